@@ -1,0 +1,79 @@
+"""Cameras: where a picture was taken from and how space falls onto its pixels.
+
+Conventions (docs/conventions.md): OpenCV axes (+x right, +y down, +z forward), pixel centres at 0.5,
+`camera_from_world` maps world points to camera points. Names: w world, c camera, px pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+CameraModel = Literal["pinhole", "orthographic"]
+
+#: Points nearer than this (in units of the ground frame) are never drawn.
+NEAR = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One view: pose and intrinsics at a given image size.
+
+    `camera_from_world` is a rigid motion [4, 4], float64. For a pinhole camera fx, fy are in pixels;
+    for an orthographic one in pixels per world unit. cx, cy are in pixels from the corner of the image.
+    """
+
+    camera_from_world: np.ndarray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    model: CameraModel = "pinhole"
+
+    @cached_property
+    def position(self) -> np.ndarray:
+        """Camera centre in the world, [3] float64."""
+        rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
+        return -rotation.T @ translation
+
+    @cached_property
+    def forward(self) -> np.ndarray:
+        """Viewing direction in the world, unit [3] float64."""
+        return self.camera_from_world[2, :3].copy()
+
+    @cached_property
+    def packed(self) -> np.ndarray:
+        """What the kernels read, [20] float32: rotation (9, row-major), translation (3),
+        fx, fy, cx, cy, width, height, orthographic (0 or 1), near."""
+        rigid = self.camera_from_world
+        tail = [self.fx, self.fy, self.cx, self.cy, self.width, self.height,
+                float(self.model == "orthographic"), NEAR]  # fmt: skip
+        return np.concatenate([rigid[:3, :3].ravel(), rigid[:3, 3], tail]).astype(np.float32)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view on an image of another size."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+        )
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """World points [n, 3] to pixels [n, 2] and depths [n] (float64; no clipping)."""
+        local = points @ self.camera_from_world[:3, :3].T + self.camera_from_world[:3, 3]
+        depth = local[:, 2]
+        divisor = depth if self.model == "pinhole" else np.ones_like(depth)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = self.fx * local[:, 0] / divisor + self.cx
+            y = self.fy * local[:, 1] / divisor + self.cy
+        return np.stack([x, y], axis=1), depth
+
+    def sees(self, points: np.ndarray) -> np.ndarray:
+        """Which points fall inside the frustum: z > near and projected centre on the image, [n] bool."""
+        pixels, depth = self.project(points)
+        x, y = pixels[:, 0], pixels[:, 1]
+        return (depth > NEAR) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)

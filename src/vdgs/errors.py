@@ -1,0 +1,23 @@
+"""Errors that a person can act on.
+
+Every error that vdgs raises on purpose is a `VdgsError`; the command line prints its message alone,
+without a traceback. A message names the file, says what is wrong and what to do.
+"""
+
+from __future__ import annotations
+
+
+class VdgsError(Exception):
+    """Something that the user can mend. The message is all they see."""
+
+
+class CaptureError(VdgsError):
+    """The capture on disk cannot be used as it is."""
+
+
+class RunError(VdgsError):
+    """The run folder cannot be used or continued as it is."""
+
+
+class TrainingDiverged(VdgsError):
+    """The loss or a parameter is no longer a finite number; the last good state is kept on disk."""

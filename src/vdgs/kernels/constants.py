@@ -1,0 +1,13 @@
+"""Constants of the image formation model, shared by every implementation.
+
+They are repeated in native/math.h; a test holds the two against each other.
+"""
+
+#: A splat contributes to a pixel where its alpha is at least this.
+ALPHA_MIN = 1.0 / 255.0
+#: Alpha is clamped here, so that transmittance never reaches zero in one step.
+ALPHA_MAX = 0.999
+#: A pixel is finished before its transmittance would fall below this.
+TRANSMITTANCE_MIN = 1e-4
+#: Added to the diagonal of every projected covariance, in square pixels.
+DILATION_PX2 = 0.3
