@@ -1,0 +1,1 @@
+"""Captures: photographs and cameras on disk become one typed `Capture`."""

@@ -1,0 +1,76 @@
+"""What a capture is, once it has been read and checked: cameras, points, a ground frame, a split."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from vdgs.cameras import Camera
+
+Split = Literal["train", "test"]
+
+
+@dataclass(frozen=True, eq=False)
+class GroundFrame:
+    """The similarity that brings the capture's own world into the ground frame (z up).
+
+    x_ground = scale * rotation @ x_source + translation, all float64; exactly invertible.
+    """
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+    #: True where one unit of the ground frame is one metre.
+    metric: bool
+    #: How the up axis and the scale were found, for people ("GPS of 18 images", "least variance", ...).
+    how: str
+    #: Latitude (deg), longitude (deg), altitude (m) of the ground frame's origin (ENU), where known.
+    origin_geo: tuple[float, float, float] | None = None
+
+    def to_ground(self, points: np.ndarray) -> np.ndarray:
+        """Source points [n, 3] to the ground frame."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def to_source(self, points: np.ndarray) -> np.ndarray:
+        """The inverse of `to_ground`."""
+        return ((points - self.translation) / self.scale) @ self.rotation
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One photograph: its camera in the ground frame, at the size at which it is used."""
+
+    name: str
+    camera: Camera
+    image_path: Path
+    mask_path: Path | None
+    split: Split
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A folder of photographs with cameras and sparse points, checked, in the ground frame."""
+
+    root: Path
+    #: The format it was read from ("colmap", "transforms", "mega-nerf", "matrixcity").
+    source: str
+    #: The image folder in use, relative to root ("images_4").
+    images: str
+    views: tuple[View, ...]
+    #: Sparse points [n, 3] float64 in the ground frame, and their colours [n, 3] uint8.
+    points: np.ndarray
+    point_colours: np.ndarray
+    ground: GroundFrame
+    #: What a person should know but need not mend.
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def train_views(self) -> tuple[View, ...]:
+        return tuple(view for view in self.views if view.split == "train")
+
+    @property
+    def test_views(self) -> tuple[View, ...]:
+        return tuple(view for view in self.views if view.split == "test")

@@ -1,0 +1,1 @@
+"""Evaluation: metrics, colour correction, pictures."""

@@ -1,0 +1,1 @@
+"""C++ implementations for the CPU, chosen at run time by instruction set."""

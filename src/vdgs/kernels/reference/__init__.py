@@ -1,0 +1,1 @@
+"""Readable torch implementations: the oracle of the tests, and the fallback."""
