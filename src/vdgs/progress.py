@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import resource
 import sys
 import time
@@ -21,6 +22,8 @@ from vdgs.config import TrainConfig
 LOG_INTERVAL = 50
 #: Seconds between two lines where there is no terminal to redraw.
 PLAIN_SECONDS = 15.0
+#: What TensorBoard shows.
+BOARD = ("loss", "l1", "ssim", "psnr_smoothed", "anchors", "splats")
 
 
 def peak_memory_bytes() -> int:
@@ -88,12 +91,12 @@ class TrainingProgress:
     def _write(self, state: TrainingState, report: StepReport) -> None:
         record = {
             "iteration": state.iteration, "loss": report.loss, "l1": report.l1, "ssim": report.ssim,
-            "psnr_smoothed": state.psnr, "anchors": len(state.anchors), "visible": report.visible,
+            "psnr_smoothed": None if math.isnan(state.psnr) else state.psnr, "anchors": len(state.anchors), "visible": report.visible,
             "splats": report.splats, "downscale": downscale_at(state.iteration - 1, self._config),
             "grown": report.grown, "pruned": report.pruned, "seconds": round(state.seconds, 3),
             "iterations_per_second": round(self.speed(), 3), "memory_bytes": self._process.memory_info().rss,
         }  # fmt: skip
         self._log.write(json.dumps(record) + "\n")
         if self._board is not None:
-            for name in ("loss", "l1", "ssim", "psnr_smoothed", "anchors", "splats"):
+            for name in (name for name in BOARD if record[name] is not None):
                 self._board.add_scalar(name, record[name], state.iteration)

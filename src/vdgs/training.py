@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -30,6 +31,8 @@ from vdgs.render import decode_visible, draw, gather_visible
 REFERENCE_HEIGHT = 10.0
 #: Every so many iterations anchors are put into Morton order, so that neighbours in space are neighbours in memory.
 REORDER_INTERVAL = 1000
+#: Every so many iterations the PSNR of the training view is taken, for people.
+PSNR_INTERVAL = 10
 
 
 class TrainingImages(Protocol):
@@ -66,7 +69,6 @@ class Stage:
     voxel: float
     #: Median height of the cameras above the ground, in units of the ground frame.
     camera_height: float
-    threads: int = field(default=0)
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,12 @@ def start_state(anchors: Anchors, decoder: Decoder) -> TrainingState:
 def view_at(iteration: int, count: int, seed: int) -> int:
     """Which training view iteration (from 0) uses: a fresh permutation of all views every `count` iterations."""
     epoch, place = divmod(iteration, count)
-    return int(np.random.default_rng((seed, epoch)).permutation(count)[place])
+    return int(_permutation(epoch, count, seed)[place])
+
+
+@lru_cache(maxsize=4)
+def _permutation(epoch: int, count: int, seed: int) -> np.ndarray:
+    return np.random.default_rng((seed, epoch)).permutation(count)
 
 
 def downscale_at(iteration: int, config: TrainConfig) -> int:
@@ -178,18 +185,21 @@ def _background(config: TrainConfig, iteration: int) -> Tensor:
 
 
 def _smooth(state: TrainingState, loss: float, image: Tensor, target: Tensor) -> None:
-    """Update the smoothed loss and PSNR (for people and for the divergence check)."""
-    error = float(torch.mean((image.clamp(0, 1) - target.float() / 255.0) ** 2))
-    psnr = -10.0 * math.log10(max(error, 1e-10))
-    keep = 0.98 if math.isfinite(state.loss) else 0.0
-    state.loss = keep * (state.loss if keep else 0.0) + (1 - keep) * loss
-    state.psnr = keep * (state.psnr if keep else 0.0) + (1 - keep) * psnr
+    """Update the smoothed loss and, every tenth step, PSNR (for people and for the divergence check)."""
+    state.loss = _moving(state.loss, loss, 0.98)
+    if state.iteration % PSNR_INTERVAL == 0:
+        error = float(torch.mean((image.clamp(0, 1) - target.float() / 255.0) ** 2))
+        state.psnr = _moving(state.psnr, -10.0 * math.log10(max(error, 1e-10)), 0.9)
     if state.iteration > 100:
         state.best_loss = min(state.best_loss, state.loss)
         if state.loss > 0.3 and state.loss > 4 * state.best_loss:
             raise TrainingDiverged(
                 f"The smoothed loss rose to {state.loss:.3f} from {state.best_loss:.3f} by iteration {state.iteration}."
             )
+
+
+def _moving(before: float, value: float, keep: float) -> float:
+    return value if math.isnan(before) else keep * before + (1 - keep) * value
 
 
 def train(
