@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.cameras import Camera
-from vdgs.captures.capture import Capture, View
+from vdgs.captures.capture import Capture, GroundFrame, View
 from vdgs.captures.colmap import count_images, find_models, read_colmap
 from vdgs.captures.ground import find_ground_frame, transform_pose
 from vdgs.captures.options import CaptureOptions
 from vdgs.captures.photographs import Names, find_images, find_mask, read_header
 from vdgs.captures.source import Intrinsics, SourceCapture, SourceView, listing
 from vdgs.captures.splits import choose_splits, nearest_to_middle
+from vdgs.captures.undistortion import undistort
 from vdgs.errors import CaptureError
 
 #: Points farther from the cameras than this many times their spread are strays of the matching.
@@ -33,8 +34,8 @@ class _Photograph:
 def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     """Read, check and normalise the capture in the folder `path`.
 
-    Raises `CaptureError` naming the file, what is wrong and the remedy, before anything expensive happens. Pixels are
-    not decoded here; `checks.check_images` does that.
+    Raises `CaptureError` naming the file, what is wrong and the remedy, before anything expensive happens.
+    Pixels are not decoded here; `checks.check_images` does that.
     """
     options = options or CaptureOptions()
     root = Path(path)
@@ -89,8 +90,8 @@ def _read(root: Path, options: CaptureOptions) -> SourceCapture:
         return _read_colmap(root, models, options)
     raise CaptureError(
         f"{root}: not a capture. Looked for a COLMAP model (sparse/0/cameras.bin and images.bin, or .txt), "
-        "transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json (MatrixCity). "
-        "For photographs alone, run COLMAP first (for example: colmap automatic_reconstructor)."
+        "transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json "
+        "(MatrixCity). For photographs alone, run COLMAP first (for example: colmap automatic_reconstructor)."
     )
 
 
@@ -185,8 +186,8 @@ def _find_photographs(
             missing.append(str(path))
     if missing:
         raise CaptureError(
-            f"{folder}: {len(missing)} of {len(source.views)} images that have a camera are missing. Copy them "
-            f"there, or choose another folder with --images.{listing(missing)}"
+            f"{folder}: {len(missing)} of {len(source.views)} images that have a camera are missing. Copy "
+            f"them there, or choose another folder with --images.{listing(missing)}"
         )
     used = {path.resolve() for path in paths}
     spare = [
@@ -218,8 +219,8 @@ def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
         turned = (header.width > header.height) != (intrinsics.width > intrinsics.height)
         hint = "The image is turned by a quarter (EXIF orientation applied?). " if turned else ""
         raise CaptureError(
-            f"{path}: is {header.width}x{header.height}, but its camera is {intrinsics.width}x{intrinsics.height}: "
-            f"another shape, so the two do not belong together. {hint}"
+            f"{path}: is {header.width}x{header.height}, but its camera is "
+            f"{intrinsics.width}x{intrinsics.height}: another shape, so the two do not belong together. {hint}"
             "Use the images that the model was made from, or shrink them evenly."
         )
     return scaled(intrinsics, header.width, header.height)
@@ -247,21 +248,19 @@ def _undistorted(
     if not options.undistort:
         models = sorted({photo.intrinsics.model for photo in bent})
         raise CaptureError(
-            f"{root}: {len(bent)} photographs have a camera with lens distortion ({', '.join(models)}); training "
-            f"needs a pinhole. Add --undistort, or run colmap image_undistorter.{listing(p.view.name for p in bent)}"
+            f"{root}: {len(bent)} photographs have a camera with lens distortion ({', '.join(models)}); "
+            "training needs a pinhole. Add --undistort, or run colmap image_undistorter."
+            f"{listing(photo.view.name for photo in bent)}"
         )
-    from vdgs.captures.undistortion import undistort
-
+    inputs = [(photo.view.name, photo.path, photo.intrinsics) for photo in photographs]
+    outputs = undistort(root, inputs, options, warnings)
     return [
         replace(photo, path=path, intrinsics=intrinsics)
-        for photo, (path, intrinsics) in zip(
-            photographs, undistort(root, [(p.view.name, p.path, p.intrinsics) for p in photographs], options, warnings),
-            strict=True,
-        )
-    ]  # fmt: skip
+        for photo, (path, intrinsics) in zip(photographs, outputs, strict=True)
+    ]
 
 
-def _view(photo: _Photograph, root: Path, options: CaptureOptions, ground) -> View:  # noqa: ANN001
+def _view(photo: _Photograph, root: Path, options: CaptureOptions, ground: GroundFrame) -> View:
     (fx, fy), (cx, cy) = photo.intrinsics.focal, photo.intrinsics.principal_point
     width, height = photo.intrinsics.width, photo.intrinsics.height
     pose = transform_pose(photo.view.camera_from_world, ground)

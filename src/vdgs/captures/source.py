@@ -32,7 +32,8 @@ SINGLE_FOCAL = {
 }  # fmt: skip
 #: Models that are a pinhole once all further parameters are zero.
 PINHOLE_WHEN_ZERO = {
-    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION",
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION",
+    "DIVISION",
 }  # fmt: skip
 LARGEST_SIDE_PX = 100_000
 OFFENDERS_SHOWN = 10
