@@ -10,7 +10,6 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,7 @@ from vdgs.captures.source import (
     Intrinsics,
     SourceView,
     check_intrinsics,
+    duplicates,
     listing,
     rigid,
     safe_name,
@@ -174,7 +174,7 @@ def _views(records: list[_ImageRecord], cameras: dict[int, Intrinsics], file: Pa
         for record in records
     ]
     views.sort(key=lambda view: view.name)
-    twice = [a.name for a, b in pairwise(views) if a.name == b.name]
+    twice = duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{file}: the same image name occurs more than once.{listing(twice)}")
     return tuple(views)
@@ -247,8 +247,7 @@ def _points_binary(file: Path) -> tuple[np.ndarray, np.ndarray]:
     cursor = _Cursor(file)
     size, data = _POINT.itemsize, cursor.data
     count = cursor.count(size, "points")
-    records = np.zeros(count, _POINT)
-    view = memoryview(records.view(np.uint8))
+    buffer = bytearray(count * size)
     offset, end = cursor.offset, len(data)
     for index in range(count):
         after = offset + size
@@ -256,10 +255,11 @@ def _points_binary(file: Path) -> tuple[np.ndarray, np.ndarray]:
         if after > end or track_end > end:
             cursor.offset = offset
             raise cursor.fail(f"point {index} of {count} runs past the end of the file")
-        view[index * size : (index + 1) * size] = data[offset:after]
+        buffer[index * size : (index + 1) * size] = data[offset:after]
         offset = track_end
     cursor.offset = offset
     cursor.finish()
+    records = np.frombuffer(buffer, _POINT)
     return records["xyz"].astype(np.float64), records["rgb"].copy()
 
 
