@@ -47,9 +47,9 @@ def fit_similarity_robust(
 ) -> tuple[Similarity, np.ndarray]:
     """Least median of squares over seeded triples, then least squares over the inliers.
 
-    Inliers lie within 3 robust standard deviations (1.4826 * median residual) of the best triple's fit, refined
-    twice. Returns the similarity and the inliers [n] bool. The draws are seeded by a constant, so that the
-    same capture always gets the same frame.
+    Inliers lie within 3 robust standard deviations (1.4826 * median residual) of the best triple's fit,
+    refined twice. Returns the similarity and the inliers [n] bool. The draws are seeded by a constant, so
+    that the same capture always gets the same frame.
     """
     generator = np.random.default_rng(0)
     best = fit_similarity(source, target)
@@ -81,8 +81,8 @@ def _residuals(similarity: Similarity, source: np.ndarray, target: np.ndarray) -
 def geometric_median(points: np.ndarray, most: int = 20_000) -> np.ndarray:
     """The place [3] with the least summed distance to the points [n, 3] (Weiszfeld's iteration).
 
-    Unlike a median per axis it turns and scales with the points, and unlike the mean a few strays do not move it.
-    More than `most` points are thinned evenly.
+    Unlike a median per axis it turns and scales with the points, and unlike the mean a few strays do not
+    move it. More than `most` points are thinned evenly.
     """
     sample = points[:: max(1, -(-len(points) // most))]
     centre = np.median(sample, axis=0)

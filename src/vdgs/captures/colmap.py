@@ -20,6 +20,7 @@ from vdgs.captures.source import (
     Intrinsics,
     SourceView,
     check_intrinsics,
+    duplicates,
     listing,
     rigid,
     safe_name,
@@ -93,7 +94,7 @@ class _Cursor:
 
 
 def find_models(root: Path) -> list[Path]:
-    """Folders under `root` that hold a sparse model: sparse/N, sparse, colmap/sparse/N, N, or `root` itself."""
+    """Folders that hold a sparse model: `root`/sparse/N, sparse, colmap/sparse/N, N, or `root` itself."""
     parents = [root / "sparse", root / "colmap" / "sparse", root]
     candidates: list[Path] = []
     for parent in parents:
@@ -173,7 +174,7 @@ def _views(records: list[_ImageRecord], cameras: dict[int, Intrinsics], file: Pa
         for record in records
     ]
     views.sort(key=lambda view: view.name)
-    twice = [a.name for a, b in zip(views, views[1:], strict=False) if a.name == b.name]
+    twice = duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{file}: the same image name occurs more than once.{listing(twice)}")
     return tuple(views)
@@ -246,8 +247,7 @@ def _points_binary(file: Path) -> tuple[np.ndarray, np.ndarray]:
     cursor = _Cursor(file)
     size, data = _POINT.itemsize, cursor.data
     count = cursor.count(size, "points")
-    records = np.zeros(count, _POINT)
-    view = memoryview(records).cast("B") if count else memoryview(b"")
+    buffer = bytearray(count * size)
     offset, end = cursor.offset, len(data)
     for index in range(count):
         after = offset + size
@@ -255,10 +255,11 @@ def _points_binary(file: Path) -> tuple[np.ndarray, np.ndarray]:
         if after > end or track_end > end:
             cursor.offset = offset
             raise cursor.fail(f"point {index} of {count} runs past the end of the file")
-        view[index * size : (index + 1) * size] = data[offset:after]
+        buffer[index * size : (index + 1) * size] = data[offset:after]
         offset = track_end
     cursor.offset = offset
     cursor.finish()
+    records = np.frombuffer(buffer, _POINT)
     return records["xyz"].astype(np.float64), records["rgb"].copy()
 
 
@@ -296,7 +297,8 @@ def _cameras_text(file: Path) -> dict[int, Intrinsics]:
             raise _bad_line(file, number, expected) from None
         if MODEL_PARAMETERS.get(model) != len(params):
             raise CaptureError(
-                f"{file}: line {number}: {model!r} with {len(params)} parameters is not a supported camera model. "
+                f"{file}: line {number}: {model!r} with {len(params)} parameters is no camera model that is "
+                "supported. "
                 f"Supported: {', '.join(MODEL_PARAMETERS)}."
             )
         _add_camera(cameras, identifier, Intrinsics(model, params, width, height), file)

@@ -27,7 +27,7 @@ def ecef_from_geodetic(geodetic: np.ndarray) -> np.ndarray:
 
 
 def geodetic_from_ecef(ecef: np.ndarray) -> np.ndarray:
-    """The inverse of `ecef_from_geodetic`, by fixed-point iteration (well below a micrometre near the ground)."""
+    """The inverse of `ecef_from_geodetic`, by fixed-point iteration (to a micrometre near the ground)."""
     x, y, z = ecef.T
     horizontal = np.hypot(x, y)
     latitude = np.arctan2(z, horizontal * (1 - ECCENTRICITY2))

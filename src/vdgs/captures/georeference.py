@@ -25,8 +25,8 @@ def read_georef(file: Path) -> tuple[float, float, float]:
         raise CaptureError(f"{file}: is not JSON ({error}). Mend it, or remove it to do without.") from None
     if not isinstance(content, dict) or "ENU" not in str(content.get("frame", "ENU")):
         raise CaptureError(
-            f"{file}: describes no ENU frame (x east, y north, z up, metres). Only ENU worlds are understood; "
-            "give --up instead and remove the file."
+            f"{file}: describes no ENU frame (x east, y north, z up, metres). Only ENU worlds are "
+            "understood; give --up instead and remove the file."
         )
     keys = ("origin_lat_deg", "origin_lon_deg", "origin_alt_m")
     try:
@@ -96,6 +96,6 @@ def _check_geodetic(position: tuple[float, ...], file: Path, where: str = "") ->
         abs(latitude) <= 90 and abs(longitude) <= 360 and math.isfinite(altitude) and abs(altitude) < 1e5
     ):
         raise CaptureError(
-            f"{file}: {where}latitude {latitude}, longitude {longitude}, altitude {altitude} is no place on Earth. "
-            "Degrees and metres are expected."
+            f"{file}: {where}latitude {latitude}, longitude {longitude}, altitude {altitude} is no place "
+            "on Earth. Degrees and metres are expected."
         )

@@ -9,8 +9,9 @@ Where the up axis and the scale come from, in this order:
 5. Estimate: the axis of least variance of the camera centres and the sparse points, signed against the mean
    viewing direction (drones look down; the mean of the cameras' own up axes fails for nadir flights).
 
-All arithmetic is float64. Choice: in a frame that is not georeferenced the origin is the median sparse point, so z = 0
-is the median height of the ground; where metres are unknown the median camera flies at `CAMERA_HEIGHT`.
+All arithmetic is float64. Choice: in a frame that is not georeferenced the origin is the median sparse point,
+so z = 0 is the median height of the ground; where metres are unknown the median camera flies at
+`CAMERA_HEIGHT`.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ from vdgs.errors import CaptureError
 
 #: Median camera height above the ground, in units, where the capture has no metres (choice).
 CAMERA_HEIGHT = 10.0
-#: Georeferenced worlds farther than this from their origin are shifted, so that float32 resolves below 0.1 mm.
+#: Georeferenced worlds farther than this from their origin are shifted, so that float32 stays below 0.1 mm.
 FAR_FROM_ORIGIN_M = 1000.0
-#: Below this cosine between up and the mean viewing direction the sign of up is taken from the heights instead.
+#: Below this cosine between up and the mean view the sign of up is taken from the heights instead.
 LEVEL_VIEW = 0.1
 AXES = {
     sign + name: factor * np.eye(3)[index]
@@ -54,7 +55,10 @@ class _Scene:
 def find_ground_frame(
     source: SourceCapture, root: Path, options: CaptureOptions
 ) -> tuple[GroundFrame, list[str]]:
-    """The ground frame of a capture, and warnings for people. Raises `CaptureError` for unusable georeferences."""
+    """The ground frame of a capture, and warnings for people.
+
+    Raises `CaptureError` for georeferences that cannot be used.
+    """
     scene = _scene(source)
     warnings: list[str] = []
     if options.up != "auto":
@@ -123,8 +127,8 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     centres = scene.centres[indices]
     if is_collinear(centres) or is_collinear(enu):
         warnings.append(
-            f"{file.name}: {len(indices)} photographs with GPS, all along one line (or fewer than three), fix no up "
-            "axis; the frame is estimated from the cameras instead and is not metric."
+            f"{file.name}: {len(indices)} photographs with GPS, all along one line (or fewer than three), "
+            "fix no up axis; the frame is estimated from the cameras instead and is not metric."
         )
         return None
     similarity, inliers = fit_similarity_robust(centres, enu)
@@ -166,7 +170,8 @@ def estimate_up(
 
     The axis of least variance of camera centres and sparse points: both covariances are divided by their
     trace, so that each counts alike, and added; points beyond the 95 % quantile of distance to the median are
-    left out. All of it turns with the world (no per-axis medians). Signed against the mean viewing direction, or towards the cameras where that is level.
+    left out. All of it turns with the world (no per-axis medians). Signed against the mean viewing
+    direction, or towards the cameras where that is level.
     """
     covariance = _shape(centres) + _shape(points)
     values, vectors = np.linalg.eigh(covariance)

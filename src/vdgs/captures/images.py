@@ -1,4 +1,4 @@
-"""The photographs' pixels in memory: decoded once, kept as uint8 within a byte budget, prefetched by threads."""
+"""The photographs' pixels in memory: uint8 within a byte budget, prefetched by threads."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ class ImageCache:
         return max(1, int(camera.width / downscale)), max(1, int(camera.height / downscale))
 
     def _run(self, key: tuple[int, float], future: Future[Picture]) -> None:
-        """Make the picture, keep it and hand it to all who wait. A failure stays pending until `get` raises it."""
+        """Make the picture, keep it, hand it to all who wait. A failure stays until `get` raises it."""
         try:
             if self._closed:
                 raise ValueError("the image cache is closed")

@@ -8,13 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.cameras import Camera
-from vdgs.captures.capture import Capture, View
+from vdgs.captures.capture import Capture, GroundFrame, View
 from vdgs.captures.colmap import count_images, find_models, read_colmap
 from vdgs.captures.ground import find_ground_frame, transform_pose
+from vdgs.captures.matrixcity import pose_files, read_matrixcity
+from vdgs.captures.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.options import CaptureOptions
 from vdgs.captures.photographs import Names, find_images, find_mask, read_header
 from vdgs.captures.source import Intrinsics, SourceCapture, SourceView, listing
 from vdgs.captures.splits import choose_splits, nearest_to_middle
+from vdgs.captures.transforms import read_transforms
+from vdgs.captures.undistortion import undistort
 from vdgs.errors import CaptureError
 
 #: Points farther from the cameras than this many times their spread are strays of the matching.
@@ -33,8 +37,8 @@ class _Photograph:
 def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     """Read, check and normalise the capture in the folder `path`.
 
-    Raises `CaptureError` naming the file, what is wrong and the remedy, before anything expensive happens. Pixels are
-    not decoded here; `checks.check_images` does that.
+    Raises `CaptureError` naming the file, what is wrong and the remedy, before anything expensive happens.
+    Pixels are not decoded here; `checks.check_images` does that.
     """
     options = options or CaptureOptions()
     root = Path(path)
@@ -71,6 +75,9 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
 def _check_options(options: CaptureOptions) -> None:
     if not (np.isfinite(options.downscale) and options.downscale >= 1):
         raise CaptureError(f"--downscale {options.downscale}: must be at least 1.")
+    for flag, folder in (("--images", options.images), ("--masks", options.masks)):
+        if folder is not None and (Path(folder).is_absolute() or ".." in Path(folder).parts or not folder):
+            raise CaptureError(f"{flag} {folder}: must be a folder inside the capture, such as images_4.")
     if options.test_every < 2:
         raise CaptureError(
             f"--test-every {options.test_every}: must be at least 2 (1 would leave nothing to train on)."
@@ -84,13 +91,19 @@ def _check_options(options: CaptureOptions) -> None:
 
 def _read(root: Path, options: CaptureOptions) -> SourceCapture:
     """The capture in whichever format the folder is."""
+    if is_mega_nerf(root):
+        return read_mega_nerf(root, options)
+    if pose_files(root):
+        return read_matrixcity(root, options)
     models = find_models(root)
     if models:
         return _read_colmap(root, models, options)
+    if (root / "transforms.json").is_file():
+        return read_transforms(root, options)
     raise CaptureError(
         f"{root}: not a capture. Looked for a COLMAP model (sparse/0/cameras.bin and images.bin, or .txt), "
-        "transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json (MatrixCity). "
-        "For photographs alone, run COLMAP first (for example: colmap automatic_reconstructor)."
+        "transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json "
+        "(MatrixCity). For photographs alone, run COLMAP first (for example: colmap automatic_reconstructor)."
     )
 
 
@@ -119,13 +132,12 @@ def _read_colmap(root: Path, models: list[Path], options: CaptureOptions) -> Sou
 def image_folder(root: Path, options: CaptureOptions) -> tuple[str, list[str]]:
     """The image folder relative to `root`: the one asked for, else images, else the largest images_N."""
     if options.images is not None:
-        asked = Path(options.images)
-        if asked.is_absolute() or ".." in asked.parts:
-            raise CaptureError(f"--images {options.images}: must be a folder inside {root}.")
-        if not (root / asked).is_dir():
+        if not (root / options.images).is_dir():
             present = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
-            raise CaptureError(f"{root / asked}: no such folder. Present: {', '.join(present) or 'none'}.")
-        return asked.as_posix(), []
+            raise CaptureError(
+                f"{root / options.images}: no such folder. Present: {', '.join(present) or 'none'}."
+            )
+        return Path(options.images).as_posix(), []
     if (root / "images").is_dir():
         return "images", []
     shrunk = {
@@ -185,8 +197,8 @@ def _find_photographs(
             missing.append(str(path))
     if missing:
         raise CaptureError(
-            f"{folder}: {len(missing)} of {len(source.views)} images that have a camera are missing. Copy them "
-            f"there, or choose another folder with --images.{listing(missing)}"
+            f"{folder}: {len(missing)} of {len(source.views)} images that have a camera are missing. Copy "
+            f"them there, or choose another folder with --images.{listing(missing)}"
         )
     used = {path.resolve() for path in paths}
     spare = [
@@ -218,8 +230,9 @@ def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
         turned = (header.width > header.height) != (intrinsics.width > intrinsics.height)
         hint = "The image is turned by a quarter (EXIF orientation applied?). " if turned else ""
         raise CaptureError(
-            f"{path}: is {header.width}x{header.height}, but its camera is {intrinsics.width}x{intrinsics.height}: "
-            f"another shape, so the two do not belong together. {hint}"
+            f"{path}: is {header.width}x{header.height}, but its camera is "
+            f"{intrinsics.width}x{intrinsics.height}: another shape, so the two do not belong together. "
+            f"{hint}"
             "Use the images that the model was made from, or shrink them evenly."
         )
     return scaled(intrinsics, header.width, header.height)
@@ -247,21 +260,19 @@ def _undistorted(
     if not options.undistort:
         models = sorted({photo.intrinsics.model for photo in bent})
         raise CaptureError(
-            f"{root}: {len(bent)} photographs have a camera with lens distortion ({', '.join(models)}); training "
-            f"needs a pinhole. Add --undistort, or run colmap image_undistorter.{listing(p.view.name for p in bent)}"
+            f"{root}: {len(bent)} photographs have a camera with lens distortion ({', '.join(models)}); "
+            "training needs a pinhole. Add --undistort, or run colmap image_undistorter."
+            f"{listing(photo.view.name for photo in bent)}"
         )
-    from vdgs.captures.undistortion import undistort
-
+    inputs = [(photo.view.name, photo.path, photo.intrinsics) for photo in photographs]
+    outputs = undistort(root, inputs, options, warnings)
     return [
         replace(photo, path=path, intrinsics=intrinsics)
-        for photo, (path, intrinsics) in zip(
-            photographs, undistort(root, [(p.view.name, p.path, p.intrinsics) for p in photographs], options, warnings),
-            strict=True,
-        )
-    ]  # fmt: skip
+        for photo, (path, intrinsics) in zip(photographs, outputs, strict=True)
+    ]
 
 
-def _view(photo: _Photograph, root: Path, options: CaptureOptions, ground) -> View:  # noqa: ANN001
+def _view(photo: _Photograph, root: Path, options: CaptureOptions, ground: GroundFrame) -> View:
     (fx, fy), (cx, cy) = photo.intrinsics.focal, photo.intrinsics.principal_point
     width, height = photo.intrinsics.width, photo.intrinsics.height
     pose = transform_pose(photo.view.camera_from_world, ground)
@@ -270,5 +281,5 @@ def _view(photo: _Photograph, root: Path, options: CaptureOptions, ground) -> Vi
         camera = camera.resized(
             max(1, int(width / options.downscale)), max(1, int(height / options.downscale))
         )
-    mask = find_mask(root / options.masks, photo.view.name)
+    mask = photo.view.mask_path or find_mask(root / options.masks, photo.view.name)
     return View(photo.view.name, camera, photo.path, mask, "train")

@@ -35,7 +35,8 @@ class Header:
 
 @contextmanager
 def pillow_quietly() -> Iterator[None]:
-    """Pillow without its warnings and its limit of 89 megapixels (aerial cameras exceed it; ours is judged below).
+    """Pillow without its warnings and its limit of 89 megapixels (aerial cameras exceed it; ours is judged
+    below).
 
     Changes the whole process: enter it in one thread, around the work of others.
     """
@@ -107,8 +108,8 @@ def find_mask(folder: Path, name: str) -> Path | None:
 def decode_photograph(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Pixels [h, w, 3] uint8 RGB, and where the file has transparency its opaque part [h, w] bool.
 
-    Grey becomes RGB, 16 bits become 8; an alpha channel is a mask (choice: opaque from one half up), never a blend.
-    Raises `CaptureError` naming the file if it cannot be decoded.
+    Grey becomes RGB, 16 bits become 8; an alpha channel is a mask (choice: opaque from one half up), never
+    a blend. Raises `CaptureError` naming the file if it cannot be decoded.
     """
     pixels = _decode(path)
     if pixels.dtype == np.uint16:

@@ -6,6 +6,7 @@ already in OpenCV camera axes. `loading` turns it into a checked `Capture` in th
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -32,7 +33,8 @@ SINGLE_FOCAL = {
 }  # fmt: skip
 #: Models that are a pinhole once all further parameters are zero.
 PINHOLE_WHEN_ZERO = {
-    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION",
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION",
+    "DIVISION",
 }  # fmt: skip
 LARGEST_SIDE_PX = 100_000
 OFFENDERS_SHOWN = 10
@@ -73,8 +75,9 @@ class SourceView:
     camera_from_world: np.ndarray
     intrinsics: Intrinsics
     split: Split | None = None
-    #: Where the image is, if the format says so itself; else it is looked up in the image folder.
+    #: Where image and mask are, if the format says so itself; else they are looked up by name.
     image_path: Path | None = None
+    mask_path: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +114,11 @@ def listing(names: Iterable[str]) -> str:
     shown = "".join(f"\n  {name}" for name in names[:OFFENDERS_SHOWN])
     more = len(names) - OFFENDERS_SHOWN
     return shown + (f"\n  ... and {more} more" if more > 0 else "")
+
+
+def duplicates(names: Iterable[str]) -> list[str]:
+    """Names that occur more than once, sorted."""
+    return sorted(name for name, count in Counter(names).items() if count > 1)
 
 
 def safe_name(name: str, file: Path) -> str:

@@ -16,7 +16,7 @@ from vdgs.errors import CaptureError
 
 
 def nearest_to_middle(views: list[View], count: int) -> list[View]:
-    """The `count` views nearest to the median camera centre, in their order: a compact patch keeps its overlap."""
+    """The `count` views nearest to the median camera centre: a compact patch keeps its overlap."""
     centres = np.stack([view.camera.position for view in views])
     distance = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
     chosen = np.sort(np.argsort(distance, kind="stable")[:count])
@@ -36,16 +36,16 @@ def choose_splits(
         splits = ["test" if explicit[view.name] == "test" else "train" for view in views]
     elif options.split == "explicit":
         raise CaptureError(
-            f"{root}: --split explicit, but the capture brings no split of its own (train/ and val/ folders). "
-            "Name the test photographs with --test-list, or use --split every."
+            f"{root}: --split explicit, but the capture brings no split of its own (train/ and val/ "
+            "folders). Name the test photographs with --test-list, or use --split every."
         )
     else:
         splits = ["test" if index % options.test_every == 0 else "train" for index in range(len(views))]
     for side in ("train", "test"):
         if side not in splits:
             raise CaptureError(
-                f"{root}: no photograph is left to {side} on ({len(views)} in all). Check --test-list, --split and "
-                "--max-images; at least two photographs are needed."
+                f"{root}: no photograph is left to {side} on ({len(views)} in all). Check --test-list, "
+                "--split and --max-images; at least two photographs are needed."
             )
     return [replace(view, split=split) for view, split in zip(views, splits, strict=True)]
 

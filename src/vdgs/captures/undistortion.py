@@ -26,10 +26,10 @@ def undistort(
 ) -> list[tuple[Path, Intrinsics]]:
     """Pinhole versions of the photographs: their files and PINHOLE intrinsics.
 
-    Files are written under `options.undistorted_folder` (default `root`/undistorted/<image folder's name>), each
-    beside a small JSON that says from which file, of which size and date, and with which camera it was made; what
-    matches is reused. Photographs without distortion pass through. Raises `CaptureError` if the folder cannot be
-    written or an image cannot be decoded.
+    Files are written under `options.undistorted_folder` (default `root`/undistorted/<image folder's
+    name>), each beside a small JSON that says from which file, of which size and date, and with which
+    camera it was made; what matches is reused. Photographs without distortion pass through. Raises
+    `CaptureError` if the folder cannot be written or an image cannot be decoded.
     """
     folder = options.undistorted_folder or root / "undistorted" / (options.images or "images")
     bent = [photo for photo in photographs if photo[2].distorted]
@@ -71,7 +71,8 @@ def pinhole_for(intrinsics: Intrinsics) -> Intrinsics:
 
 
 def sampling_map(distorted: Intrinsics, pinhole: Intrinsics) -> np.ndarray:
-    """Where each pixel of the pinhole picture lies in the distorted one, [h, w, 2] float32, OpenCV's convention.
+    """Where each pixel of the pinhole picture lies in the distorted one, [h, w, 2] float32, OpenCV's
+    convention.
 
     Pixel centres are at 0.5 here and at 0 in `cv2.remap`.
     """
@@ -97,7 +98,7 @@ def _undistorted_file(folder: Path, photo: Photograph, pinhole: Intrinsics) -> P
         return target
     pixels, _ = decode_photograph(path)
     grid = sampling_map(intrinsics, pinhole)
-    straight = cv2.remap(pixels, grid, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    straight = cv2.remap(pixels, grid[..., 0], grid[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
     encoded = cv2.imencode(".jpg", cv2.cvtColor(straight, cv2.COLOR_RGB2BGR), settings)[1]
     target.parent.mkdir(parents=True, exist_ok=True)
