@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from native_choice import every_instruction_set, on_threads, using
 from vdgs.kernels.native import adam as native
-from vdgs.kernels.native import module
 from vdgs.kernels.reference import adam as reference
 
 BOTH = pytest.mark.parametrize("implementation", [reference, native])
@@ -63,7 +63,10 @@ def test_rows_that_are_not_given_keep_parameters_and_moments(implementation):
 
 @settings(max_examples=40, deadline=None)
 @given(
-    st.integers(0, 400), st.sampled_from([(), (1,), (3,), (6,), (32,), (10, 3)]), st.floats(0, 1), st.integers(1, 9999)
+    st.integers(0, 400),
+    st.sampled_from([(), (1,), (3,), (6,), (32,), (10, 3)]),
+    st.floats(0, 1),
+    st.integers(1, 9999),
 )
 def test_native_equals_twin(n, rest, share, step):
     rows = some_rows(n, share)
@@ -71,19 +74,27 @@ def test_native_equals_twin(n, rest, share, step):
     for implementation in (reference, native):
         parameter, gradient, first, second = state(n, *rest)
         implementation.adam_rows(
-            parameter, rows, gradient[rows], first, second, learning_rate=0.02, step=step, beta1=0.8, beta2=0.99
+            parameter,
+            rows,
+            gradient[rows],
+            first,
+            second,
+            learning_rate=0.02,
+            step=step,
+            beta1=0.8,
+            beta2=0.99,
         )
         results.append((parameter, first, second))
     for value, expected in zip(*results, strict=True):
         torch.testing.assert_close(value, expected, rtol=2e-6, atol=2e-6)
 
 
-@pytest.mark.parametrize("instructions", module.available())
+@every_instruction_set
 def test_same_bits_for_any_number_of_threads(instructions):
     rows, results = some_rows(20_000, 0.6), []
-    with module.using(instructions):
+    with using(instructions):
         for threads in (1, 2, 3):
-            with module.threads(threads):
+            with on_threads(threads):
                 parameter, gradient, first, second = state(20_000, 7)
                 native.adam_rows(parameter, rows, gradient[rows], first, second, learning_rate=0.1, step=3)
                 results.append((parameter, first, second))
@@ -105,7 +116,8 @@ def test_a_gradient_that_is_not_finite_changes_nothing(implementation, bad, plac
 
 @BOTH
 @pytest.mark.parametrize(
-    ("rows", "error"), [([0, 4], IndexError), ([-1, 2], IndexError), ([2, 1], ValueError), ([1, 1], ValueError)]
+    ("rows", "error"),
+    [([0, 4], IndexError), ([-1, 2], IndexError), ([2, 1], ValueError), ([1, 1], ValueError)],
 )
 def test_wrong_rows_are_refused_before_any_change(implementation, rows, error):
     parameter, gradient, first, second = state(4, 3)
@@ -121,7 +133,9 @@ def test_wrong_rows_are_refused_before_any_change(implementation, rows, error):
 def test_zero_gradients_of_fresh_rows_change_nothing(implementation):
     parameter = torch.randn(5, 3)
     before, zeros = parameter.clone(), torch.zeros(5, 3)
-    assert implementation.adam_rows(parameter, None, zeros, zeros.clone(), zeros.clone(), learning_rate=1.0, step=1)
+    assert implementation.adam_rows(
+        parameter, None, zeros, zeros.clone(), zeros.clone(), learning_rate=1.0, step=1
+    )
     assert torch.equal(parameter, before)
 
 

@@ -7,13 +7,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from native_choice import every_instruction_set, on_threads, using
 from vdgs.kernels.native import cells as native
-from vdgs.kernels.native import module
 from vdgs.kernels.reference import cells as reference
 
 BOTH = pytest.mark.parametrize("implementation", [reference, native])
 KEYS = st.lists(
-    st.one_of(st.integers(-3, 3), st.integers(-(2**63), 2**63 - 1), st.integers(2**40, 2**40 + 20)), max_size=200
+    st.one_of(st.integers(-3, 3), st.integers(-(2**63), 2**63 - 1), st.integers(2**40, 2**40 + 20)),
+    max_size=200,
 ).map(lambda values: torch.tensor(values, dtype=torch.int64))
 
 
@@ -148,7 +149,7 @@ def test_morton_order_refuses_what_is_not_finite(implementation, bad):
         implementation.morton_order(positions)
 
 
-@pytest.mark.parametrize("instructions", module.available())
+@every_instruction_set
 def test_any_instruction_set_and_number_of_threads_give_the_same(instructions):
     positions, origin = cloud(60_000), torch.zeros(3)
     keys = reference.cell_keys(positions, 2.0, origin)
@@ -159,9 +160,9 @@ def test_any_instruction_set_and_number_of_threads_give_the_same(instructions):
         reference.group_max(values, group, len(unique)),
         reference.morton_order(positions),
     )
-    with module.using(instructions):
+    with using(instructions):
         for threads in (1, 2, 3):
-            with module.threads(threads):
+            with on_threads(threads):
                 assert torch.equal(native.cell_keys(positions, 2.0, origin), keys)
                 assert all(map(torch.equal, native.group_cells(keys), (unique, group)))
                 assert torch.equal(native.contains(unique[::3], keys), held)

@@ -9,8 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from native_choice import every_instruction_set, on_threads, using
 from vdgs.kernels.native import loss as native
-from vdgs.kernels.native import module
 from vdgs.kernels.reference import loss as reference
 
 SIZES = [(1, 1), (1, 7), (3, 2), (5, 40), (37, 1), (13, 29), (64, 33), (131, 70)]
@@ -23,7 +23,9 @@ def scene(height: int, width: int, seed: int = 0, kept: float | None = None):
     base = (base - base.min()) / max(np.ptp(base), 1e-3)
     noisy = np.clip(base + generator.normal(0, 0.1, base.shape), -0.2, 1.2)
     target = torch.from_numpy((base * 255).astype(np.uint8))
-    mask = None if kept is None else torch.from_numpy((generator.random((height, width)) < kept) * np.uint8(9))
+    mask = (
+        None if kept is None else torch.from_numpy((generator.random((height, width)) < kept) * np.uint8(9))
+    )
     return torch.from_numpy(noisy.astype(np.float32)), target, mask
 
 
@@ -81,16 +83,18 @@ def test_the_twin_combines_l1_and_ssim():
 def test_gradients_of_the_twin_are_finite_differences():
     image, target, mask = scene(7, 6, kept=0.7)
     leaf = image.double().requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: reference.photometric_loss(x, target, mask).loss, leaf, eps=1e-7)
+    assert torch.autograd.gradcheck(
+        lambda x: reference.photometric_loss(x, target, mask).loss, leaf, eps=1e-7
+    )
 
 
-@pytest.mark.parametrize("instructions", module.available())
+@every_instruction_set
 @pytest.mark.parametrize("kept", [None, 0.7, 0.02])
 @pytest.mark.parametrize(("height", "width"), SIZES)
 def test_native_equals_twin(height, width, kept, instructions):
     image, target, mask = scene(height, width, kept=kept)
     truth, truth_gradient = with_gradient(reference, image.double(), target, mask)
-    with module.using(instructions):
+    with using(instructions):
         result, gradient = with_gradient(native, image, target, mask)
     for value, expected in zip(result, truth, strict=True):
         assert float(value.detach()) == pytest.approx(float(expected.detach()), abs=2e-6)
@@ -109,13 +113,13 @@ def test_native_equals_twin_at_any_size(height, width, weight, seed):
     assert float((gradient - truth_gradient).abs().max()) < 1e-4 * scale
 
 
-@pytest.mark.parametrize("instructions", module.available())
+@every_instruction_set
 def test_same_bits_for_any_number_of_threads(instructions):
     image, target, mask = scene(230, 57, kept=0.9)
     results = []
-    with module.using(instructions):
+    with using(instructions):
         for threads in (1, 2, 3):
-            with module.threads(threads):
+            with on_threads(threads):
                 results.append(with_gradient(native, image, target, mask))
     for result, gradient in results[1:]:
         assert torch.equal(gradient, results[0][1])
@@ -149,7 +153,9 @@ class TestMeaning:
 
     def test_nothing_kept_means_no_loss_and_no_gradient(self, implementation):
         image, target, _ = scene(12, 17)
-        result, gradient = with_gradient(implementation, image, target, torch.zeros(12, 17, dtype=torch.uint8))
+        result, gradient = with_gradient(
+            implementation, image, target, torch.zeros(12, 17, dtype=torch.uint8)
+        )
         assert [float(value.detach()) for value in result] == [0.0, 0.0, 1.0]
         assert torch.all(gradient == 0)
 
@@ -191,7 +197,12 @@ class TestMeaning:
             (torch.zeros(4, 4), torch.zeros(4, 4).byte(), None, (ValueError, TypeError)),
             (torch.zeros(0, 4, 3), torch.zeros(0, 4, 3).byte(), None, ValueError),
             (torch.zeros(4, 4, 3), torch.zeros(4, 5, 3).byte(), None, (ValueError, TypeError)),
-            (torch.zeros(4, 4, 3), torch.zeros(4, 4, 3).byte(), torch.ones(5, 4).byte(), (ValueError, TypeError)),
+            (
+                torch.zeros(4, 4, 3),
+                torch.zeros(4, 4, 3).byte(),
+                torch.ones(5, 4).byte(),
+                (ValueError, TypeError),
+            ),
         ],
     )
     def test_unsuitable_inputs_are_refused(self, implementation, image, target, mask, error):

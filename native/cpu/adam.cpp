@@ -1,10 +1,13 @@
 // Adam is bound by memory: one pass over the gradient to see that it is finite, one over everything.
-#include "adam.h"
-
 #include <algorithm>
 #include <atomic>
+#include <cstdint>
 #include <cstring>
+#include <optional>
 
+#include <nanobind/stl/optional.h>
+
+#include "bindings.h"
 #include "simd.h"
 #include "threads.h"
 
@@ -12,6 +15,11 @@ namespace vdgs {
 namespace {
 
 constexpr size_t kTaskFloats = 1 << 15;
+
+// parameter -= rate * m / (sqrt(v) * root + epsilon): both bias corrections are in rate and root.
+struct AdamStep {
+  float rate, root, beta1, beta2, epsilon;
+};
 
 struct Factors {
   F16 rate, root, beta1, beta2, rest1, rest2, epsilon;
@@ -68,28 +76,47 @@ bool stretch_finite(const float* values, size_t size) {
   return bad == 0;
 }
 
-size_t tasks(size_t size, size_t each) { return (size + each - 1) / each; }
-
-}  // namespace
+int64_t tasks(size_t size, size_t each) { return static_cast<int64_t>((size + each - 1) / each); }
 
 bool all_finite(const float* values, size_t size) {
   std::atomic<bool> finite{true};
-  parallel_for(tasks(size, kTaskFloats), [&](size_t task) {
-    const size_t begin = task * kTaskFloats, end = std::min(size, begin + kTaskFloats);
+  parallel_for(tasks(size, kTaskFloats), [&](int64_t task) {
+    const size_t begin = static_cast<size_t>(task) * kTaskFloats, end = std::min(size, begin + kTaskFloats);
     if (!stretch_finite(values + begin, end - begin)) finite.store(false, std::memory_order_relaxed);
   });
   return finite.load();
 }
 
+// `count` rows of `width` floats. rows ascend without repetition, or null: row i is row i. The gradient holds
+// `count` packed rows; the other three are addressed by row.
 void adam_rows(float* parameter, const int64_t* rows, size_t count, size_t width, const float* gradient, float* first,
                float* second, const AdamStep& step) {
   // A row's lanes may be cut differently by different runs of neighbours, but every lane is computed alike.
   const Factors factors(step);
   const size_t each = std::max<size_t>(1, kTaskFloats / std::max<size_t>(1, width));
-  parallel_for(tasks(count, each), [&](size_t task) {
-    update_rows(parameter, rows, task * each, std::min(count, (task + 1) * each), width, gradient, first, second,
-                factors);
+  parallel_for(tasks(count, each), [&](int64_t task) {
+    const size_t begin = static_cast<size_t>(task) * each;
+    update_rows(parameter, rows, begin, std::min(count, begin + each), width, gradient, first, second, factors);
   });
+}
+
+using State = Array<float, nb::ndim<2>>;
+
+bool bound(State parameter, std::optional<Array<const int64_t, nb::ndim<1>>> rows,
+           Array<const float, nb::ndim<2>> gradient, State first, State second, float rate, float root, float beta1,
+           float beta2, float epsilon) {
+  nb::gil_scoped_release release;
+  if (!all_finite(gradient.data(), gradient.size())) return false;
+  adam_rows(parameter.data(), rows ? rows->data() : nullptr, gradient.shape(0), gradient.shape(1), gradient.data(),
+            first.data(), second.data(), {rate, root, beta1, beta2, epsilon});
+  return true;
+}
+
+}  // namespace
+
+VDGS_BIND(adam_rows) {
+  m.def("adam_rows", &bound, nb::arg("parameter"), nb::arg("rows").none(), nb::arg("gradient"), nb::arg("first"),
+        nb::arg("second"), nb::arg("rate"), nb::arg("root"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"));
 }
 
 }  // namespace vdgs

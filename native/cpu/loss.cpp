@@ -15,14 +15,20 @@
 //
 // the gradient of sum S is  G(S_a) + 2x G(S_q) + y G(S_c): zero padding makes G its own adjoint.
 //
+// Where the mask is zero x is replaced by y and neither sum counts the pixel: see reference/loss.py.
 // Tiles do not depend on the number of threads, and their sums are added in order: same bits always.
-#include "loss.h"
-
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
+#include <optional>
+#include <tuple>
 #include <vector>
 
-#include "aligned.h"
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+
+#include "bindings.h"
+#include "scratch.h"
 #include "simd.h"
 #include "threads.h"
 
@@ -54,6 +60,10 @@ struct Window {
   static double gauss(int i) { return std::exp(-(i - kHalf) * (i - kHalf) / (2 * 1.5 * 1.5)); }
 };
 const Window kWindow;
+
+struct Photometric {
+  double loss, l1, ssim;
+};
 
 struct Images {
   const float* image;
@@ -298,8 +308,6 @@ int64_t kept_pixels(const uint8_t* mask, int64_t pixels) {
   return kept;
 }
 
-}  // namespace
-
 Photometric photometric_loss(const float* image, const uint8_t* target, const uint8_t* mask, int height, int width,
                              float ssim_weight, float* gradient) {
   // With nothing kept both sums are zero, whatever they are divided by.
@@ -308,8 +316,8 @@ Photometric photometric_loss(const float* image, const uint8_t* target, const ui
                       static_cast<float>((1.0 - ssim_weight) / count), static_cast<float>(-ssim_weight / count)};
   const std::vector<Tile> tiles = cut(height, images.lanes);
   std::vector<Sums> sums(tiles.size());
-  parallel_for(tiles.size(), [&](size_t i) {
-    thread_local AlignedBuffer<float> memory;
+  parallel_for(static_cast<int64_t>(tiles.size()), [&](int64_t i) {
+    thread_local Scratch<float> memory;
     Walk walk(images, tiles[i], memory.at_least(Walk::memory_floats(tiles[i].end_lane - tiles[i].first_lane + kLanes)));
     sums[i] = walk.run();
   });
@@ -317,6 +325,27 @@ Photometric photometric_loss(const float* image, const uint8_t* target, const ui
   for (const Sums& part : sums) total.l1 += part.l1, total.ssim += part.ssim;
   const double l1 = total.l1 / count, dissimilarity = total.ssim / count;
   return {(1.0 - ssim_weight) * l1 + ssim_weight * dissimilarity, l1, 1.0 - dissimilarity};
+}
+
+using Image = Array<const float, nb::ndim<3>>;
+using Bytes = Array<const uint8_t, nb::ndim<3>>;
+using Mask = Array<const uint8_t, nb::ndim<2>>;
+using Gradient = Array<float, nb::ndim<3>>;
+
+std::tuple<double, double, double> bound(Image image, Bytes target, std::optional<Mask> mask, float ssim_weight,
+                                         std::optional<Gradient> gradient) {
+  const int height = static_cast<int>(image.shape(0)), width = static_cast<int>(image.shape(1));
+  nb::gil_scoped_release release;
+  const Photometric result = photometric_loss(image.data(), target.data(), mask ? mask->data() : nullptr, height,
+                                              width, ssim_weight, gradient ? gradient->data() : nullptr);
+  return {result.loss, result.l1, result.ssim};
+}
+
+}  // namespace
+
+VDGS_BIND(photometric_loss) {
+  m.def("photometric_loss", &bound, nb::arg("image"), nb::arg("target"), nb::arg("mask").none(),
+        nb::arg("ssim_weight"), nb::arg("gradient").none());
 }
 
 }  // namespace vdgs

@@ -8,11 +8,12 @@
 // Float32 is exact enough because points are taken relative to the block's centre, whose own distance to
 // each plane is computed in float64. What rounding could still decide, a point nearer to a plane than a bound
 // on the error, is computed again in float64: the result is that of brute force in float64.
-#include "views.h"
-
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
+#include <vector>
 
+#include "bindings.h"
 #include "simd.h"
 #include "threads.h"
 
@@ -25,6 +26,16 @@ constexpr int kPlanes = 5;
 // Bound on the error of n·p + d in float32, in units of (radius of the block + |d|), for |n| = 1: the
 // coordinates, the normal and d are rounded once each (3 · 2^-24), the three fused steps once each.
 constexpr double kRounding = 16.0 / (1 << 24);
+// The same for what is computed in float64, in units of all that is added up.
+constexpr double kExactRounding = 16.0 / (int64_t{1} << 53);
+// Blocks that reach further than this could overflow in float32; they are computed in float64 throughout.
+constexpr float kFar = 1e30f;
+
+// In float64, packed in this order by views.py; the rotation is row-major.
+struct ViewCamera {
+  double rotation[9], translation[3], fx, fy, cx, cy, width, height, orthographic, near;
+};
+constexpr size_t kCameraNumbers = sizeof(ViewCamera) / sizeof(double);
 
 struct Plane {
   double normal[3], offset;
@@ -76,7 +87,7 @@ bool sees(const ViewCamera& c, const double* p) {
 struct Block {
   alignas(64) float column[3][kBlock];
   alignas(64) int32_t count[kBlock];
-  double centre[3], half[3], radius;
+  double centre[3], half[3], radius, magnitude;
   size_t size;
 };
 
@@ -99,12 +110,13 @@ void fill(Block& block, const Scalar* points, size_t size) {
     }
   }
   block.size = size;
-  block.radius = 0.0;
+  block.radius = block.magnitude = 0.0;
   for (int k = 0; k < 3; ++k) {
     const bool empty = low[k] > high[k];
     block.centre[k] = empty ? 0.0 : 0.5 * low[k] + 0.5 * high[k];
     block.half[k] = empty ? 0.0 : 0.5 * high[k] - 0.5 * low[k];
     block.radius += block.half[k];
+    block.magnitude += std::abs(block.centre[k]) + block.half[k];
   }
   for (int k = 0; k < 3; ++k) {
     std::fill(block.column[k], block.column[k] + kBlock, 0.0f);
@@ -131,8 +143,8 @@ Side cut_block(const Block& block, const Frustum& frustum, Cut& cut) {
       distance += plane.normal[k] * block.centre[k];
       reach += std::abs(plane.normal[k]) * block.half[k];
     }
-    // The margin covers the rounding of all that was computed here, which the exact test would share.
-    const double doubt = kRounding * (block.radius + std::abs(distance));
+    const double doubt = kRounding * (block.radius + std::abs(distance)) +
+                         kExactRounding * (block.magnitude + std::abs(plane.offset));
     if (distance < -reach - doubt) return Side::kOutside;
     if (distance > reach + doubt) continue;
     for (int k = 0; k < 3; ++k) cut.normal[cut.planes][k] = static_cast<float>(plane.normal[k]);
@@ -143,7 +155,17 @@ Side cut_block(const Block& block, const Frustum& frustum, Cut& cut) {
 }
 
 template <class Scalar>
+void count_exact(Block& block, size_t at, const ViewCamera& camera, const Scalar* points) {
+  const double exact[3] = {points[3 * at], points[3 * at + 1], points[3 * at + 2]};
+  block.count[at] += sees(camera, exact);
+}
+
+template <class Scalar>
 void count_cut(Block& block, const Cut& cut, const ViewCamera& camera, const Scalar* points) {
+  if (!(cut.doubt < kFar)) {
+    for (size_t at = 0; at < block.size; ++at) count_exact(block, at, camera, points);
+    return;
+  }
   for (size_t i = 0; i < block.size; i += kLanes) {
     const F16 x = load(block.column[0] + i), y = load(block.column[1] + i), z = load(block.column[2] + i);
     F16 nearest = splat(HUGE_VALF);
@@ -153,25 +175,22 @@ void count_cut(Block& block, const Cut& cut, const ViewCamera& camera, const Sca
     }
     const F16 doubt = splat(cut.doubt);
     const M16 inside = gt(nearest, doubt);
-    const I16 counted = load(block.count + i);
-    store(block.count + i, counted + (bits_of(zero_unless(inside, splat(1.0f))) & splat(int32_t{1 << 23})));
+    // The bits of 1.0f are 127 << 23: their lowest set bit, moved down, is the integer one.
+    const I16 one = shift_right<23>(bits_of(zero_unless(inside, splat(1.0f)))) & splat(int32_t{1});
+    store(block.count + i, load(block.count + i) + one);
     for (unsigned open = bits(le(abs(nearest), doubt)); open; open &= open - 1) {
       const size_t at = i + static_cast<size_t>(__builtin_ctz(open));
-      if (at >= block.size) break;
-      const double exact[3] = {points[3 * at], points[3 * at + 1], points[3 * at + 2]};
-      if (sees(camera, exact)) block.count[at] += 1;
+      if (at < block.size) count_exact(block, at, camera, points);
     }
   }
 }
-
-}  // namespace
 
 template <class Scalar>
 void count_views(const Scalar* points, size_t n, const ViewCamera* cameras, size_t n_cameras, int32_t* count) {
   std::vector<Frustum> frusta(n_cameras);
   for (size_t i = 0; i < n_cameras; ++i) frusta[i] = frustum_of(cameras[i]);
-  parallel_for((n + kBlock - 1) / kBlock, [&](size_t task) {
-    const size_t begin = task * kBlock, size = std::min(kBlock, n - begin);
+  parallel_for(static_cast<int64_t>((n + kBlock - 1) / kBlock), [&](int64_t task) {
+    const size_t begin = static_cast<size_t>(task) * kBlock, size = std::min(kBlock, n - begin);
     const Scalar* own = points + 3 * begin;
     Block block;
     fill(block, own, size);
@@ -186,7 +205,19 @@ void count_views(const Scalar* points, size_t n, const ViewCamera* cameras, size
   });
 }
 
-template void count_views<float>(const float*, size_t, const ViewCamera*, size_t, int32_t*);
-template void count_views<double>(const double*, size_t, const ViewCamera*, size_t, int32_t*);
+template <class Scalar>
+void bound(Array<const Scalar, nb::shape<-1, 3>> points, Array<const double, nb::shape<-1, kCameraNumbers>> cameras,
+           Array<int32_t, nb::ndim<1>> count) {
+  nb::gil_scoped_release release;
+  count_views(points.data(), points.shape(0), reinterpret_cast<const ViewCamera*>(cameras.data()), cameras.shape(0),
+              count.data());
+}
+
+}  // namespace
+
+VDGS_BIND(count_views) {
+  m.def("count_views", &bound<float>, nb::arg("points").noconvert(), nb::arg("cameras"), nb::arg("count"));
+  m.def("count_views", &bound<double>, nb::arg("points").noconvert(), nb::arg("cameras"), nb::arg("count"));
+}
 
 }  // namespace vdgs

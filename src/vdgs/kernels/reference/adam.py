@@ -91,9 +91,8 @@ def check_rows(
         raise ValueError(f"rows must be [v], not {list(rows.shape)}")
     count = parameter.shape[0] if rows is None else rows.shape[0]
     if gradient.shape != (count, *parameter.shape[1:]):
-        raise ValueError(
-            f"gradient is {list(gradient.shape)}, expected {[count, *parameter.shape[1:]]}: one row for each row"
-        )
+        expected = [count, *parameter.shape[1:]]
+        raise ValueError(f"gradient is {list(gradient.shape)}, not {expected}: one row for each of the rows")
     if rows is None or count == 0:
         return
     if not bool((rows[1:] > rows[:-1]).all()):

@@ -62,9 +62,7 @@ def group_max(values: Float[Tensor, "n d"], group: Int64[Tensor, "n"], count: in
 
     Raises IndexError for a group outside [0, count).
     """
-    check_groups(values, group)
-    if group.numel() and (int(group.min()) < 0 or int(group.max()) >= count):
-        raise IndexError(f"groups reach from {int(group.min())} to {int(group.max())}, of {count}")
+    check_groups(values, group, count)
     result = values.new_zeros(count, values.shape[1])
     index = group[:, None].expand_as(values)
     return result.scatter_reduce(0, index, values.detach(), "amax", include_self=False)
@@ -141,8 +139,8 @@ def check_keys(keys: Tensor) -> None:
         raise ValueError(f"keys must be [n], not {list(keys.shape)}")
 
 
-def check_groups(values: Tensor, group: Tensor) -> None:
-    """Raise a clear error unless every row of the values has a group."""
+def check_groups(values: Tensor, group: Tensor, count: int) -> None:
+    """Raise a clear error unless every row of the values has one of the `count` groups."""
     if values.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"values must be float32 or float64, not {values.dtype}")
     if group.dtype != torch.int64:
@@ -151,3 +149,5 @@ def check_groups(values: Tensor, group: Tensor) -> None:
         raise ValueError(
             f"expected values [n, d] and group [n], got {list(values.shape)} and {list(group.shape)}"
         )
+    if group.numel() and (int(group.min()) < 0 or int(group.max()) >= count):
+        raise IndexError(f"groups reach from {int(group.min())} to {int(group.max())}, of {count}")
