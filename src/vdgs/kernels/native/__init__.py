@@ -1,1 +1,18 @@
 """C++ implementations for the CPU, chosen at run time by instruction set."""
+
+from vdgs.kernels.native.adam import adam_rows
+from vdgs.kernels.native.cells import cell_keys, contains, group_cells, group_max, morton_order
+from vdgs.kernels.native.loss import photometric_loss
+from vdgs.kernels.native.views import count_views, mark_views
+
+__all__ = [
+    "adam_rows",
+    "cell_keys",
+    "contains",
+    "count_views",
+    "group_cells",
+    "group_max",
+    "mark_views",
+    "morton_order",
+    "photometric_loss",
+]
