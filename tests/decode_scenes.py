@@ -75,8 +75,7 @@ class Scene:
         moved = self.with_trainable(tensors)
         return Scene(self.positions.to(dtype), moved.features, moved.offsets, moved.log_scales, moved.weights)
 
-    def decode(self, implementation, camera: Camera):
-        """Splats of this scene by `implementation.decode`."""
-        return implementation.decode.decode(
-            self.positions, self.features, self.offsets, self.log_scales, self.weights, camera
-        )
+    @property
+    def arguments(self) -> tuple:
+        """What `decode` takes before the camera."""
+        return self.positions, self.features, self.offsets, self.log_scales, self.weights

@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vdgs.cameras import Camera
-from vdgs.kernels import native, reference
 from vdgs.kernels.constants import DILATION_PX2
+from vdgs.kernels.native.project import project as native_project
+from vdgs.kernels.reference.project import project as twin_project
+from vdgs.kernels.reference.project import rotation_matrices
 
 CAMERAS = [looking_down(), looking_down("orthographic"), turned()]
 
@@ -25,7 +27,7 @@ def gaussians(m: int, seed: int = 0, log_sigma: float = -2.0) -> tuple[torch.Ten
 
 
 def monte_carlo_covariance(mean: np.ndarray, scales, quaternion, camera: Camera) -> np.ndarray:
-    rotation = reference.project.rotation_matrices(quaternion[None])[0].numpy()
+    rotation = rotation_matrices(quaternion[None])[0].numpy()
     samples = np.random.default_rng(0).normal(size=(200_000, 3)) * scales.numpy() @ rotation.T + mean
     return np.cov(camera.project(samples)[0].T) + DILATION_PX2 * np.eye(2)
 
@@ -34,7 +36,7 @@ def monte_carlo_covariance(mean: np.ndarray, scales, quaternion, camera: Camera)
 def test_small_gaussians_have_the_covariance_of_their_projected_samples(camera):
     means, scales, quaternions = gaussians(4, log_sigma=-3.0)
     means = means * 0.3  # near the axis, where nothing is clamped
-    projected = reference.project.project(means, scales, quaternions, camera)
+    projected = twin_project(means, scales, quaternions, camera)
     pixels, depths = camera.project(means.numpy())
     np.testing.assert_allclose(projected.means_px.numpy(), pixels, rtol=1e-12)
     np.testing.assert_allclose(projected.depths.numpy(), depths, rtol=1e-12)
@@ -53,7 +55,7 @@ def test_gradients_of_the_twin_are_those_of_finite_differences(camera):
     arguments = [t.requires_grad_() for t in (means, scales, quaternions)]
 
     def f(*gaussian):
-        projected = reference.project.project(*gaussian, camera)
+        projected = twin_project(*gaussian, camera)
         return projected.means_px, projected.conics, projected.depths
 
     assert torch.autograd.gradcheck(f, arguments, eps=1e-6, atol=1e-6, rtol=1e-5)
@@ -64,7 +66,7 @@ def awkward() -> tuple[torch.Tensor, ...]:
     means, scales, quaternions = gaussians(40, seed=2)
     means[0, 2], means[1, 2] = 50.0, 10.0
     means[2] = torch.tensor([40.0, 0.0, 9.9])
-    scales[3], scales[4], scales[5] = 1e3, 1e-6, 1e25
+    scales[3], scales[4], scales[5] = 1e3, 1e-6, 1e39
     scales[6] = torch.tensor([10.0, 1e-7, 1e-7])
     quaternions[7] = 0.0
     means[8, 0] = scales[9, 1] = quaternions[10, 2] = float("nan")
@@ -75,7 +77,7 @@ def awkward() -> tuple[torch.Tensor, ...]:
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_what_is_not_valid_is_zero_and_has_no_gradient(camera):
     arguments = [t.float().requires_grad_() for t in awkward()]
-    for project in (reference.project.project, native.project.project):
+    for project in (twin_project, native_project):
         projected = project(*arguments, camera)
         bad = ~projected.valid
         assert set(range(7, 13)) | {5} <= set(bad.nonzero()[:, 0].tolist())
@@ -92,8 +94,8 @@ def test_what_is_not_valid_is_zero_and_has_no_gradient(camera):
 def test_native_equals_the_twin(camera, make):
     exact = [t.float().double().requires_grad_() for t in make()]
     single = [t.detach().float().requires_grad_() for t in exact]
-    twin = reference.project.project(*exact, camera)
-    ours = native.project.project(*single, camera)
+    twin = twin_project(*exact, camera)
+    ours = native_project(*single, camera)
     assert torch.equal(ours.valid, twin.valid)
     generator = torch.Generator().manual_seed(0)
     losses = []
@@ -116,7 +118,7 @@ def test_moving_the_world_and_the_camera_together_changes_nothing(seed, angle):
     means, scales, quaternions = gaussians(5, seed=seed)
     camera = looking_down()
     turn = torch.tensor([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
-    rotation = reference.project.rotation_matrices(turn[None])[0]
+    rotation = rotation_matrices(turn[None])[0]
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = rotation.numpy(), [1.0, -2.0, 3.0]
     moved = Camera(
@@ -125,8 +127,8 @@ def test_moving_the_world_and_the_camera_together_changes_nothing(seed, angle):
     w, x, y, z = quaternions.unbind(-1)
     c, s = turn[0], turn[3]
     turned_quaternions = torch.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], -1)
-    a = reference.project.project(means, scales, quaternions, camera)
-    b = reference.project.project(
+    a = twin_project(means, scales, quaternions, camera)
+    b = twin_project(
         means @ rotation.T + torch.from_numpy(motion[:3, 3]), scales, turned_quaternions, moved
     )
     torch.testing.assert_close(a.means_px, b.means_px)
