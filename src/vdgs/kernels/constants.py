@@ -11,3 +11,5 @@ ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
 #: Added to the diagonal of every projected covariance, in square pixels.
 DILATION_PX2 = 0.3
+#: The Jacobian of the projection is taken no further out than this many half-angles of the frustum.
+FRUSTUM_MARGIN = 1.3

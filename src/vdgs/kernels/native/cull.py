@@ -1,0 +1,2 @@
+from vdgs.kernels.reference.cull import *
+from vdgs.kernels.reference.cull import cull

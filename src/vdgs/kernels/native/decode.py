@@ -1,0 +1,2 @@
+from vdgs.kernels.reference.decode import *
+from vdgs.kernels.reference.decode import decode

@@ -1,0 +1,2 @@
+from vdgs.kernels.reference.project import *
+from vdgs.kernels.reference.project import project
