@@ -56,9 +56,8 @@ def test_new_anchors_are_centred_in_empty_cells_that_hold_a_strong_offset(n, see
 def test_the_random_keep_follows_its_share():
     before, stats = anchors(20_000), statistics(20_000)
     stats.gradient[:] = 10.0
-    spread = Anchors(before.positions * 1e4, before.features, before.offsets, before.log_scales)
-    spread.positions[:, 0] += torch.arange(20_000) * 10.0
-    added = decide(spread, stats, 0.01, ALWAYS, torch.Generator().manual_seed(1)).added
+    before.positions[:, 0] = torch.arange(20_000) * 10.0 - 1e5
+    added = decide(before, stats, 0.2, ALWAYS, torch.Generator().manual_seed(1)).added
     assert 0.48 < len(added) / (20_000 * K) < 0.52
 
 
@@ -78,6 +77,16 @@ def test_features_are_the_elementwise_maximum_of_the_parents():
             torch.testing.assert_close(added.features[0], parents.features.amax(0))
             return
     pytest.fail("both parents were never kept together in 50 draws")
+
+
+def test_what_lies_beyond_the_lattice_does_not_grow():
+    before, stats = anchors(3), statistics(3)
+    stats.gradient[:] = 10.0
+    before.positions[0] = 1e9
+    before.positions[1] = float("inf")
+    added = decide(before, stats, 1.0, ALWAYS, torch.Generator().manual_seed(0)).added
+    assert 0 < len(added) <= K
+    assert float(added.positions.abs().max()) < 1000
 
 
 def test_weak_gradients_and_unseen_offsets_grow_nothing():

@@ -18,6 +18,9 @@ from vdgs.config import GrowthConfig
 from vdgs.kernels import native as kernels
 from vdgs.kernels.decode_types import FEATURE_SIZE
 
+#: Cells have keys within this many cells of the origin on each axis.
+LATTICE_REACH = 2**20
+
 
 @dataclass
 class Statistics:
@@ -147,28 +150,33 @@ def _fill_cells(
     k = anchors.offsets.shape[1]
     rows, offset = parents // k, parents % k
     means = anchors.positions[rows] + anchors.offsets[rows, offset] * anchors.log_scales[rows, :3].exp()
-    # Cells are centred on multiples of their edge (upstream rounds), hence the shift by half a cell; the origin
-    # lies on a multiple of the coarsest cell, so that the grids of all levels stay where they are for ever.
-    finite = torch.isfinite(means).all(1)
-    parents, rows, means = parents[finite], rows[finite], means[finite]
+    within = _within_lattice(means, cell)
+    parents, rows, means = parents[within], rows[within], means[within]
     if not len(parents):
         return anchors.select(parents)
-    low = torch.minimum(means.amin(0), occupied.amin(0))
-    origin = (torch.floor(low / cell) - 1.0) * cell - 0.5 * cell
+    # Cells are centred on multiples of their edge (upstream rounds), hence the origin at half a cell.
+    origin = torch.full((3,), -0.5 * cell)
     keys = kernels.cell_keys(means, cell, origin)
     cells, group = kernels.group_cells(keys)
-    empty = ~kernels.contains(kernels.cell_keys(occupied, cell, origin), cells)
+    empty = ~kernels.contains(kernels.cell_keys(occupied[_within_lattice(occupied, cell)], cell, origin), cells)
     features = kernels.group_max(anchors.features[rows], group, len(cells))
     if room is not None and int(empty.sum()) > room:
         strongest = kernels.group_max(gradient.reshape(-1)[parents][:, None], group, len(cells))[:, 0]
         strongest[~empty] = -1.0
         empty = torch.zeros_like(empty).index_fill_(0, strongest.argsort(descending=True, stable=True)[:room], True)
     first = torch.full((len(cells),), len(group)).scatter_reduce_(0, group, torch.arange(len(group)), "amin")
-    index = torch.round((means[first[empty]] - origin) / cell - 0.5)
+    index = torch.floor((means[first[empty]].double() - origin) / cell)
     count = len(index)
     return Anchors(
-        positions=origin + (index + 0.5) * cell,
+        positions=(index * cell).float(),
         features=features[empty].reshape(count, FEATURE_SIZE),
         offsets=torch.zeros(count, k, 3),
         log_scales=torch.full((count, 6), math.log(cell)),
     )
+
+
+def _within_lattice(points: Float[Tensor, "p 3"], cell: float) -> Bool[Tensor, " p"]:
+    """Which points have a cell: finite and within 2^20 cells of the origin (a key has 21 bits an axis).
+
+    What lies farther away than a million of the finest cells does not grow (choice)."""
+    return (points.abs() < (LATTICE_REACH - 2) * cell).all(1)
