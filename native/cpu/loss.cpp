@@ -283,7 +283,12 @@ void Walk::gradient_row(int row) {
     const F16 ssim = slope[0] + fma(splat(2.0f) * a, slope[1], b * slope[2]);
     const F16 sign = zero_unless(gt(a, b), l1_scale) - zero_unless(lt(a, b), l1_scale);
     const F16 total = fma(ssim_scale, ssim, sign) * load(kept + at);
-    store_first(out + lane, std::min(kLanes, tile_.end_lane - lane), total);
+    const int lanes = tile_.end_lane - lane;
+    if (lanes >= kLanes) {
+      storeu(out + lane, total);
+    } else {
+      store_first(out + lane, lanes, total);
+    }
   }
 }
 
