@@ -52,8 +52,8 @@ def look_down(position: np.ndarray, tilt_deg: float = 0.0, yaw_deg: float = 0.0)
 
 
 def tiny_scene(
-    columns: int = 4, rows: int = 3, width: int = 64, height: int = 48, altitude: float = 10.0, points: int = 400,
-    seed: int = 0,
+    columns: int = 4, rows: int = 3, width: int = 64, height: int = 48, altitude: float = 10.0,
+    points: int = 400, seed: int = 0,
 ) -> TinyScene:  # fmt: skip
     """A grid of slightly tilted cameras over a plane with low bumps; everything is drawn from `seed`."""
     generator = np.random.default_rng(seed)
@@ -102,8 +102,8 @@ def write_images(folder: Path, scene: TinyScene, shown: TinyScene | None = None)
 
 
 def write_colmap(
-    root: Path, scene: TinyScene, *, text: bool = False, model: str = "PINHOLE", extra: tuple[float, ...] = (),
-    images: str | None = "images", sparse: str = "sparse/0", shown: TinyScene | None = None,
+    root: Path, scene: TinyScene, *, text: bool = False, model: str = "PINHOLE",
+    extra: tuple[float, ...] = (), images: str | None = "images", sparse: str = "sparse/0", shown: TinyScene | None = None,
 ) -> Path:  # fmt: skip
     """The scene as a COLMAP capture, one camera per image; `extra` are lens parameters. Returns the model "
     "folder."""
@@ -148,7 +148,7 @@ def _write_binary(folder: Path, scene: TinyScene, model: str, extra: tuple[float
         images += name.encode() + b"\0" + struct.pack("<Q", 1) + struct.pack("<ddq", 1.0, 2.0, -1)
     points = struct.pack("<Q", len(scene.points))
     for index, (point, colour) in enumerate(zip(scene.points, scene.colours, strict=True), 1):
-        points += struct.pack("<Q3d3Bd", index, *point, *colour, 0.5) + struct.pack("<QIIII", 2, 1, 0, 2, 0)
+        points += struct.pack("<Q3d3Bd", index, *point, *colour, 0.5) + struct.pack("<Q", 0)
     for stem, data in (("cameras", cameras), ("images", images), ("points3D", points)):
         (folder / f"{stem}.bin").write_bytes(data)
 
@@ -163,7 +163,7 @@ def _write_text(folder: Path, scene: TinyScene, model: str, extra: tuple[float, 
         images += [f"{index} {numbers} {index} {name}", "1.0 2.0 -1"]
     for index, (point, colour) in enumerate(zip(scene.points, scene.colours, strict=True), 1):
         words = [*(repr(float(value)) for value in point), *(str(int(value)) for value in colour)]
-        points.append(f"{index} {' '.join(words)} 0.5 1 0 2 0")
+        points.append(f"{index} {' '.join(words)} 0.5")
     for stem, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
         (folder / f"{stem}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
