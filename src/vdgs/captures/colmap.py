@@ -183,7 +183,8 @@ def _views(records: list[_ImageRecord], cameras: dict[int, Intrinsics], file: Pa
 def _pose(record: _ImageRecord, file: Path) -> np.ndarray:
     label = f"image {record.name!r}"
     quaternion = np.array(record.quaternion)
-    if not np.isfinite(quaternion).all() or abs(np.linalg.norm(quaternion) - 1) > QUATERNION_TOLERANCE:
+    near = np.isfinite(quaternion).all() and np.abs(quaternion).max() < 2  # before squares overflow
+    if not near or abs(np.linalg.norm(quaternion) - 1) > QUATERNION_TOLERANCE:
         raise CaptureError(
             f"{file}: {label} has the rotation {record.quaternion}, which is not a unit quaternion. "
             "The file is damaged; copy or export the COLMAP model again."

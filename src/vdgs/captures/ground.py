@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.alignment import fit_similarity_robust, geometric_median, is_collinear
+from vdgs.captures.alignment import Similarity, fit_similarity_robust, geometric_median, is_collinear
 from vdgs.captures.capture import GroundFrame
 from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.captures.georeference import match_gps, read_georef, read_gps
@@ -125,13 +125,17 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
     origin = (float(median[0]), float(median[1]), float(median[2]))
     enu = enu_from_geodetic(geodetic, origin)
     centres = scene.centres[indices]
-    if is_collinear(centres) or is_collinear(enu):
+    similarity, inliers = Similarity(1.0, np.eye(3), np.zeros(3)), np.ones(len(centres), bool)
+    fixed = not is_collinear(centres)
+    if fixed:
+        similarity, inliers = fit_similarity_robust(centres, enu)
+        fixed = not is_collinear(enu[inliers])
+    if not fixed:
         warnings.append(
             f"{file.name}: {len(indices)} photographs with GPS, all along one line (or fewer than three), "
             "fix no up axis; the frame is estimated from the cameras instead and is not metric."
         )
         return None
-    similarity, inliers = fit_similarity_robust(centres, enu)
     residuals = similarity.apply(centres)[inliers] - enu[inliers]
     rms = float(np.sqrt((residuals**2).sum(axis=1).mean()))
     spread = float(np.sqrt((enu - enu.mean(axis=0)).var(axis=0).sum()))
