@@ -2,7 +2,10 @@
 
 from vdgs.kernels.native.adam import adam_rows
 from vdgs.kernels.native.cells import cell_keys, contains, group_cells, group_max, morton_order
+from vdgs.kernels.native.cull import cull
+from vdgs.kernels.native.decode import decode
 from vdgs.kernels.native.loss import photometric_loss
+from vdgs.kernels.native.project import project
 from vdgs.kernels.native.views import count_views, mark_views
 
 __all__ = [
@@ -10,9 +13,12 @@ __all__ = [
     "cell_keys",
     "contains",
     "count_views",
+    "cull",
+    "decode",
     "group_cells",
     "group_max",
     "mark_views",
     "morton_order",
     "photometric_loss",
+    "project",
 ]
