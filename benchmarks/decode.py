@@ -18,14 +18,11 @@ import torch
 
 from vdgs.cameras import Camera
 from vdgs.kernels.decode_types import DecoderWeights, Splats
-from vdgs.kernels.native import cull as native_cull
-from vdgs.kernels.native import decode as native_decode
 from vdgs.kernels.native import module
+from vdgs.kernels.native.cull import cull as native_cull
+from vdgs.kernels.native.decode import decode as native_decode
 from vdgs.kernels.reference.cull import cull as twin_cull
 from vdgs.kernels.reference.decode import decode as twin_decode
-
-#: Names under which the wrappers look up the module of the chosen instruction set.
-WRAPPERS = ("vdgs.kernels.native.decode", "vdgs.kernels.native.cull")
 
 
 def overhead_camera() -> Camera:
@@ -56,11 +53,6 @@ def median_ms(run: Callable[[], object], repeats: int) -> float:
     return 1e3 * float(np.median(times))
 
 
-def loss(splats: Splats, weights: dict[str, torch.Tensor]) -> torch.Tensor:
-    """A scalar with a fixed gradient for every output, as cheap as can be."""
-    return sum((getattr(splats, name) * weight).sum() for name, weight in weights.items())  # type: ignore[return-value]
-
-
 def decode_times(decode: Callable[..., Splats], arguments: tuple, repeats: int) -> tuple[float, float, int]:
     """Forward ms, backward ms (of the decoder alone), and how many splats came out."""
     camera = overhead_camera()
@@ -82,24 +74,25 @@ def report_decode(v: int, k: int, repeats: int, isas: list[str]) -> None:
         for threads in (1, 2):
             torch.set_num_threads(threads)
             rows = [("torch twin", twin_decode, None, max(3, repeats // 5))]
-            rows += [(f"native {isa}", native_decode.decode, isa, repeats) for isa in isas]
+            rows += [(f"native {isa}", native_decode, isa, repeats) for isa in isas]
             for name, decode, isa, n in rows:
                 if isa:
                     use(isa, threads)
                 forward, backward, m = decode_times(decode, arguments, n)
                 print(
-                    f"{v:7d} anchors, {m:7d} splats, {'frozen' if frozen else 'free  '} decoder, {threads} thread(s), "
-                    f"{name:16s} forward {forward:7.2f} ms ({1e6 * forward / v:5.0f} ns)   "
-                    f"backward {backward:7.2f} ms ({1e6 * backward / v:5.0f} ns)   both {forward + backward:7.2f} ms"
+                    f"{v:7d} anchors, {m:7d} splats, {'frozen' if frozen else 'free  '} decoder, "
+                    f"{threads} thread(s), {name:16s} "
+                    f"forward {forward:7.2f} ms ({1e6 * forward / v:5.0f} ns)   "
+                    f"backward {backward:7.2f} ms ({1e6 * backward / v:5.0f} ns)   "
+                    f"both {forward + backward:7.2f} ms"
                 )
 
 
 def use(isa: str, threads: int) -> None:
-    """Let the wrappers run the kernels of one instruction set on so many threads."""
+    """Run the kernels of one instruction set on so many threads."""
     chosen = module.load(isa)
     chosen.set_threads(threads)
-    for wrapper in (native_decode, native_cull):
-        mock.patch.object(wrapper, "native", lambda: chosen).start()
+    mock.patch.object(module, "native", return_value=chosen).start()
 
 
 def report_cull(n: int, isas: list[str]) -> None:
@@ -119,16 +112,16 @@ def report_cull(n: int, isas: list[str]) -> None:
             times = [("torch twin", median_ms(lambda c=camera: twin_cull(positions, log_scales, c), 3))]
             for isa in isas:
                 use(isa, threads)
-                times.append(
-                    (isa, median_ms(lambda c=camera: native_cull.cull(positions, log_scales, c), 15))
-                )
+                times.append((isa, median_ms(lambda c=camera: native_cull(positions, log_scales, c), 15)))
             listed = ", ".join(f"{label} {ms:.2f} ms ({1e6 * ms / n:.1f} ns)" for label, ms in times)
             print(f"cull {n} anchors, {name} ({seen} seen), {threads} thread(s): {listed}")
 
 
 def main() -> None:
     """Measure what the command line asks for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--anchors", type=int, nargs="*", default=[20_000, 100_000])
     parser.add_argument("--offsets", type=int, default=10)
     parser.add_argument("--isa", nargs="*", default=list(module.supported()))

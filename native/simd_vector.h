@@ -121,19 +121,23 @@ VDGS_INLINE M16 mask_of_bits(unsigned u) {
 }
 VDGS_INLINE M16 first_lanes(int count) { return mask_of_bits((1u << count) - 1u); }
 
-#define VDGS_LOADS_AND_STORES(Lanes, Scalar)                                                           \
-  VDGS_INLINE Lanes load(const Scalar* p) {                                                            \
-    Lanes r;                                                                                           \
-    std::memcpy(&r, __builtin_assume_aligned(p, 64), 64);                                              \
-    return r;                                                                                          \
-  }                                                                                                    \
-  VDGS_INLINE Lanes loadu(const Scalar* p) {                                                           \
-    Lanes r;                                                                                           \
-    std::memcpy(&r, p, 64);                                                                            \
-    return r;                                                                                          \
-  }                                                                                                    \
-  VDGS_INLINE void store(Scalar* p, Lanes a) { std::memcpy(__builtin_assume_aligned(p, 64), &a, 64); } \
-  VDGS_INLINE void storeu(Scalar* p, Lanes a) { std::memcpy(p, &a, 64); }
+// Part by part: a copy of all 64 bytes at once goes through the stack in pieces of 16 bytes, and the
+// wider load that follows stalls on them.
+#define VDGS_LOADS_AND_STORES(Lanes, Scalar)                                                  \
+  VDGS_INLINE Lanes loadu(const Scalar* p) {                                                  \
+    Lanes r;                                                                                  \
+    VDGS_EACH std::memcpy(&r.v[k], p + k * kPartLanes, sizeof r.v[k]);                        \
+    return r;                                                                                 \
+  }                                                                                           \
+  VDGS_INLINE void storeu(Scalar* p, Lanes a) {                                               \
+    VDGS_EACH std::memcpy(p + k * kPartLanes, &a.v[k], sizeof a.v[k]);                        \
+  }                                                                                           \
+  VDGS_INLINE Lanes load(const Scalar* p) {                                                   \
+    return loadu(static_cast<const Scalar*>(__builtin_assume_aligned(p, 64)));                \
+  }                                                                                           \
+  VDGS_INLINE void store(Scalar* p, Lanes a) {                                                \
+    storeu(static_cast<Scalar*>(__builtin_assume_aligned(p, 64)), a);                         \
+  }
 VDGS_LOADS_AND_STORES(F16, float)
 VDGS_LOADS_AND_STORES(I16, int32_t)
 #undef VDGS_LOADS_AND_STORES

@@ -45,7 +45,13 @@ class Scene:
 
     @staticmethod
     def random(
-        v: int, k: int = 10, *, with_distance: bool = False, seed: int = 0, spread: float = 3.0, log_scale: float = -1.5
+        v: int,
+        k: int = 10,
+        *,
+        with_distance: bool = False,
+        seed: int = 0,
+        spread: float = 3.0,
+        log_scale: float = -1.5,
     ) -> Scene:
         """Anchors scattered about the origin, about half of their splats opaque; float32."""
         g = torch.Generator().manual_seed(seed)
@@ -65,7 +71,9 @@ class Scene:
     def with_trainable(self, tensors) -> Scene:
         """The same scene with other trainable tensors."""
         features, offsets, log_scales, *weights = tensors
-        return Scene(self.positions, features, offsets, log_scales, DecoderWeights.from_tensors(tuple(weights)))
+        return Scene(
+            self.positions, features, offsets, log_scales, DecoderWeights.from_tensors(tuple(weights))
+        )
 
     def to(self, dtype: torch.dtype, frozen: bool = False) -> Scene:
         """A copy in another precision, as leaves that require gradients (but the decoder, where frozen)."""

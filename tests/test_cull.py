@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from decode_scenes import looking_down, turned
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from decode_scenes import looking_down, turned
 from vdgs.cameras import NEAR
+from vdgs.kernels.native import module
 from vdgs.kernels.native.cull import cull as native_cull
 from vdgs.kernels.reference.cull import cull as twin_cull
 from vdgs.kernels.reference.project import project
@@ -17,7 +18,9 @@ CAMERAS = [looking_down(), looking_down("orthographic"), turned()]
 BOTH = pytest.mark.parametrize("cull", [twin_cull, native_cull])
 
 
-def anchors(n: int, seed: int, spread: float = 8.0, log_scale: float = -1.0) -> tuple[torch.Tensor, torch.Tensor]:
+def anchors(
+    n: int, seed: int, spread: float = 8.0, log_scale: float = -1.0
+) -> tuple[torch.Tensor, torch.Tensor]:
     g = torch.Generator().manual_seed(seed)
     return spread * torch.randn(n, 3, generator=g), torch.randn(n, 6, generator=g) + log_scale
 
@@ -35,7 +38,9 @@ def ellipse_touches_image(positions, log_scales, camera) -> torch.Tensor:
 
 @BOTH
 @settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 10**6), spread=st.floats(0.5, 30), log_scale=st.floats(-6, 3), which=st.integers(0, 2))
+@given(
+    seed=st.integers(0, 10**6), spread=st.floats(0.5, 30), log_scale=st.floats(-6, 3), which=st.integers(0, 2)
+)
 def test_never_drops_what_touches_the_image(cull, seed, spread, log_scale, which):
     positions, log_scales = anchors(400, seed, spread, log_scale)
     touching = ellipse_touches_image(positions, log_scales, CAMERAS[which]).nonzero()[:, 0]
@@ -56,7 +61,9 @@ def test_keeps_little_else(cull, camera):
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("n", [0, 1, 15, 17, 5000])
-def test_native_equals_the_twin(camera, n):
+@pytest.mark.parametrize("isa", module.supported())
+def test_native_equals_the_twin(camera, n, isa, monkeypatch):
+    monkeypatch.setattr(module, "native", lambda: module.load(isa))
     positions, log_scales = anchors(n, seed=2)
     ours = set(native_cull(positions, log_scales, camera).tolist())
     twin = set(twin_cull(positions.double(), log_scales.double(), camera).tolist())

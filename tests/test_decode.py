@@ -6,14 +6,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from decode_scenes import Scene, looking_down, turned
 
+from decode_scenes import Scene, looking_down, turned
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.decode_types import DecoderWeights, Splats
+from vdgs.kernels.native import module
 from vdgs.kernels.native.decode import decode as native_decode
 from vdgs.kernels.reference.decode import decode as twin_decode
 
 CAMERAS = [looking_down(), looking_down("orthographic"), turned()]
+EVERY_ISA = pytest.mark.parametrize("isa", module.supported())
 BOTH = pytest.mark.parametrize("decode", [twin_decode, native_decode])
 NUMBERS = ("means_px", "conics", "depths", "colours", "opacities", "volumes")
 
@@ -63,7 +65,9 @@ def test_splats_follow_the_definition(decode):
     torch.testing.assert_close(splats.colours[index], torch.sigmoid(colour.reshape(4, 3)[offset]), **close)
     torch.testing.assert_close(splats.volumes[index], scale.prod(), **close)
     pixels, depths = camera.project(mean[None].double().numpy())
-    torch.testing.assert_close(splats.means_px[index].double(), torch.from_numpy(pixels[0]), rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(
+        splats.means_px[index].double(), torch.from_numpy(pixels[0]), rtol=1e-4, atol=1e-3
+    )
     torch.testing.assert_close(splats.depths[index].double(), torch.from_numpy(depths)[0], **close)
 
 
@@ -92,7 +96,11 @@ def assert_same(scene: Scene, camera, frozen: bool = False, tolerance: float = 1
     ours, twin = restricted(ours, common), restricted(twin, common)
     for name in NUMBERS:
         torch.testing.assert_close(
-            getattr(ours, name).double(), getattr(twin, name), rtol=2e-4, atol=2e-4, msg=lambda m, n=name: f"{n}: {m}"
+            getattr(ours, name).double(),
+            getattr(twin, name),
+            rtol=2e-4,
+            atol=2e-4,
+            msg=lambda m, n=name: f"{n}: {m}",
         )
     leaves = [(a, b) for a, b in zip(single.trainable, exact.trainable, strict=True) if b.requires_grad]
     gradients = torch.autograd.grad(weighted_sum(ours), [a for a, _ in leaves])
@@ -192,3 +200,46 @@ def test_weights_survive_a_walk_through_their_tensors():
     assert all(a is b for a, b in zip(weights.tensors(), again.tensors(), strict=True))
     assert weights.covariance.w2.shape == (35, 32)
     assert weights.map(lambda t: 2 * t).colour.w1.shape == (32, 36)
+
+
+def results(scene: Scene, camera) -> list[torch.Tensor]:
+    """Splats and gradients of the native decoder, to be compared bit by bit."""
+    scene = scene.to(torch.float32)
+    splats = native_decode(*scene.arguments, camera)
+    numbers = [getattr(splats, name) for name in (*NUMBERS, "source")]
+    return [*(t.detach() for t in numbers), *torch.autograd.grad(weighted_sum(splats), scene.trainable)]
+
+
+@EVERY_ISA
+def test_any_number_of_threads_gives_the_same_bits(isa, monkeypatch):
+    chosen = module.load(isa)
+    monkeypatch.setattr(module, "native", lambda: chosen)
+    scene, threads = Scene.random(1500, seed=5), chosen.threads()
+    try:
+        runs = []
+        for count in (1, 2, 3):
+            chosen.set_threads(count)
+            runs.append(results(scene, CAMERAS[2]))
+    finally:
+        chosen.set_threads(threads)
+    for run in runs[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(run, runs[0], strict=True))
+
+
+@EVERY_ISA
+def test_every_instruction_set_equals_the_twin(isa, monkeypatch):
+    monkeypatch.setattr(module, "native", lambda: module.load(isa))
+    assert_same(Scene.random(330, seed=6), CAMERAS[2])
+    assert_same(Scene.random(37, k=3, with_distance=True, seed=6), CAMERAS[1])
+
+
+def test_shapes_that_do_not_belong_together_are_refused():
+    scene = Scene.random(4)
+    for wrong in (
+        replace(scene, features=scene.features[:3]),
+        replace(scene, log_scales=scene.log_scales[:, :5]),
+        replace(scene, weights=Scene.random(1, k=9).weights),
+        Scene.random(1, k=33),
+    ):
+        with pytest.raises(ValueError, match=r"must be"):
+            native_decode(*wrong.arguments, CAMERAS[0])

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from decode_scenes import looking_down, turned
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from decode_scenes import looking_down, turned
 from vdgs.cameras import Camera
+from vdgs.kernels import constants
 from vdgs.kernels.constants import DILATION_PX2
+from vdgs.kernels.native import module
 from vdgs.kernels.native.project import project as native_project
 from vdgs.kernels.reference.project import project as twin_project
 from vdgs.kernels.reference.project import rotation_matrices
@@ -91,7 +93,9 @@ def test_what_is_not_valid_is_zero_and_has_no_gradient(camera):
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("make", [awkward, lambda: gaussians(333, seed=3), lambda: gaussians(0)])
-def test_native_equals_the_twin(camera, make):
+@pytest.mark.parametrize("isa", module.supported())
+def test_native_equals_the_twin(camera, make, isa, monkeypatch):
+    monkeypatch.setattr(module, "native", lambda: module.load(isa))
     exact = [t.float().double().requires_grad_() for t in make()]
     single = [t.detach().float().requires_grad_() for t in exact]
     twin = twin_project(*exact, camera)
@@ -128,8 +132,18 @@ def test_moving_the_world_and_the_camera_together_changes_nothing(seed, angle):
     c, s = turn[0], turn[3]
     turned_quaternions = torch.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], -1)
     a = twin_project(means, scales, quaternions, camera)
-    b = twin_project(
-        means @ rotation.T + torch.from_numpy(motion[:3, 3]), scales, turned_quaternions, moved
-    )
+    b = twin_project(means @ rotation.T + torch.from_numpy(motion[:3, 3]), scales, turned_quaternions, moved)
     torch.testing.assert_close(a.means_px, b.means_px)
     torch.testing.assert_close(a.conics, b.conics)
+
+
+@pytest.mark.parametrize("isa", module.supported())
+def test_the_constants_of_the_kernels_are_those_of_the_twins(isa):
+    for name, value in module.load(isa).constants.items():
+        assert value == pytest.approx(getattr(constants, name), rel=1e-6), name
+
+
+def test_shapes_that_do_not_belong_together_are_refused():
+    means, scales, quaternions = gaussians(3)
+    with pytest.raises(ValueError, match=r"quaternions must be \[3, 4\]"):
+        native_project(means, scales, quaternions[:, :3], CAMERAS[0])

@@ -7,8 +7,8 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
+from vdgs.kernels.native import module
 from vdgs.kernels.native.arguments import contiguous, packed_camera, require_rows
-from vdgs.kernels.native.module import native
 
 
 def cull(
@@ -21,7 +21,7 @@ def cull(
     where the shapes do not belong together.
     """
     require_rows(positions.shape[0], positions=(positions, 3), log_scales=(log_scales, 6))
-    visible = native().cull(
+    visible = module.native().cull(
         contiguous(positions.detach()), contiguous(log_scales.detach()), packed_camera(camera)
     )
     indices = torch.empty(visible.count, dtype=torch.int64)

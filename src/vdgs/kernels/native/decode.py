@@ -10,8 +10,8 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels.decode_types import FEATURE_SIZE, DecoderWeights, Splats
+from vdgs.kernels.native import module
 from vdgs.kernels.native.arguments import contiguous, packed_camera, require_rows
-from vdgs.kernels.native.module import native
 
 
 def decode(
@@ -30,8 +30,8 @@ def decode(
     computed. Raises ValueError where shapes do not belong together or k > 32.
     """
     k = offsets.shape[1]
-    if not 1 <= k <= native().max_offsets:
-        raise ValueError(f"offsets per anchor must be 1 to {native().max_offsets}, not {k}")
+    if not 1 <= k <= module.native().max_offsets:
+        raise ValueError(f"offsets per anchor must be 1 to {module.native().max_offsets}, not {k}")
     rows = positions.shape[0]
     require_rows(
         rows,
@@ -49,9 +49,11 @@ class _Decode(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, camera: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
         inputs = [t.detach() for t in tensors]
-        decoded = native().decode(*inputs[:4], inputs[4:], camera)
+        decoded = module.native().decode(*inputs[:4], inputs[4:], camera)
         m = decoded.count
-        splats = [torch.empty(m, columns) if columns > 1 else torch.empty(m) for columns in (2, 3, 1, 3, 1, 1)]
+        splats = [
+            torch.empty(m, columns) if columns > 1 else torch.empty(m) for columns in (2, 3, 1, 3, 1, 1)
+        ]
         source = torch.empty(m, dtype=torch.int32)
         decoded.write(*splats, source)
         ctx.save_for_backward(camera, *tensors, source, splats[3], splats[4])
@@ -63,11 +65,14 @@ class _Decode(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         camera, *inputs, source, colours, opacities = (t.detach() for t in ctx.saved_tensors)
         wanted = ctx.needs_input_grad[1:]
-        out = [torch.empty_like(t) if want else None for t, want in zip(inputs[1:4], wanted[1:4], strict=True)]
+        out = [
+            torch.empty_like(t) if want else None for t, want in zip(inputs[1:4], wanted[1:4], strict=True)
+        ]
         # The gradients of the weights come together or not at all.
         weights = [torch.empty_like(t) for t in inputs[4:]] if any(wanted[4:]) else None
+        nothing: list[Tensor | None] = [None] * 12
         incoming = [None if g is None else g.contiguous() for g in gradients[:6]]
-        native().decode_backward(
+        module.native().decode_backward(
             *inputs[:4], inputs[4:], camera, source, colours, opacities, incoming, out, weights
         )
-        return None, None, *out, *(weights or [None] * 12)
+        return None, None, *out, *(weights or nothing)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels.decode_types import Projected
+from vdgs.kernels.native import module
 from vdgs.kernels.native.arguments import contiguous, packed_camera, require_rows
-from vdgs.kernels.native.module import native
 
 
 def project(
@@ -31,13 +31,14 @@ def project(
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means: Tensor, scales: Tensor, quaternions: Tensor, camera: Tensor) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
+        means, *_, camera = tensors
         m = means.shape[0]
         means_px, conics, depths = means.new_empty(m, 2), means.new_empty(m, 3), means.new_empty(m)
         valid = torch.empty(m, dtype=torch.uint8)
-        gaussians = [t.detach() for t in (means, scales, quaternions)]
-        native().project(*gaussians, camera, means_px, conics, depths, valid)
-        ctx.save_for_backward(means, scales, quaternions, camera)
+        gaussians = [t.detach() for t in tensors[:3]]
+        module.native().project(*gaussians, camera, means_px, conics, depths, valid)
+        ctx.save_for_backward(*tensors)
         visible = valid.view(torch.bool)
         ctx.mark_non_differentiable(visible)
         return means_px, conics, depths, visible
@@ -47,5 +48,5 @@ class _Project(torch.autograd.Function):
         means, scales, quaternions, camera = (t.detach() for t in ctx.saved_tensors)
         out = [torch.empty_like(t) for t in (means, scales, quaternions)]
         incoming = [g.contiguous() for g in gradients[:3]]
-        native().project_backward(means, scales, quaternions, camera, *incoming, *out)
+        module.native().project_backward(means, scales, quaternions, camera, *incoming, *out)
         return *out, None

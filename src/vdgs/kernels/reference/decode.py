@@ -33,10 +33,11 @@ def decode(
     k = offsets.shape[1]
     positions = positions.detach()
     viewing = _viewing(positions, camera)
-    finite = _finite_anchors(positions, viewing, features, log_scales)
+    finite = _finite_rows(positions, viewing, features, log_scales.exp())
     # Replaced before the arithmetic: 0 · NaN would enter the gradients of the weights.
     positions, viewing, features, log_scales = (
-        torch.where(finite[:, None], t, torch.zeros_like(t)) for t in (positions, viewing, features, log_scales)
+        torch.where(finite[:, None], t, torch.zeros_like(t))
+        for t in (positions, viewing, features, log_scales)
     )
     inputs = torch.cat([features, viewing], -1)
 
@@ -83,8 +84,8 @@ def _head(head: HeadWeights, inputs: Float[Tensor, "v 36"]) -> Tensor:
 
 
 @torch.no_grad()
-def _finite_anchors(positions: Tensor, viewing: Tensor, features: Tensor, log_scales: Tensor) -> Bool[Tensor, "v"]:
-    return torch.isfinite(torch.cat([positions, viewing, features, torch.exp(log_scales)], -1)).all(-1)
+def _finite_rows(*tensors: Float[Tensor, "v _"]) -> Bool[Tensor, "v"]:
+    return torch.isfinite(torch.cat(tensors, -1)).all(-1)
 
 
 @torch.no_grad()
