@@ -100,6 +100,10 @@ def test_same_bits_for_any_number_of_threads(instructions):
                 results.append((parameter, first, second))
     for result in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
+    parameter, gradient, first, second = state(20_000, 7)
+    reference.adam_rows(parameter, rows, gradient[rows], first, second, learning_rate=0.1, step=3)
+    for value, expected in zip(results[0], (parameter, first, second), strict=True):
+        torch.testing.assert_close(value, expected, rtol=2e-6, atol=2e-6)
 
 
 @BOTH

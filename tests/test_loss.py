@@ -172,6 +172,16 @@ class TestMeaning:
         _, gradient = with_gradient(implementation, image, target)
         torch.testing.assert_close(leaf.grad, 3 * gradient)
 
+    def test_a_second_pass_through_a_kept_graph_adds_the_same_gradient(self, implementation):
+        image, target, _ = scene(20, 14)
+        leaf = image.clone().requires_grad_()
+        loss = implementation.photometric_loss(leaf * 1, target).loss
+        loss.backward(retain_graph=True)
+        once = leaf.grad.clone()
+        (2 * loss).backward(retain_graph=True)
+        loss.backward()
+        torch.testing.assert_close(leaf.grad, 4 * once)
+
     def test_only_the_loss_carries_a_gradient(self, implementation):
         image, target, _ = scene(8, 8)
         result = implementation.photometric_loss(image.requires_grad_(), target)

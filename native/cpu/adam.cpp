@@ -18,14 +18,16 @@ constexpr size_t kTaskFloats = 1 << 15;
 
 // parameter -= rate * m / (sqrt(v) * root + epsilon): both bias corrections are in rate and root.
 struct AdamStep {
-  float rate, root, beta1, beta2, epsilon;
+  double rate, root, beta1, beta2, epsilon;
 };
 
 struct Factors {
   F16 rate, root, beta1, beta2, rest1, rest2, epsilon;
+  // 1 - beta is taken in float64: in float32 1 - 0.999 is off by 5e-5.
   explicit Factors(const AdamStep& step)
-      : rate(splat(step.rate)), root(splat(step.root)), beta1(splat(step.beta1)), beta2(splat(step.beta2)),
-        rest1(splat(1.0f - step.beta1)), rest2(splat(1.0f - step.beta2)), epsilon(splat(step.epsilon)) {}
+      : rate(rounded(step.rate)), root(rounded(step.root)), beta1(rounded(step.beta1)), beta2(rounded(step.beta2)),
+        rest1(rounded(1.0 - step.beta1)), rest2(rounded(1.0 - step.beta2)), epsilon(rounded(step.epsilon)) {}
+  static F16 rounded(double value) { return splat(static_cast<float>(value)); }
 };
 
 VDGS_INLINE void update(F16& parameter, F16& first, F16& second, F16 gradient, const Factors& f) {
@@ -51,8 +53,8 @@ void update_stretch(float* parameter, float* first, float* second, const float* 
 }
 
 // Rows [begin, end) of the list; neighbours in the list that are neighbours in memory go together.
-void update_rows(float* parameter, const int64_t* rows, size_t begin, size_t end, size_t width, const float* gradient,
-                 float* first, float* second, const Factors& factors) {
+void update_rows(float* parameter, const int64_t* rows, size_t begin, size_t end, size_t width,
+                 const float* gradient, float* first, float* second, const Factors& factors) {
   while (begin < end) {
     size_t stop = begin + 1;
     if (rows) {
@@ -103,8 +105,8 @@ void adam_rows(float* parameter, const int64_t* rows, size_t count, size_t width
 using State = Array<float, nb::ndim<2>>;
 
 bool bound(State parameter, std::optional<Array<const int64_t, nb::ndim<1>>> rows,
-           Array<const float, nb::ndim<2>> gradient, State first, State second, float rate, float root, float beta1,
-           float beta2, float epsilon) {
+           Array<const float, nb::ndim<2>> gradient, State first, State second, double rate, double root,
+           double beta1, double beta2, double epsilon) {
   nb::gil_scoped_release release;
   if (!all_finite(gradient.data(), gradient.size())) return false;
   adam_rows(parameter.data(), rows ? rows->data() : nullptr, gradient.shape(0), gradient.shape(1), gradient.data(),

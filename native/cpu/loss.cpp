@@ -170,7 +170,8 @@ struct Rotated {
   }
 };
 template <int planes>
-VDGS_INLINE void blur_down(const float* ring, size_t row_floats, int chunk, const Rotated& window, F16 (&out)[planes]) {
+VDGS_INLINE void blur_down(const float* ring, size_t row_floats, int chunk, const Rotated& window,
+                           F16 (&out)[planes]) {
   const float* at = ring + chunk * planes * kLanes;
   for (int plane = 0; plane < planes; ++plane) out[plane] = load(at + plane * kLanes) * splat(window.weight[0]);
   for (int slot = 1; slot < kTaps; ++slot) {
@@ -323,7 +324,8 @@ Photometric photometric_loss(const float* image, const uint8_t* target, const ui
   std::vector<Sums> sums(tiles.size());
   parallel_for(static_cast<int64_t>(tiles.size()), [&](int64_t i) {
     thread_local Scratch<float> memory;
-    Walk walk(images, tiles[i], memory.at_least(Walk::memory_floats(tiles[i].end_lane - tiles[i].first_lane + kLanes)));
+    const int most_lanes = tiles[i].end_lane - tiles[i].first_lane + kLanes;
+    Walk walk(images, tiles[i], memory.at_least(Walk::memory_floats(most_lanes)));
     sums[i] = walk.run();
   });
   Sums total;

@@ -50,4 +50,8 @@ class _Photometric(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, scale: Tensor | None, *_: Any) -> Any:
-        return (None if scale is None else ctx.gradient * scale), None, None, None
+        if scale is None:
+            return None, None, None, None
+        # Training adds the loss to others with weight 1: nothing to scale, and nothing to copy.
+        gradient = ctx.gradient if float(scale) == 1 else ctx.gradient * scale
+        return gradient, None, None, None
