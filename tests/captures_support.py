@@ -103,10 +103,10 @@ def write_images(folder: Path, scene: TinyScene, shown: TinyScene | None = None)
 
 def write_colmap(
     root: Path, scene: TinyScene, *, text: bool = False, model: str = "PINHOLE",
-    extra: tuple[float, ...] = (), images: str | None = "images", sparse: str = "sparse/0", shown: TinyScene | None = None,
+    extra: tuple[float, ...] = (), images: str | None = "images", sparse: str = "sparse/0",
+    shown: TinyScene | None = None,
 ) -> Path:  # fmt: skip
-    """The scene as a COLMAP capture, one camera per image; `extra` are lens parameters. Returns the model "
-    "folder."""
+    """The scene as a COLMAP capture, one camera per image, `extra` its lens. Returns the model's folder."""
     folder = root / sparse
     folder.mkdir(parents=True, exist_ok=True)
     (_write_text if text else _write_binary)(folder, scene, model, extra)
