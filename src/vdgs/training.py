@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -35,6 +35,7 @@ REORDER_INTERVAL = 1000
 PSNR_INTERVAL = 10
 
 
+@runtime_checkable
 class TrainingImages(Protocol):
     """Photographs on demand. Index i is the i-th training view."""
 

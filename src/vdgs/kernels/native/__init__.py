@@ -6,6 +6,7 @@ from vdgs.kernels.native.cull import cull
 from vdgs.kernels.native.decode import decode
 from vdgs.kernels.native.loss import photometric_loss
 from vdgs.kernels.native.project import project
+from vdgs.kernels.native.rasterise import rasterise
 from vdgs.kernels.native.views import count_views, mark_views
 
 __all__ = [
@@ -21,4 +22,5 @@ __all__ = [
     "morton_order",
     "photometric_loss",
     "project",
+    "rasterise",
 ]
