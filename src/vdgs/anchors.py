@@ -64,6 +64,8 @@ class AnchorModel:
     decoder: Decoder
     #: Edge of the voxel grid on which the anchors started, in units of the ground frame.
     voxel: float
+    #: Colour drawn where nothing is, RGB in [0, 1].
+    background: tuple[float, float, float]
     #: JSON-able facts that travel with the file: ground frame, capture, version.
     facts: Mapping[str, Any]
 
@@ -71,7 +73,7 @@ class AnchorModel:
         """Write one safetensors file, atomically."""
         tensors = {f"anchors.{k}": v.contiguous() for k, v in self.anchors.tensors().items()}
         tensors |= {f"decoder.{k}": v.detach().contiguous() for k, v in self.decoder.tensors().items()}
-        header = {"format": FORMAT, "voxel": repr(self.voxel), "facts": json.dumps(dict(self.facts))}
+        header = {"format": FORMAT, "voxel": repr(self.voxel), "background": json.dumps(self.background), "facts": json.dumps(dict(self.facts))}
         write_atomically(path, lambda temporary: save_file(tensors, temporary, metadata=header))
 
     @staticmethod
@@ -85,7 +87,9 @@ class AnchorModel:
             decoder = Decoder.from_tensors(
                 {name.removeprefix("decoder."): t for name, t in tensors.items() if name.startswith("decoder.")}
             )
-            model = AnchorModel(anchors, decoder, float(header["voxel"]), json.loads(header["facts"]))
+            red, green, blue = (float(value) for value in json.loads(header["background"]))
+            facts = json.loads(header["facts"])
+            model = AnchorModel(anchors, decoder, float(header["voxel"]), (red, green, blue), facts)
             model.check()
         except (KeyError, ValueError, TypeError) as error:
             raise VdgsError(f"{path}: is damaged or incomplete ({error}). Restore it or train again.") from error

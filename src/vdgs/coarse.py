@@ -17,7 +17,8 @@ from rich.console import Console
 from vdgs import __version__
 from vdgs.anchors import AnchorModel, initial_anchors
 from vdgs.captures.capture import Capture
-from vdgs.captures.images import ImageCache, check_images
+from vdgs.captures.checks import check_images
+from vdgs.captures.images import ImageCache
 from vdgs.captures.loading import load_capture
 from vdgs.captures.options import CaptureOptions
 from vdgs.checkpoints import load_newest, save_state
@@ -28,7 +29,7 @@ from vdgs.files import write_json
 from vdgs.progress import TrainingProgress, peak_memory_bytes
 from vdgs.run import RunFolder
 from vdgs.run_options import CoarseOptions
-from vdgs.training import Stage, StepReport, TrainingState, from_saved, start_state, to_saved, train
+from vdgs.training import Stage, StepReport, TrainingState, from_saved, mean_colour, start_state, to_saved, train
 
 
 class Stopped(VdgsError):
@@ -104,7 +105,10 @@ def _train(run: RunFolder, capture: Capture, config: TrainConfig, options: Coars
     budget = int(options.image_memory_gb * 1e9) or psutil.virtual_memory().available // 4
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
     images = ImageCache(views, budget, downscales=factors)
-    stage = Stage(config, images, len(views), voxel, camera_height(capture))
+    background = (0.0, 0.0, 0.0)
+    if config.loss.background != "black":
+        background = mean_colour(images, len(views), factors[-1])
+    stage = Stage(config, images, len(views), voxel, camera_height(capture), background)
     _announce(capture, state, config, budget, console)
     clock = _Clock(state)
     try:
@@ -136,7 +140,7 @@ def _train(run: RunFolder, capture: Capture, config: TrainConfig, options: Coars
         save_state(folder.checkpoints, to_saved(state))
         folder.set_status("stopped", iteration=state.iteration)
         raise Stopped(f"Stopped at iteration {state.iteration}; saved. The same command continues.")
-    _finish(run, capture, state, voxel, console)
+    _finish(run, capture, state, stage, console)
 
 
 def _continue_or_start(
@@ -170,9 +174,9 @@ def _continue_or_start(
     return state, voxel
 
 
-def _finish(run: RunFolder, capture: Capture, state: TrainingState, voxel: float, console: Console) -> None:
+def _finish(run: RunFolder, capture: Capture, state: TrainingState, stage: Stage, console: Console) -> None:
     facts = {"capture": capture_facts(capture), "version": __version__, "iterations": state.iteration}
-    model = AnchorModel(state.anchors, state.decoder, voxel, facts)
+    model = AnchorModel(state.anchors, state.decoder, stage.voxel, stage.background, facts)
     model.save(run.coarse.model)
     save_state(run.coarse.checkpoints, to_saved(state))
     run.coarse.set_status(

@@ -85,8 +85,9 @@ class LossConfig:
     """Loss = (1 - w) L1 + w (1 - SSIM) + volume."""
     volume_weight: float = 0.01
     """Weight of the mean product of the three scales of the Gaussians that are drawn."""
-    background: Literal["black", "random"] = "black"
-    """Colour behind the scene during training."""
+    background: Literal["mean", "black", "random"] = "mean"
+    """Colour behind the scene: the mean of the training photographs (choice: what no photograph shows is then drawn in a
+    colour of the place), black, or a random one in training and the mean afterwards."""
 
 
 @dataclass(frozen=True)

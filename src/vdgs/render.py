@@ -14,8 +14,6 @@ from vdgs.kernels import native as kernels
 from vdgs.kernels.decode_types import Splats
 from vdgs.kernels.types import Raster
 
-BLACK = (0.0, 0.0, 0.0)
-
 
 @dataclass(frozen=True)
 class VisibleAnchors:
@@ -51,17 +49,17 @@ def render(
     model: AnchorModel,
     camera: Camera,
     *,
-    background: tuple[float, float, float] = BLACK,
+    background: tuple[float, float, float] | None = None,
     depth: bool = False,
     image: int | None = None,
 ) -> Raster:
     """One view of a model: image [h, w, 3] (not clamped), alpha [h, w], depth [h, w] or None.
 
-    `image` is the index of a training image whose appearance to use; None takes the mean appearance.
+    `background` replaces the model's own. `image` is the index of a training image whose appearance to use; None takes the mean appearance.
     """
     visible = gather_visible(model.anchors, camera)
     splats = decode_visible(visible.anchors, model.decoder.for_image(image), camera)
-    return draw(splats, camera, torch.tensor(background), depth)
+    return draw(splats, camera, torch.tensor(background or model.background), depth)
 
 
 @torch.no_grad()

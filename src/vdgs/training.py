@@ -70,6 +70,8 @@ class Stage:
     voxel: float
     #: Median height of the cameras above the ground, in units of the ground frame.
     camera_height: float
+    #: Colour behind the scene.
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,7 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     leaves = {name: getattr(visible.anchors, name).requires_grad_(True) for name in TRAINED}
     splats = decode_visible(visible.anchors, state.decoder.for_image(view), camera)
     splats.means_px.retain_grad()
-    raster = draw(splats, camera, _background(config, iteration))
+    raster = draw(splats, camera, _background(stage, iteration))
     photometric = kernels.photometric_loss(raster.image, target, mask, ssim_weight=config.loss.ssim_weight)
     loss = photometric.loss
     if config.loss.volume_weight and len(splats.volumes):
@@ -179,10 +181,22 @@ def reorder(state: TrainingState) -> None:
     state.optimiser.anchors = state.optimiser.anchors.rebuilt(0, order)
 
 
-def _background(config: TrainConfig, iteration: int) -> Tensor:
-    if config.loss.background == "black":
-        return torch.zeros(3)
-    return torch.rand(3, generator=torch.Generator().manual_seed(config.seed * 1_000_033 + iteration))
+def _background(stage: Stage, iteration: int) -> Tensor:
+    if stage.config.loss.background != "random":
+        return torch.tensor(stage.background)
+    return torch.rand(3, generator=torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration))
+
+
+def mean_colour(images: TrainingImages, count: int, downscale: int, at_most: int = 32) -> tuple[float, float, float]:
+    """Mean colour in [0, 1] of the pixels that count, over up to `at_most` evenly chosen training views."""
+    total, pixels = np.zeros(3), 0
+    for index in np.unique(np.linspace(0, count - 1, min(count, at_most)).astype(int)):
+        image, mask = images.get(int(index), downscale)
+        colours = image.numpy().reshape(-1, 3) if mask is None else image.numpy()[mask.numpy() > 0]
+        total += colours.sum(0, dtype=np.float64)
+        pixels += len(colours)
+    red, green, blue = (float(np.float32(value)) for value in total / (255.0 * max(pixels, 1)))
+    return red, green, blue
 
 
 def _smooth(state: TrainingState, loss: float, image: Tensor, target: Tensor) -> None:
