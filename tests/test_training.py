@@ -93,7 +93,7 @@ def test_training_learns_the_place():
         picture = render(model, photographs.camera(index), image=index).image
         errors.append(float(((picture - photographs.get(index)[0].float() / 255) ** 2).mean()))
     before = float(torch.var(photographs.get(0)[0].float() / 255))
-    assert np.mean(errors) < 0.1 * before
+    assert np.mean(errors) < 0.2 * before
     assert len(state.anchors) > len(start().anchors)
 
 
