@@ -8,7 +8,6 @@ namespace vdgs {
 namespace {
 
 constexpr int64_t kPiece = 256;  // anchors per task
-constexpr int kFields = 11;      // floats of a Splat
 
 struct alignas(64) Outputs {
   float opacity[kMaxOffsets * kLanes];
@@ -16,9 +15,9 @@ struct alignas(64) Outputs {
   float colour[3 * kMaxOffsets * kLanes];
 };
 
-// Splats of one batch by offset: fields with anchors as lanes, and which lanes are kept.
+// Splats of one batch by offset and anchor, and which are kept (one bit per anchor).
 struct alignas(64) Spawned {
-  float fields[kMaxOffsets][kFields][kLanes];
+  Splat splats[kMaxOffsets][kLanes];
   unsigned kept[kMaxOffsets];
 };
 
@@ -38,7 +37,8 @@ bool decode_opacity(WeightLayout layout, const float* weights, const Batch& batc
   return any(some);
 }
 
-void spawn_offset(const Camera& camera, const Batch& batch, const Outputs& outputs, int j, Spawned& out) {
+void spawn_offset(const Camera& camera, const Batch& batch, const Outputs& outputs, I16 source, int j,
+                  Spawned& out) {
   const M16 wanted = opaque(outputs, j);
   out.kept[j] = 0;
   if (none(wanted)) return;
@@ -53,29 +53,30 @@ void spawn_offset(const Camera& camera, const Batch& batch, const Outputs& outpu
   out.kept[j] = bits(kept);
   if (none(kept)) return;
   const float* rgb = outputs.colour + 3 * j * kLanes;
-  const F16 fields[kFields] = {p.drawn.x, p.drawn.y, p.drawn.conic_xx, p.drawn.conic_xy, p.drawn.conic_yy,
-                               p.drawn.depth, sigmoid(load(rgb)), sigmoid(load(rgb + kLanes)),
-                               sigmoid(load(rgb + 2 * kLanes)), opacity,
-                               gaussian.scale.x * gaussian.scale.y * gaussian.scale.z};
-  for (int f = 0; f < kFields; ++f) store(out.fields[j][f], fields[f]);
+  const F16 fields[12] = {p.drawn.x, p.drawn.y, p.drawn.conic_xx, p.drawn.conic_xy, p.drawn.conic_yy,
+                          p.drawn.depth, sigmoid(load(rgb)), sigmoid(load(rgb + kLanes)),
+                          sigmoid(load(rgb + 2 * kLanes)), opacity,
+                          gaussian.scale.x * gaussian.scale.y * gaussian.scale.z, float_of_bits(source)};
+  alignas(64) float columns[kLanes * kLanes];
+  for (int f = 0; f < kLanes; ++f) store(columns + f * kLanes, f < 12 ? fields[f] : splat(0.0f));
+  transpose16(columns, kLanes, &out.splats[j][0].x, kLanes);
 }
 
 // Appends what was kept, anchor by anchor.
-void emit(const Spawned& spawned, int k, int64_t first, std::vector<Splat>& out) {
+void emit(const Spawned& spawned, int k, std::vector<Splat>& out) {
   uint32_t offsets_of[kLanes] = {};
   for (int j = 0; j < k; ++j)
     for (int lane = 0; lane < kLanes; ++lane) offsets_of[lane] |= ((spawned.kept[j] >> lane) & 1u) << j;
-  for (int lane = 0; lane < kLanes; ++lane) {
-    for (uint32_t left = offsets_of[lane]; left; left &= left - 1) {
-      const int j = __builtin_ctz(left);
-      float values[kFields];
-      for (int f = 0; f < kFields; ++f) values[f] = spawned.fields[j][f][lane];
-      Splat splat;
-      std::memcpy(&splat, values, sizeof values);
-      splat.source = static_cast<int32_t>((first + lane) * k + j);
-      out.push_back(splat);
-    }
-  }
+  for (int lane = 0; lane < kLanes; ++lane)
+    for (uint32_t left = offsets_of[lane]; left; left &= left - 1)
+      out.push_back(spawned.splats[__builtin_ctz(left)][lane]);
+}
+
+// k times the index of each lane's anchor: the sources of its first splat.
+I16 first_sources(int64_t first, int k) {
+  alignas(64) int32_t sources[kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) sources[lane] = static_cast<int32_t>((first + lane) * k);
+  return load(sources);
 }
 
 void decode_piece(const AnchorArrays& anchors, WeightLayout layout, const float* weights, const Camera& camera,
@@ -91,8 +92,9 @@ void decode_piece(const AnchorArrays& anchors, WeightLayout layout, const float*
     if (!decode_opacity(layout, weights, batch, outputs)) continue;
     output_layer(layout, weights, 1, batch, outputs.covariance);
     output_layer(layout, weights, 2, batch, outputs.colour);
-    for (int j = 0; j < layout.k; ++j) spawn_offset(camera, batch, outputs, j, spawned);
-    emit(spawned, layout.k, first, scratch);
+    const I16 sources = first_sources(first, layout.k);
+    for (int j = 0; j < layout.k; ++j) spawn_offset(camera, batch, outputs, sources + splat(j), j, spawned);
+    emit(spawned, layout.k, scratch);
   }
   out.assign(scratch.begin(), scratch.end());
 }

@@ -7,11 +7,14 @@
 
 namespace vdgs {
 
-// A splat on its way out of the decoder: what `Splats` holds, in one piece.
+// A splat on its way out of the decoder: what `Splats` holds, in one piece of sixteen words, so that
+// sixteen splats are a transpose and one splat is one register.
 struct Splat {
   float x, y, conic_xx, conic_xy, conic_yy, depth, red, green, blue, opacity, volume;
   int32_t source;
+  float unused[4];
 };
+static_assert(sizeof(Splat) == 16 * sizeof(float));
 
 // The splats of a view in order, in pieces of consecutive anchors.
 struct DecodedView {
