@@ -16,10 +16,22 @@ struct Splat {
 };
 static_assert(sizeof(Splat) == 16 * sizeof(float));
 
-// The splats of a view in order, in pieces of consecutive anchors.
+// Room for the splats of a piece of consecutive anchors.
+struct Piece {
+  std::unique_ptr<Splat[]> splats;
+  int64_t capacity = 0, count = 0;
+};
+
+// The splats of a view in order. Their memory goes back to a store when the view is destroyed, since
+// the system asks for more time to hand out fresh pages than it takes to fill them.
 struct DecodedView {
-  std::vector<std::vector<Splat>> pieces;
+  std::vector<Piece> pieces;
   int64_t count = 0;
+
+  DecodedView() = default;
+  DecodedView(DecodedView&&) = default;
+  DecodedView& operator=(DecodedView&&) = default;
+  ~DecodedView();
 };
 
 struct SplatArrays {
