@@ -243,3 +243,21 @@ def test_shapes_that_do_not_belong_together_are_refused():
     ):
         with pytest.raises(ValueError, match=r"must be"):
             native_decode(*wrong.arguments, CAMERAS[0])
+
+
+@EVERY_ISA
+def test_activations_are_exact_to_a_few_units_in_the_last_place(isa, monkeypatch):
+    monkeypatch.setattr(module, "native", lambda: module.load(isa))
+    scene = Scene.random(16, k=32, spread=0.2)
+    raw_opacities, raw_colours = torch.linspace(0.005, 4, 32), torch.linspace(-10, 10, 96)
+    opacity, colour = scene.weights.opacity, scene.weights.colour
+    opacity = replace(opacity, w2=torch.zeros_like(opacity.w2), b2=raw_opacities)
+    colour = replace(colour, w2=torch.zeros_like(colour.w2), b2=raw_colours)
+    scene = replace(scene, weights=replace(scene.weights, opacity=opacity, colour=colour))
+    splats = native_decode(*scene.arguments, CAMERAS[0])
+    offset = splats.source.long() % 32
+    assert len(offset.unique()) > 25
+    expected = torch.tanh(raw_opacities.double())[offset]
+    torch.testing.assert_close(splats.opacities.double(), expected, rtol=1e-6, atol=0)
+    expected = torch.sigmoid(raw_colours.double()).reshape(32, 3)[offset]
+    torch.testing.assert_close(splats.colours.double(), expected, rtol=1e-6, atol=0)

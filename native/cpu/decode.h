@@ -7,16 +7,31 @@
 
 namespace vdgs {
 
-// A splat on its way out of the decoder: what `Splats` holds, in one piece.
+// A splat on its way out of the decoder: what `Splats` holds, in one piece of sixteen words, so that
+// sixteen splats are a transpose and one splat is one register.
 struct Splat {
   float x, y, conic_xx, conic_xy, conic_yy, depth, red, green, blue, opacity, volume;
   int32_t source;
+  float unused[4];
+};
+static_assert(sizeof(Splat) == 16 * sizeof(float));
+
+// Room for the splats of a piece of consecutive anchors.
+struct Piece {
+  std::unique_ptr<Splat[]> splats;
+  int64_t capacity = 0, count = 0;
 };
 
-// The splats of a view in order, in pieces of consecutive anchors.
+// The splats of a view in order. Their memory goes back to a store when the view is destroyed, since
+// the system asks for more time to hand out fresh pages than it takes to fill them.
 struct DecodedView {
-  std::vector<std::vector<Splat>> pieces;
+  std::vector<Piece> pieces;
   int64_t count = 0;
+
+  DecodedView() = default;
+  DecodedView(DecodedView&&) = default;
+  DecodedView& operator=(DecodedView&&) = default;
+  ~DecodedView();
 };
 
 struct SplatArrays {

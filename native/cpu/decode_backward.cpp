@@ -28,7 +28,7 @@ struct alignas(64) Outgoing {
   float offsets[3 * kMaxOffsets * kLanes];
   float hidden[kAllHidden * kLanes];
   float features[kFeatures * kLanes];
-  F16 log_scales[6];
+  float log_scales[kLanes * kLanes];  // six columns are used
 };
 
 // Collects the splats from position `s` on that belong to the batch; returns the position behind them.
@@ -86,7 +86,10 @@ void offset_backward(const Camera& camera, const Batch& batch, const float* cova
   float* d_offset = out.offsets + 3 * j * kLanes;
   put(d_offset, d.offset.x), put(d_offset + kLanes, d.offset.y), put(d_offset + 2 * kLanes, d.offset.z);
   const F16 logs[6] = {d.log_extent.x, d.log_extent.y, d.log_extent.z, d.log_size.x, d.log_size.y, d.log_size.z};
-  for (int i = 0; i < 6; ++i) out.log_scales[i] = out.log_scales[i] + zero_unless(present, logs[i]);
+  for (int i = 0; i < 6; ++i) {
+    float* sum = out.log_scales + i * kLanes;
+    store(sum, load(sum) + zero_unless(present, logs[i]));
+  }
 }
 
 void offsets_backward(const Camera& camera, WeightLayout layout, const float* weights, const Batch& batch,
@@ -94,7 +97,7 @@ void offsets_backward(const Camera& camera, WeightLayout layout, const float* we
   alignas(64) float covariances[7 * kMaxOffsets * kLanes];
   output_layer(layout, weights, 1, batch, covariances);
   const int k = layout.k;
-  for (F16& g : out.log_scales) g = splat(0.0f);
+  std::memset(out.log_scales, 0, sizeof out.log_scales);
   for (int j = 0; j < k; ++j) {
     if (in.present[j]) {
       offset_backward(camera, batch, covariances, in, j, k, out);
@@ -146,20 +149,10 @@ void write_anchor_gradients(const float* weights, int k, int64_t first, int coun
     multiply<kAllHidden, 1>(
         weights, kFeatures, kAllHidden, g.hidden, [](int) { return splat(0.0f); },
         [&](int r, F16 sum) { store(g.features + r * kLanes, sum); });
-    alignas(64) float rows[kLanes * kFeatures];
-    transpose16(g.features, kLanes, rows, kFeatures);
-    transpose16(g.features + kLanes * kLanes, kLanes, rows + kLanes, kFeatures);
-    std::memcpy(out.features + first * kFeatures, rows, sizeof(float) * static_cast<size_t>(count * kFeatures));
+    lanes_to_rows<kFeatures>(g.features, kFeatures, count, out.features + first * kFeatures);
   }
-  if (out.offsets)
-    for (int lane = 0; lane < count; ++lane)
-      for (int i = 0; i < 3 * k; ++i) out.offsets[(first + lane) * 3 * k + i] = g.offsets[i * kLanes + lane];
-  if (out.log_scales) {
-    alignas(64) float columns[6][kLanes];
-    for (int i = 0; i < 6; ++i) store(columns[i], g.log_scales[i]);
-    for (int lane = 0; lane < count; ++lane)
-      for (int i = 0; i < 6; ++i) out.log_scales[(first + lane) * 6 + i] = columns[i][lane];
-  }
+  if (out.offsets) lanes_to_rows<3 * kMaxOffsets>(g.offsets, 3 * k, count, out.offsets + first * 3 * k);
+  if (out.log_scales) lanes_to_rows<kLanes>(g.log_scales, 6, count, out.log_scales + first * 6);
 }
 
 void write_no_gradients(int k, int64_t first, int64_t count, const DecodeGradients& out) {

@@ -77,27 +77,47 @@ struct alignas(64) Batch {
   M16 usable;  // there, and all numbers finite
 };
 
+// Rows of `width` floats become lanes: out[16 column + lane]; lanes from `count` on repeat the last row.
+// `out` holds a multiple of sixteen columns; those behind `width` are filled with anything. Nothing is
+// read behind `end`.
+inline void rows_to_lanes(const float* rows, const float* end, int width, int count, float* out) {
+  alignas(64) float block[kLanes * kLanes];
+  for (int column = 0; column < width; column += kLanes) {
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const float* from = rows + std::min(lane, count - 1) * width + column;
+      store(block + lane * kLanes,
+            from + kLanes <= end ? loadu(from) : load_first(from, std::min(kLanes, width - column)));
+    }
+    transpose16(block, kLanes, out + column * kLanes, kLanes);
+  }
+}
+
+// The other way, for the first `count` lanes; `lanes` holds a multiple of sixteen columns.
+template <int most>
+inline void lanes_to_rows(const float* lanes, int width, int count, float* rows) {
+  alignas(64) float all[kLanes * most];
+  for (int column = 0; column < width; column += kLanes)
+    transpose16(lanes + column * kLanes, kLanes, all + column, most);
+  for (int lane = 0; lane < count; ++lane)
+    std::memcpy(rows + lane * width, all + lane * most, sizeof(float) * static_cast<size_t>(width));
+}
+
 // Anchors first .. first + 15 (or fewer at the end), and the hidden layer of all heads. The inputs of
 // anchors that are not usable are zero, so that no NaN of theirs meets another's gradient.
 inline void load_batch(const AnchorArrays& anchors, const Camera& camera, int64_t first, Batch& batch) {
   const int count = static_cast<int>(std::min<int64_t>(kLanes, anchors.count - first));
-  const int last = count - 1;
-  alignas(64) float rows[kLanes * kFeatures], columns[9][kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) {
-    const int64_t a = first + std::min(lane, last);
-    std::memcpy(rows + lane * kFeatures, anchors.features + a * kFeatures, kFeatures * sizeof(float));
-    for (int i = 0; i < 3; ++i) columns[i][lane] = anchors.positions[3 * a + i];
-    for (int i = 0; i < 6; ++i) columns[3 + i][lane] = anchors.log_scales[6 * a + i];
-    const float* offsets = anchors.offsets + a * anchors.k * 3;
-    for (int i = 0; i < 3 * anchors.k; ++i) batch.offsets[i * kLanes + lane] = offsets[i];
-  }
-  transpose16(rows, kFeatures, batch.inputs, kLanes);
-  transpose16(rows + kLanes, kFeatures, batch.inputs + kLanes * kLanes, kLanes);
-
+  const auto into_lanes = [&](const float* rows, int width, float* out) {
+    rows_to_lanes(rows + first * width, rows + anchors.count * width, width, count, out);
+  };
+  alignas(64) float columns[kLanes][kLanes];
+  into_lanes(anchors.features, kFeatures, batch.inputs);
+  into_lanes(anchors.offsets, 3 * anchors.k, batch.offsets);
+  into_lanes(anchors.positions, 3, columns[0]);
   const Vec3<F16> x = {load(columns[0]), load(columns[1]), load(columns[2])};
+  into_lanes(anchors.log_scales, 6, columns[0]);
   batch.anchor.position = x;
-  batch.anchor.extent = {exp(load(columns[3])), exp(load(columns[4])), exp(load(columns[5]))};
-  batch.anchor.size = {exp(load(columns[6])), exp(load(columns[7])), exp(load(columns[8]))};
+  batch.anchor.extent = {exp(load(columns[0])), exp(load(columns[1])), exp(load(columns[2]))};
+  batch.anchor.size = {exp(load(columns[3])), exp(load(columns[4])), exp(load(columns[5]))};
 
   const Vec3<F16> centre = constant<F16>(camera.centre);
   const Vec3<F16> ray = {x.x - centre.x, x.y - centre.y, x.z - centre.z};
@@ -109,11 +129,11 @@ inline void load_batch(const AnchorArrays& anchors, const Camera& camera, int64_
   store(viewing + 3 * kLanes, distance), store(viewing + 4 * kLanes, splat(1.0f));
 
   // Zero times a number is zero, but times infinity or NaN it is NaN, which compares with nothing.
-  F16 zero = splat(0.0f);
-  for (int i = 0; i < kInputs; ++i) zero = fma(splat(0.0f), load(batch.inputs + i * kLanes), zero);
   const Anchor<F16>& a = batch.anchor;
-  for (const Vec3<F16>& v : {a.position, a.extent, a.size}) zero = fma(splat(0.0f), v.x + v.y + v.z, zero);
-  batch.usable = first_lanes(count) & le(zero, splat(0.0f));
+  F16 zero[2] = {splat(0.0f), splat(0.0f)};
+  for (int i = 0; i < kInputs; ++i) zero[i % 2] = fma(splat(0.0f), load(batch.inputs + i * kLanes), zero[i % 2]);
+  for (const Vec3<F16>& v : {a.position, a.extent, a.size}) zero[0] = fma(splat(0.0f), v.x + v.y + v.z, zero[0]);
+  batch.usable = first_lanes(count) & le(zero[0] + zero[1], splat(0.0f));
   if (bits(batch.usable) != 0xffff)
     for (int i = 0; i < kInputs; ++i) {
       float* input = batch.inputs + i * kLanes;
