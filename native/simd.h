@@ -40,13 +40,16 @@ constexpr int kLanes = 16;
 //   zero_unless(m, a)                      m ? a : 0
 //   bits(m), mask_of_bits(u), any(m), none(m), first_lanes(n)
 //   hsum(a)                                sum of the lanes;  hsum4(out, a, b, c, d): four sums at once
-//   exp2(a)                                2^a to 1e-7; underflow 0, overflow infinity, NaN stays NaN
+//   exp2(a)                                2^a to 2.5e-7; underflow 0, overflow infinity, NaN stays NaN
+//   exp2_bounded(a)                        the same, faster, for -126 < a < 127 (elsewhere: any value)
 //   to_int(a) (truncates), to_float(i), bits_of(a), float_of_bits(i)
 //   I16: + - & | shift_left<n> shift_right<n> (logical) load store loadu storeu lt
 //   gather(base, index)                    base[index[lane]]
 //   load2/load3(p, x, y, ..), store3(..)   rows of two or three floats, to and from columns
 //   compress_store(p, m, a)                the chosen lanes, packed; writes no more than those
+//   load_quads(p, stride), store_quads     lanes 4i .. 4i+3 at p + i stride
 //   bit_column(masks, b)                   bit b of 64 aligned uint16 as one uint64
+//   set_bit_column(masks, b, u)            ors it back into them
 
 // 1/a where a may be zero, infinite or NaN; one division per lane.
 VDGS_INLINE F16 exact_reciprocal(F16 a) { return splat(1.0f) / a; }

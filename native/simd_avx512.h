@@ -103,6 +103,8 @@ VDGS_INLINE F16 exp2(F16 a) {
   return {_mm512_scalef_ps(p.v, a.v)};  // p * 2^floor(a)
 }
 
+VDGS_INLINE F16 exp2_bounded(F16 a) { return exp2(a); }
+
 VDGS_INLINE I16 operator+(I16 a, I16 b) { return {_mm512_add_epi32(a.v, b.v)}; }
 VDGS_INLINE I16 operator-(I16 a, I16 b) { return {_mm512_sub_epi32(a.v, b.v)}; }
 VDGS_INLINE I16 operator&(I16 a, I16 b) { return {_mm512_and_si512(a.v, b.v)}; }
@@ -181,11 +183,31 @@ VDGS_INLINE void store3(float* p, F16 x, F16 y, F16 z) {
 VDGS_INLINE void compress_store(float* p, M16 m, F16 a) { _mm512_mask_compressstoreu_ps(p, m.m, a.v); }
 VDGS_INLINE void compress_store(int32_t* p, M16 m, I16 a) { _mm512_mask_compressstoreu_epi32(p, m.m, a.v); }
 
+VDGS_INLINE F16 load_quads(const float* p, ptrdiff_t stride) {
+  __m512 r = _mm512_castps128_ps512(_mm_loadu_ps(p));
+  r = _mm512_insertf32x4(r, _mm_loadu_ps(p + stride), 1);
+  r = _mm512_insertf32x4(r, _mm_loadu_ps(p + 2 * stride), 2);
+  return {_mm512_insertf32x4(r, _mm_loadu_ps(p + 3 * stride), 3)};
+}
+VDGS_INLINE void store_quads(float* p, ptrdiff_t stride, F16 a) {
+  _mm_storeu_ps(p, _mm512_castps512_ps128(a.v));
+  _mm_storeu_ps(p + stride, _mm512_extractf32x4_ps(a.v, 1));
+  _mm_storeu_ps(p + 2 * stride, _mm512_extractf32x4_ps(a.v, 2));
+  _mm_storeu_ps(p + 3 * stride, _mm512_extractf32x4_ps(a.v, 3));
+}
+
 VDGS_INLINE uint64_t bit_column(const uint16_t* masks, int bit) {
   const __m512i wanted = _mm512_set1_epi16(static_cast<short>(1u << bit));
   const uint64_t low = _mm512_test_epi16_mask(_mm512_load_si512(masks), wanted);
   const uint64_t high = _mm512_test_epi16_mask(_mm512_load_si512(masks + 32), wanted);
   return low | high << 32;
+}
+VDGS_INLINE void set_bit_column(uint16_t* masks, int bit, uint64_t column) {
+  const __m512i wanted = _mm512_set1_epi16(static_cast<short>(1u << bit));
+  const __m512i low = _mm512_load_si512(masks), high = _mm512_load_si512(masks + 32);
+  const __m512i low_set = _mm512_or_si512(low, wanted), high_set = _mm512_or_si512(high, wanted);
+  _mm512_store_si512(masks, _mm512_mask_mov_epi16(low, static_cast<__mmask32>(column), low_set));
+  _mm512_store_si512(masks + 32, _mm512_mask_mov_epi16(high, static_cast<__mmask32>(column >> 32), high_set));
 }
 
 }  // namespace vdgs

@@ -319,23 +319,35 @@ VDGS_INLINE F16 exp2(F16 a) {
   return p * float_of_bits(shift_left<23>(to_int(whole) + splat(127)));
 }
 
+VDGS_INLINE F16 exp2_bounded(F16 a) {
+  const F16 rounder = splat(12582912.0f);  // 1.5 * 2^23: the sum's low bits are the nearest integer
+  const F16 rounded = a + rounder;
+  const F16 f = a - (rounded - rounder);
+  F16 p = splat(1.327647196e-03f);
+  p = fma(p, f, splat(9.675541503e-03f));
+  p = fma(p, f, splat(5.550713275e-02f));
+  p = fma(p, f, splat(2.402211972e-01f));
+  p = fma(p, f, splat(6.931469671e-01f));
+  p = fma(p, f, splat(1.0f));
+  return float_of_bits(bits_of(p) + shift_left<23>(bits_of(rounded)));
+}
+
 VDGS_INLINE void load2(const float* p, F16& x, F16& y) {
-  VDGS_EACH for (int i = 0; i < kPartLanes; ++i) {
-    const float* row = p + 2 * (k * kPartLanes + i);
-    x.v[k][i] = row[0], y.v[k][i] = row[1];
-  }
+  alignas(64) float columns[2][16];
+  for (int i = 0; i < 16; ++i) columns[0][i] = p[2 * i], columns[1][i] = p[2 * i + 1];
+  x = load(columns[0]), y = load(columns[1]);
 }
 VDGS_INLINE void load3(const float* p, F16& x, F16& y, F16& z) {
-  VDGS_EACH for (int i = 0; i < kPartLanes; ++i) {
-    const float* row = p + 3 * (k * kPartLanes + i);
-    x.v[k][i] = row[0], y.v[k][i] = row[1], z.v[k][i] = row[2];
-  }
+  alignas(64) float columns[3][16];
+  for (int i = 0; i < 16; ++i)
+    columns[0][i] = p[3 * i], columns[1][i] = p[3 * i + 1], columns[2][i] = p[3 * i + 2];
+  x = load(columns[0]), y = load(columns[1]), z = load(columns[2]);
 }
 VDGS_INLINE void store3(float* p, F16 x, F16 y, F16 z) {
-  VDGS_EACH for (int i = 0; i < kPartLanes; ++i) {
-    float* row = p + 3 * (k * kPartLanes + i);
-    row[0] = x.v[k][i], row[1] = y.v[k][i], row[2] = z.v[k][i];
-  }
+  alignas(64) float columns[3][16];
+  store(columns[0], x), store(columns[1], y), store(columns[2], z);
+  for (int i = 0; i < 16; ++i)
+    p[3 * i] = columns[0][i], p[3 * i + 1] = columns[1][i], p[3 * i + 2] = columns[2][i];
 }
 
 namespace part {
@@ -348,6 +360,26 @@ VDGS_INLINE void compress_store(Scalar* p, unsigned chosen, const Lanes& a) {
 }  // namespace part
 VDGS_INLINE void compress_store(float* p, M16 m, F16 a) { part::compress_store(p, bits(m), a); }
 VDGS_INLINE void compress_store(int32_t* p, M16 m, I16 a) { part::compress_store(p, bits(m), a); }
+
+// Quads are the 128-bit quarters of the sixteen lanes, in whatever parts they are held.
+VDGS_INLINE F16 load_quads(const float* p, ptrdiff_t stride) {
+  F16 r;
+#if defined(__AVX2__)
+  r.v[0] = _mm256_set_m128(_mm_loadu_ps(p + stride), _mm_loadu_ps(p));
+  r.v[1] = _mm256_set_m128(_mm_loadu_ps(p + 3 * stride), _mm_loadu_ps(p + 2 * stride));
+#else
+  for (int i = 0; i < 4; ++i) std::memcpy(&r.v[i], p + i * stride, 16);
+#endif
+  return r;
+}
+VDGS_INLINE void store_quads(float* p, ptrdiff_t stride, F16 a) {
+#if defined(__AVX2__)
+  _mm256_storeu2_m128(p + stride, p, a.v[0]);
+  _mm256_storeu2_m128(p + 3 * stride, p + 2 * stride, a.v[1]);
+#else
+  for (int i = 0; i < 4; ++i) std::memcpy(p + i * stride, &a.v[i], 16);
+#endif
+}
 
 VDGS_INLINE uint64_t bit_column(const uint16_t* masks, int bit) {
   uint64_t column = 0;
@@ -364,6 +396,18 @@ VDGS_INLINE uint64_t bit_column(const uint16_t* masks, int bit) {
   for (int i = 0; i < 64; ++i) column |= static_cast<uint64_t>((masks[i] >> bit) & 1u) << i;
 #endif
   return column;
+}
+VDGS_INLINE void set_bit_column(uint16_t* masks, int bit, uint64_t column) {
+  typedef uint16_t Eight __attribute__((vector_size(16)));
+  const Eight weight = {1, 2, 4, 8, 16, 32, 64, 128};
+  const Eight wanted = Eight{} + static_cast<uint16_t>(1u << bit);
+  for (int q = 0; q < 8; ++q) {
+    Eight eight;
+    std::memcpy(&eight, masks + 8 * q, 16);
+    const Eight chosen = (Eight)(((Eight{} + static_cast<uint16_t>((column >> (8 * q)) & 255)) & weight) != 0);
+    eight |= chosen & wanted;
+    std::memcpy(masks + 8 * q, &eight, 16);
+  }
 }
 
 #undef VDGS_EACH
