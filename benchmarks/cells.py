@@ -10,9 +10,8 @@ from collections.abc import Callable
 from types import ModuleType
 
 import torch
-from machine import describe
 
-from stopwatch import medians_ms
+from stopwatch import describe, medians_ms
 from vdgs.kernels.native import cells as native
 from vdgs.kernels.native import module
 from vdgs.kernels.reference import cells as reference
@@ -48,10 +47,7 @@ def main() -> None:
     module.set_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
-    print(
-        f"{module.isa()}, {arguments.threads} threads; {arguments.points} points, "
-        f"median ms of {arguments.rounds}"
-    )
+    print(f"{arguments.points} points, median ms of {arguments.rounds}")
     print(f"{'operation':>14} {'native':>8} {'torch':>8}")
     fast, slow = (operations(implementation, arguments.points) for implementation in (native, reference))
     for name in fast:
