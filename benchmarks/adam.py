@@ -10,9 +10,8 @@ from collections.abc import Callable
 from types import ModuleType
 
 import torch
-from machine import describe
 
-from stopwatch import medians_ms
+from stopwatch import describe, medians_ms
 from vdgs.kernels.native import adam as native
 from vdgs.kernels.native import module
 from vdgs.kernels.reference import adam as reference
@@ -52,10 +51,7 @@ def main() -> None:
     module.set_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
-    print(
-        f"{module.isa()}, {arguments.threads} threads; {arguments.visible} of {arguments.anchors} rows, "
-        f"median ms of {arguments.rounds}"
-    )
+    print(f"{arguments.visible} of {arguments.anchors} rows, median ms of {arguments.rounds}")
     print(f"{'array':>10} {'native':>8} {'twin':>8} {'torch fused, all rows':>22}")
     for name, width in WIDTHS.items():
         ms = medians_ms(

@@ -1,6 +1,6 @@
 """Photometric loss with its gradient: the native kernel beside torch, in one run.
 
-OMP_WAIT_POLICY=PASSIVE python benchmarks/loss.py [--threads 2] [--rounds 9]
+OMP_WAIT_POLICY=PASSIVE python benchmarks/loss.py [--threads 2] [--rounds 5]
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ from collections.abc import Callable
 from types import ModuleType
 
 import torch
-from machine import describe
 
-from stopwatch import medians_ms
+from stopwatch import describe, medians_ms
 from vdgs.kernels.native import loss as native
 from vdgs.kernels.native import module
 from vdgs.kernels.reference import loss as reference
@@ -37,12 +36,12 @@ def main() -> None:
     """Print one line for each size."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, default=module.threads())
-    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--rounds", type=int, default=5)
     arguments = parser.parse_args()
     module.set_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
-    print(f"{module.isa()}, {arguments.threads} threads; loss + gradient, median ms of {arguments.rounds}")
+    print(f"loss + gradient, median ms of {arguments.rounds}")
     print(f"{'size':>10} {'native':>8} {'masked':>8} {'torch':>8} {'torch / native':>15}")
     for width, height in SIZES:
         ms = medians_ms(

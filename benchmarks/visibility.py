@@ -13,8 +13,8 @@ import time
 
 import numpy as np
 import torch
-from machine import describe
 
+from stopwatch import describe
 from vdgs.cameras import Camera
 from vdgs.kernels.native import module
 from vdgs.kernels.native import views as native
@@ -58,7 +58,6 @@ def main() -> None:
     module.set_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
-    print(f"{module.isa()}, {arguments.threads} threads")
     print(f"{arguments.points} points x {arguments.cameras} cameras")
     print(f"{'flight':>22} {'native s':>9} {'brute force s (scaled)':>23} {'mean V':>7} {'differing':>9}")
     for name, extent_m, tilt_deg in FLIGHTS:

@@ -28,7 +28,7 @@
 #include <nanobind/stl/tuple.h>
 
 #include "bindings.h"
-#include "scratch.h"
+#include "buffer.h"
 #include "simd.h"
 #include "threads.h"
 
@@ -323,9 +323,9 @@ Photometric photometric_loss(const float* image, const uint8_t* target, const ui
   const std::vector<Tile> tiles = cut(height, images.lanes);
   std::vector<Sums> sums(tiles.size());
   parallel_for(static_cast<int64_t>(tiles.size()), [&](int64_t i) {
-    thread_local Scratch<float> memory;
+    thread_local Buffer<float> memory;
     const int most_lanes = tiles[i].end_lane - tiles[i].first_lane + kLanes;
-    Walk walk(images, tiles[i], memory.at_least(Walk::memory_floats(most_lanes)));
+    Walk walk(images, tiles[i], memory.reserve(Walk::memory_floats(most_lanes)));
     sums[i] = walk.run();
   });
   Sums total;
