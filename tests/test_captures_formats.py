@@ -124,14 +124,18 @@ def test_angles_stand_in_for_focal_lengths(tmp_path, scene):
     assert_sees_the_scene(load_capture(tmp_path), scene)
 
 
+def frame(pose: np.ndarray, path: str = "images/frame_000.png") -> dict:
+    return {"file_path": path, "transform_matrix": pose.tolist()}
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"frames": []}, "none"),
         ({"frames": [{"file_path": "images/frame_000.png"}]}, "4x4 matrix"),
-        ({"frames": [{"file_path": "images/frame_000.png", "transform_matrix": (2 * np.eye(4)).tolist()}]}, "orthonormal"),
-        ({"frames": [{"file_path": "../frame_000.png", "transform_matrix": np.eye(4).tolist()}]}, "inside the image folder"),
-        ({"frames": [{"file_path": "images/no.png", "transform_matrix": np.eye(4).tolist()}]}, "no such image"),
+        ({"frames": [frame(2 * np.eye(4))]}, "orthonormal"),
+        ({"frames": [frame(np.eye(4), "../frame_000.png")]}, "inside the image folder"),
+        ({"frames": [frame(np.eye(4), "images/no.png")]}, "no such image"),
         ({"fl_x": "wide"}, "finite number"),
         ({"fl_x": -3.0, "fl_y": -3.0}, "focal length"),
         ({"k1": 0.2}, "lens distortion"),
@@ -273,7 +277,7 @@ def test_mega_nerf(tmp_path, scene, points):
 
 def test_mistakes_in_mega_nerf_folders_are_named(tmp_path, scene):
     write_mega_nerf(tmp_path, scene)
-    with pytest.raises(CaptureError, match="brings no 3D points(?s:.)*points3D.ply"):
+    with pytest.raises(CaptureError, match=r"brings no 3D points(?s:.)*points3D\.ply"):
         load_capture(tmp_path)
     write_ply(tmp_path / "points3D.ply", scene.points @ DRB.T, scene.colours)
     file = tmp_path / "train" / "metadata" / "000001.pt"
@@ -293,12 +297,17 @@ def test_mistakes_in_mega_nerf_folders_are_named(tmp_path, scene):
 
 def test_a_foreign_colmap_model_is_refused(tmp_path, scene):
     write_mega_nerf(tmp_path, scene)
-    write_colmap(tmp_path, TinyScene(dict(zip(scene.cameras, tiny_scene(rows=12,
-    columns=1).cameras.values(), strict=True)), scene.points, scene.colours), images=None)  # fmt: skip # noqa: E501 with pytest.raises(CaptureError, match="disagree"):
+    shuffled = np.random.default_rng(0).permutation(list(scene.cameras))
+    others = dict(zip(shuffled.tolist(), scene.cameras.values(), strict=True))
+    write_colmap(tmp_path, TinyScene(others, scene.points, scene.colours), images=None)
+    with pytest.raises(CaptureError, match="disagree"):
         load_capture(tmp_path)
 
 
 # -------------------------------------------------------------------------------------------- MatrixCity
+
+
+KEYS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
 
 
 def matrixcity_frames(scene: TinyScene, block: str, unit: float) -> list[dict]:
@@ -329,8 +338,8 @@ def test_matrixcity_pose_folder(tmp_path, scene):
     """pose/<block>/transforms_train.json: units of 100 m, images found above, in their blocks."""
     train, test = halves(scene)
     first = next(iter(scene.cameras.values()))
-    intrinsics = {"camera_angle_x": 2 * np.arctan(first.width / 2 / first.fx), "fl_x": first.fx, "fl_y": first.fx,
-                  "cx": first.cx, "cy": first.cy, "w": first.width, "h": first.height}  # fmt: skip
+    intrinsics = {key: getattr(first, name) for key, name in KEYS.items()}
+    intrinsics["camera_angle_x"] = 2 * np.arctan(first.width / 2 / first.fx)
     root = tmp_path / "aerial" / "pose" / "block_A"
     root.mkdir(parents=True)
     for side, part, block in (("train", train, "train/block_1"), ("test", test, "test/block_1_test")):
