@@ -164,11 +164,10 @@ def _fill_cells(
         strongest = kernels.group_max(gradient.reshape(-1)[parents][:, None], group, len(cells))[:, 0]
         strongest[~empty] = -1.0
         empty = torch.zeros_like(empty).index_fill_(0, strongest.argsort(descending=True, stable=True)[:room], True)
-    first = torch.full((len(cells),), len(group)).scatter_reduce_(0, group, torch.arange(len(group)), "amin")
-    index = torch.floor((means[first[empty]].double() - origin) / cell)
-    count = len(index)
+    centres = kernels.cell_centres(cells[empty], cell, origin)
+    count = len(centres)
     return Anchors(
-        positions=(index * cell).float(),
+        positions=centres,
         features=features[empty].reshape(count, FEATURE_SIZE),
         offsets=torch.zeros(count, k, 3),
         log_scales=torch.full((count, 6), math.log(cell)),

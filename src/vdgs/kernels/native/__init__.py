@@ -1,7 +1,7 @@
 """C++ implementations for the CPU, chosen at run time by instruction set."""
 
 from vdgs.kernels.native.adam import adam_rows
-from vdgs.kernels.native.cells import cell_keys, contains, group_cells, group_max, morton_order
+from vdgs.kernels.native.cells import cell_centres, cell_keys, contains, group_cells, group_max, morton_order
 from vdgs.kernels.native.cull import cull
 from vdgs.kernels.native.decode import decode
 from vdgs.kernels.native.loss import photometric_loss
@@ -11,6 +11,7 @@ from vdgs.kernels.native.views import count_views, mark_views
 
 __all__ = [
     "adam_rows",
+    "cell_centres",
     "cell_keys",
     "contains",
     "count_views",
