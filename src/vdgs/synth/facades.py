@@ -194,7 +194,7 @@ def glass(s: Surface) -> Shaded:
 
 def awning(s: Surface) -> Shaded:
     """Broad stripes of colour and white."""
-    stripe = ((s.uv[:, 0] / np.float32(0.85)) % 1 < 0.5).astype(np.float32)
+    stripe = ((s.uv[:, 0] / s.panel[:, 0] * np.float32(3.5)) % 1 < 0.5).astype(np.float32)
     fringe = 1 - 0.15 * np.exp(-s.uv[:, 1] / 0.15)
     return _matt(mix(s.colour, _FRAME * 0.95, stripe) * fringe[:, None])
 

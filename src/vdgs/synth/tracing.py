@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,12 @@ class Hits:
     v: np.ndarray
 
 
+def require_embree() -> None:
+    """Raises VdgsError where Embree is not installed."""
+    if importlib.util.find_spec("embreex") is None:
+        raise VdgsError('Generating a capture needs the ray caster Embree: pip install "vdgs[synth]".')
+
+
 class Tracer:
     """A scene that answers rays; safe to ask from several threads at once.
 
@@ -29,13 +36,10 @@ class Tracer:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ImportError as missing:
-            raise VdgsError(
-                'Generating a capture needs the ray caster Embree: pip install "vdgs[synth]".'
-            ) from missing
+        require_embree()
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
         self._scene = EmbreeScene(robust=True)
         self._mesh = TriangleMesh(self._scene, mesh.vertices, mesh.faces)
         # the first ray builds the hierarchy; do it here, before threads share the scene
