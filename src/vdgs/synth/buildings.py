@@ -160,12 +160,15 @@ def flat_block(
     box(builder, frame, body, wall, roof)
     parapet(builder, frame, body, Skin(Material.PAINT, wall.colour * 0.85))
     metal, dark = Skin(Material.PAINT, palette.METAL), Skin(Material.DARK, palette.DARK)
-    hx, hy = rng.uniform(-0.5, 0.5) * w, rng.uniform(-0.4, 0.4) * d
+    hx, hy = rng.uniform(-0.5, 0.5) * w, rng.uniform(-0.1, 0.5) * d
     hut = Box(hx - 1.5, hx + 1.5, hy - 1.3, hy + 1.3, height, height + 2.4)
     box(builder, frame, hut, Skin(Material.PLASTER, wall.colour, wall.seed), metal)
+    sunny = rng.random() < 0.45
+    if sunny:
+        solar_row(builder, frame, -0.8 * w, 0.8 * w, -0.7 * d, height)
     for _ in range(max(2, int(size[0] * size[1] / 45))):
         x, y = rng.uniform(-0.8, 0.8) * w, rng.uniform(-0.8, 0.8) * d
-        if abs(x - hx) < 2.6 and abs(y - hy) < 2.4:
+        if (abs(x - hx) < 2.6 and abs(y - hy) < 2.4) or (sunny and abs(y + 0.7 * d) < 1.9):
             continue
         if rng.random() < 0.5:
             unit = Box(x - 0.8, x + 0.8, y - 0.6, y + 0.6, height, height + 1.0)
@@ -175,8 +178,6 @@ def flat_block(
             light = Box(x - 0.7, x + 0.7, y - 0.7, y + 0.7, height, height + 0.45)
             skin = Skin(Material.PAINT, palette.TRIM)
             box(builder, frame, light, skin, Skin(Material.GLASS, palette.DARK), inset=(0.15, 0.15))
-    if rng.random() < 0.45:
-        solar_row(builder, frame, -0.8 * w, 0.8 * w, -0.6 * d, height)
 
 
 def parapet(builder: MeshBuilder, frame: Frame, shape: Box, skin: Skin) -> None:
@@ -194,7 +195,9 @@ def parapet(builder: MeshBuilder, frame: Frame, shape: Box, skin: Skin) -> None:
 def solar_row(builder: MeshBuilder, frame: Frame, x0: float, x1: float, y: float, z: float) -> None:
     """A row of tilted solar panels."""
     skin = Skin(Material.SOLAR, palette.DARK)
-    panel = np.array([(x0, y - 0.9, z + 0.25), (x1, y - 0.9, z + 0.25), (x1, y + 0.9, z + 0.95), (x0, y + 0.9, z + 0.95)])
+    panel = np.array(
+        [(x0, y - 0.9, z + 0.25), (x1, y - 0.9, z + 0.25), (x1, y + 0.9, z + 0.95), (x0, y + 0.9, z + 0.95)]
+    )
     face(builder, frame, panel, skin)
     back = np.array([(x1, y + 0.9, z), (x0, y + 0.9, z), (x0, y + 0.9, z + 0.95), (x1, y + 0.9, z + 0.95)])
     face(builder, frame, back, Skin(Material.PAINT, palette.METAL))
@@ -248,7 +251,9 @@ def barn(builder: MeshBuilder, frame: Frame) -> None:
     gables(builder, frame, body, 0.75, red)
     pitched_roof(builder, frame, body, 0.75, Skin(Material.SLATE, palette.METAL * 0.7))
     for x in (-3.0, 3.0):
-        door = np.array([(x - 1.6, -4.56, 0), (x + 1.6, -4.56, 0), (x + 1.6, -4.56, 3.2), (x - 1.6, -4.56, 3.2)])
+        door = np.array(
+            [(x - 1.6, -4.56, 0), (x + 1.6, -4.56, 0), (x + 1.6, -4.56, 3.2), (x - 1.6, -4.56, 3.2)]
+        )
         face(builder, frame, door, Skin(Material.PAINT, palette.TRIM))
     silo = frame.moved(11.5, 1.5)
     steel = Skin(Material.PAINT, palette.METAL)

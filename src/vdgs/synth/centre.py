@@ -90,7 +90,12 @@ def park(site: Site, block: Plot) -> None:
         if any(np.hypot(a - x, b - y) < r for x, y, r in kept):
             continue
         kept.append((a, b, 4.2))
-        tree(site.builder, site.frame(block, a, b), rng, str(rng.choice(["round", "round", "round", "conifer"])))
+        tree(
+            site.builder,
+            site.frame(block, a, b),
+            rng,
+            str(rng.choice(["round", "round", "round", "conifer"])),
+        )
     for b in (-d + 0.5, d - 0.5):
         for a in (-0.55 * w, 0.5 * w):
             hedge(site.builder, site.frame(block, a, b), 0.7 * w, 1.0)

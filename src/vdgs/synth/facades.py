@@ -42,9 +42,7 @@ def stone(s: Surface) -> Shaded:
     u = u + 0.5 * (j % 2)
     i = np.floor(u)
     tint = 1 + 0.22 * (cells(i, j) - 0.5) * fade(0.5, s.footprint)
-    joint = np.maximum(
-        line((u - i) * 0.9, 0.03, s.footprint), line((v - j) * 0.45, 0.03, s.footprint)
-    )
+    joint = np.maximum(line((u - i) * 0.9, 0.03, s.footprint), line((v - j) * 0.45, 0.03, s.footprint))
     return _matt(shaded(s.colour, (tint + 0.05 * smooth(*_grain_plane(s), 1.3)) * (1 - 0.3 * joint)))
 
 
@@ -160,7 +158,7 @@ def slate(s: Surface) -> Shaded:
 def flat_roof(s: Surface) -> Shaded:
     """Bitumen in strips or gravel or a planted roof, with puddle stains; by seed."""
     u, v = _grain_plane(s)
-    grain = 1 + 0.1 * smooth(u, v, 0.35, s.footprint) + 0.09 * smooth(u, v, 2.8)
+    grain = 1 + 0.09 * smooth(u, v, 0.3, s.footprint) + 0.05 * smooth(u, v, 3.4)
     seam = line((s.uv[:, 0] / 1.4 % 1 - 0.5) * 1.4, 0.05, s.footprint) * (s.seed < 0.6)
     stain = np.clip(smooth(u, v, 4.6) - 0.6, 0, 0.8) * 0.3
     bare = shaded(s.colour, grain * (1 - 0.22 * seam) * (1 - stain))

@@ -83,7 +83,7 @@ def fly(options: ResolvedOptions, terrain: Terrain) -> list[Camera]:
     """The cameras of the flight, jittered as wind and GPS would have it."""
     rng = np.random.default_rng([options.seed, 2])
     place, tilt, heading = _mission(options, float(rng.uniform(0, 6.28)))
-    altitude = float(np.clip(0.42 * options.extent_m, 36, 78))
+    altitude = float(np.clip(0.46 * options.extent_m, 36, 80))
     cameras = []
     for (x, y), lean, turn in zip(place, tilt, heading, strict=True):
         x, y = x + rng.normal(0, 0.012 * options.extent_m), y + rng.normal(0, 0.012 * options.extent_m)

@@ -39,7 +39,8 @@ def _meadow(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     base = grass(x, y, footprint, dry=0.55) * np.float32(0.92)
     i, j = np.floor(x / 0.33), np.floor(y / 0.33)
     drift = np.clip(smooth(x, y, 5.0) - 0.2, 0, 0.6)
-    bloom = (cells(i, j) < 0.3 * drift).astype(np.float32) * fade(0.33, footprint)
+    petal = np.hypot(x / 0.33 - i - 0.5, y / 0.33 - j - 0.5) < 0.38
+    bloom = ((cells(i, j) < 0.5 * drift) & petal).astype(np.float32) * fade(0.33, footprint)
     petals = np.where((cells(i, j, 1) < 0.55)[:, None], srgb("#e8cf3e"), srgb("#efeae0"))
     return mix(base, petals, bloom * 0.85)
 
@@ -51,7 +52,6 @@ def _slabs(
     u, v = x / np.float32(size), y / np.float32(size)
     i, j = np.floor(u), np.floor(v)
     tint = 1 + vary * (cells(i, j) - 0.5) * fade(size, footprint) + 0.05 * smooth(x, y, 1.9)
-    edge = np.minimum(np.abs(u - i - 0.5), np.abs(v - j - 0.5) * 0 + np.abs(u - i - 0.5))
     edge = np.maximum(np.abs(u - i - 0.5), np.abs(v - j - 0.5))
     joint = line((0.5 - edge) * size, 0.035, footprint) * 0.4
     return shaded(colour, (tint + 0.05 * smooth(x, y, 0.3, footprint)) * (1 - joint))
@@ -59,10 +59,10 @@ def _slabs(
 
 def _asphalt(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     """Asphalt: fine grain, worn patches, tar-sealed cracks."""
-    grain = 0.11 * smooth(x, y, 0.25, footprint) + 0.07 * smooth(y, x, 0.7, footprint)
-    worn = 0.09 * smooth(x, y, 4.3) + 0.06 * smooth(y, x, 1.6, footprint)
+    grain = 0.1 * smooth(x, y, 0.25, footprint) + 0.035 * smooth(y, x, 0.7, footprint)
+    worn = 0.06 * smooth(x, y, 5.3) + 0.03 * smooth(y, x, 1.6, footprint)
     crack = line(smooth(x + 7, y, 6.3) * 1.2, 0.035, footprint) * (smooth(y, x, 9.1) > 0.1)
-    return shaded(srgb("#6f7174"), (1 + grain + worn) * (1 - 0.35 * crack))
+    return shaded(srgb("#77777a"), (1 + grain + worn) * (1 - 0.35 * crack))
 
 
 def _gravel(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
@@ -137,9 +137,9 @@ def _rows(
     x: np.ndarray, y: np.ndarray, footprint: np.ndarray, period: float, furrow: np.ndarray, crop: np.ndarray
 ) -> np.ndarray:
     """A crop in rows along y, with tramlines of a tractor every eighteen metres or so."""
-    wander = x + 0.12 * smooth(x, y, 6.0)
+    wander = x + 0.25 * np.sin(y * np.float32(0.21))
     ridge = 0.5 + 0.5 * np.cos(wander * np.float32(2 * np.pi / period)) * fade(period, footprint)
-    grown = np.clip(ridge + 0.25 * smooth(x, y, 0.5, footprint), 0, 1)
+    grown = np.clip(ridge + 0.2 * smooth(x, y, 0.4, footprint), 0, 1)
     colour = mix(furrow, crop, grown) * (1 + 0.1 * smooth(x, y, 11.0) + 0.07 * smooth(y, x, 2.1))[:, None]
     tram = np.abs((wander / np.float32(18.0)) % 1 - 0.5) * 18.0
     track = np.maximum(line(tram - 0.8, 0.25, footprint), line(tram + 0.8, 0.25, footprint))
@@ -206,9 +206,7 @@ def _open_land(p: np.ndarray, q: np.ndarray, footprint: np.ndarray) -> np.ndarra
         at = np.flatnonzero(which == k)
         if len(at):
             colour[at] = paint(u[at], v[at], footprint[at])
-    edge = np.minimum(
-        31 - np.abs(a / 62 - i - 0.5) * 62 + 0 * a, 42 - np.abs((b + shift) / 84 - j - 0.5) * 84
-    )
+    edge = np.minimum(31 - np.abs(a / 62 - i - 0.5) * 62, 42 - np.abs((b + shift) / 84 - j - 0.5) * 84)
     verge = np.clip((1.6 + 0.5 * smooth(p, q, 2.0) - edge) * 2, 0, 1)
     return mix(colour, _woods(p, q, footprint), verge)
 
@@ -228,7 +226,7 @@ def _street_colours(
     zebra = (np.abs(gap - 3.7) < 1.35) & (np.abs(across) < half - 0.3)
     bars = np.clip(0.5 + 4 * np.cos(across * np.float32(2 * np.pi / 1.1)), 0, 1)
     paint = np.maximum(paint, bars * zebra)
-    stop = (np.abs(gap - 5.6) < 0.2) & (across * 0 + np.abs(across) < half - 0.3)
+    stop = (np.abs(gap - 5.6) < 0.2) & (np.abs(across) < half - 0.3)
     paint = np.maximum(paint, stop * np.float32(0.9))
     wheel = np.exp(-((np.abs(np.abs(across) - 0.5 * half) - 0.75) ** 2) * 6)
     worn = colour * (1 - 0.1 * wheel)[:, None]
@@ -239,13 +237,14 @@ def _streets(
     plan: StreetPlan, p: np.ndarray, q: np.ndarray, footprint: np.ndarray, colour: np.ndarray
 ) -> np.ndarray:
     """Draw carriageways, kerbs and pavements over whatever lies below."""
-    dp, hp, dq, hq = plan.beside(p, q)
-    out_p, out_q = np.abs(dp) - hp, np.abs(dq) - hq
+    by_p, by_q = plan.beside(p, q)
+    out_p, out_q = by_p.outside, by_q.outside
     r = np.float32(KERB_RADIUS)
     corner = r - np.hypot(np.maximum(r - out_p, 0), np.maximum(r - out_q, 0))
     # outside both streets near their crossing the kerb runs on a circle; elsewhere on the nearer street
-    beyond = np.where((out_p > 0) & (out_q > 0), np.minimum(corner, np.minimum(out_p, out_q)),
-                      np.minimum(out_p, out_q))  # fmt: skip
+    rounded = (out_p > 0) & (out_q > 0) & ~by_p.ended & ~by_q.ended
+    nearest = np.minimum(out_p, out_q)
+    beyond = np.where(rounded, np.minimum(corner, nearest), nearest)
     paved = np.flatnonzero(beyond < PAVEMENT)
     if not len(paved):
         return colour
@@ -257,8 +256,8 @@ def _streets(
     road = np.flatnonzero(beyond < 0)
     tar = _asphalt(p[road], q[road], fp[road])
     for inside, other, along, across, half in (
-        (out_p, out_q, q, dp[paved], hp[paved]),
-        (out_q, out_p, p, dq[paved], hq[paved]),
+        (out_p, out_q, q, by_p.offset[paved], by_p.half[paved]),
+        (out_q, out_p, p, by_q.offset[paved], by_q.half[paved]),
     ):
         on = np.flatnonzero((inside[road] < 0) & (other[road] > 0))
         at = road[on]

@@ -69,9 +69,7 @@ class MeshBuilder:
     def __init__(self) -> None:
         self._parts: list[dict[str, np.ndarray]] = []
 
-    def polygon(
-        self, corners: np.ndarray, material: Material, colour: np.ndarray, seed: float = 0.0
-    ) -> None:
+    def polygon(self, corners: np.ndarray, material: Material, colour: np.ndarray, seed: float = 0.0) -> None:
         """A planar convex polygon [k, 3], anticlockwise from outside.
 
         Its texture runs from the lowest coordinates, u along the first edge and v across it, in metres.

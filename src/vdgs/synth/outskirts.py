@@ -157,8 +157,7 @@ def _line_of_trees(site: Site, plot: Plot, a: float, kind: str) -> None:
 
 def _on_street(site: Site, x: float, y: float) -> bool:
     p, q = site.plan.to_plan(np.array([x]), np.array([y]))
-    dp, hp, dq, hq = site.plan.beside(p, q)
-    return bool(abs(dp[0]) < hp[0] + PAVEMENT + 1.5 or abs(dq[0]) < hq[0] + PAVEMENT + 1.5)
+    return any(street.outside[0] < PAVEMENT + 1.5 for street in site.plan.beside(p, q))
 
 
 def scatter_trees(site: Site, half_extent: float, count: int) -> None:

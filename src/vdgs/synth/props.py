@@ -84,7 +84,7 @@ def lamp(builder: MeshBuilder, frame: Frame) -> None:
     box(builder, frame, Box(-0.07, 0.07, -0.07, 0.07, -0.3, 5.2), _METAL)
     box(builder, frame, Box(-0.06, 0.06, -1.3, 0.07, 5.1, 5.25), _METAL, _METAL)
     head = Skin(Material.PAINT, palette.TRIM)
-    box(builder, frame, Box(-0.16, 0.16, -1.7, -0.9, 5.05, 5.25), head, head)
+    box(builder, frame, Box(-0.13, 0.13, -1.5, -0.95, 5.05, 5.2), head, head)
 
 
 def bandstand(builder: MeshBuilder, frame: Frame) -> None:

@@ -102,7 +102,13 @@ def _garden(site: Site, lot: Plot, start: float) -> None:
     elif what == "shed":
         shed = site.level(site.frame(lot, w - 1.6, middle), 2.6, 2.2)
         wood = Skin(Material.TIMBER, palette.TIMBER)
-        box(site.builder, shed, Box(-1.3, 1.3, -1.1, 1.1, -1, 2.2), wood, Skin(Material.SLATE, palette.SLATE[1]))
+        box(
+            site.builder,
+            shed,
+            Box(-1.3, 1.3, -1.1, 1.1, -1, 2.2),
+            wood,
+            Skin(Material.SLATE, palette.SLATE[1]),
+        )
         site.footprint(shed, (-1.3, 1.3), (-1.1, 1.1))
     elif what == "flowers":
         site.disc(lot, -0.5 * w, middle, min(1.5, depth / 2), Zone.FLOWERS)

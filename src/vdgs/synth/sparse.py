@@ -110,13 +110,16 @@ def _adjusted(
         local = places[point[at]] @ rotation.T + camera.camera_from_world[:3, 3]
         x, y, z = local.T
         zero = np.zeros_like(z)
-        jacobian = np.stack(
-            [
-                np.stack([camera.fx / z, zero, -camera.fx * x / z**2], 1),
-                np.stack([zero, camera.fy / z, -camera.fy * y / z**2], 1),
-            ],
-            1,
-        ) @ rotation
+        jacobian = (
+            np.stack(
+                [
+                    np.stack([camera.fx / z, zero, -camera.fx * x / z**2], 1),
+                    np.stack([zero, camera.fy / z, -camera.fy * y / z**2], 1),
+                ],
+                1,
+            )
+            @ rotation
+        )
         np.add.at(normal, point[at], np.einsum("nij,nik->njk", jacobian, jacobian))
         np.add.at(right, point[at], np.einsum("nij,ni->nj", jacobian, noise[at]))
     damping = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
@@ -153,5 +156,7 @@ def sparse_cloud(
     for k, camera in enumerate(cameras):
         at = image == k
         residual[at] = np.linalg.norm(camera.project(points[point[at]])[0] - observed[at], axis=1)
-    errors = np.bincount(point, residual, len(places)) / np.maximum(np.bincount(point, minlength=len(places)), 1)
+    errors = np.bincount(point, residual, len(places)) / np.maximum(
+        np.bincount(point, minlength=len(places)), 1
+    )
     return SparseCloud(places, points, colours, errors, point, image, observed, visible)

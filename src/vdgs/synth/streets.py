@@ -10,9 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 
 PAVEMENT = 1.9
-KERB_RADIUS = 3.0
-#: A street that stops short of a place is this far from it.
-_NOWHERE = np.float32(1e4)
+KERB_RADIUS = 2.6
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """Places beside a street (m, [n] float32): signed offset from its centre line, distance outside its
+    carriageway (negative: on it), half the carriageway's width, and whether the street has ended ([n] bool)."""
+
+    offset: np.ndarray
+    outside: np.ndarray
+    half: np.ndarray
+    ended: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +63,12 @@ class StreetPlan:
         x, y = self.to_world(np.array([p - 2, p + 2]), np.array([q, q]))
         return float(np.arctan2(y[1] - y[0], x[1] - x[0]))
 
-    def beside(
-        self, p: np.ndarray, q: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """For places in the plan: signed offset from the nearest street along q and its half width,
-        then the same of the nearest street along p. Where such a street has ended the offset is huge."""
-        first = self._nearest(p, q, self.p, self.p_half, self.q, self.p_main)
-        second = self._nearest(q, p, self.q, self.q_half, self.p, self.q_main)
-        return (*first, *second)
+    def beside(self, p: np.ndarray, q: np.ndarray) -> tuple[Beside, Beside]:
+        """What places in the plan [n] are beside: the nearest street along q, and the nearest along p."""
+        return (
+            self._nearest(p, q, self.p, self.p_half, self.q, self.q_half, self.p_main),
+            self._nearest(q, p, self.q, self.q_half, self.p, self.p_half, self.q_main),
+        )
 
     @staticmethod
     def _nearest(
@@ -70,12 +77,18 @@ class StreetPlan:
         positions: np.ndarray,
         halves: np.ndarray,
         ends: np.ndarray,
+        end_halves: np.ndarray,
         main: int,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> Beside:
         index = np.searchsorted((positions[1:] + positions[:-1]) / 2, across)
         offset = (across - positions.astype(np.float32)[index]).astype(np.float32)
-        ended = ((along < ends[0]) | (along > ends[-1])) & (index != main)
-        return np.where(ended, _NOWHERE, offset), halves.astype(np.float32)[index]
+        half = halves.astype(np.float32)[index]
+        outside = np.abs(offset) - half
+        # a street ends at the far edge of the last street that crosses it; main streets never do
+        past = np.maximum(ends[0] - end_halves[0] - along, along - ends[-1] - end_halves[-1])
+        past = np.where(index == main, 0, np.maximum(past, 0)).astype(np.float32)
+        around_end = np.hypot(np.maximum(outside, 0), past)
+        return Beside(offset, np.where(past > 0, around_end, outside), half, past > 0)
 
 
 def street_plan(rng: np.random.Generator, extent: float) -> StreetPlan:
@@ -89,8 +102,8 @@ def street_plan(rng: np.random.Generator, extent: float) -> StreetPlan:
         return along - along[-1] / 2
 
     p_main, q_main = (cells + 1) // 2, cells // 2
-    p_half, q_half = np.full(cells + 1, 3.1), np.full(cells + 1, 3.1)
-    p_half[p_main] = q_half[q_main] = 4.3
+    p_half, q_half = np.full(cells + 1, 3.5), np.full(cells + 1, 3.5)
+    p_half[p_main] = q_half[q_main] = 4.5
     return StreetPlan(
         p=positions(),
         q=positions(),

@@ -58,9 +58,7 @@ class Terrain:
         rise = np.clip((away - 1.8) / 6.0, 0, 1)
         rise = rise * rise * (3 - 2 * rise)
         span = 2.2 * self.half_extent
-        hills = (
-            np.sin(x / span + d) * np.cos(y / span + a) + 0.5 * np.sin((x + y) / (0.6 * span) + b) + 0.6
-        )
+        hills = np.sin(x / span + d) * np.cos(y / span + a) + 0.5 * np.sin((x + y) / (0.6 * span) + b) + 0.6
         return gentle + rise * 14.0 * hills
 
     def add_to(self, builder: MeshBuilder) -> None:

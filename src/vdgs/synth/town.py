@@ -87,7 +87,7 @@ def _traffic(site: Site) -> None:
     ):
         for position, half in zip(streets, halves, strict=True):
             for start, end in zip(others[:-1], others[1:], strict=True):
-                _stretch(site, position, half, (start + 8, end - 8), along_q)
+                _stretch(site, position, half, (start + 13, end - 13), along_q)
 
 
 def _stretch(site: Site, position: float, half: float, span: tuple[float, float], along_q: bool) -> None:
@@ -100,11 +100,11 @@ def _stretch(site: Site, position: float, half: float, span: tuple[float, float]
 
     for direction in (-1, 1):
         if rng.random() < (0.75 if half > 4 else 0.4):
-            lane = at(-direction * -0.5 * half, rng.uniform(*span), direction < 0)
+            lane = at(direction * 0.3 * half, rng.uniform(*span), direction < 0)
             (props.bus if rng.random() < 0.12 else props.car)(site.builder, site.frame(lane), rng)
-        for along in np.arange(span[0] + 3, span[1] - 3, 5.6):
-            if rng.random() < (0.28 if half > 4 else 0.16):
-                kerb = at(direction * (half - 1.05), along, direction < 0)
+        for along in np.arange(span[0], span[1], 5.6):
+            if rng.random() < (0.32 if half > 4 else 0.25):
+                kerb = at(direction * (half - 1.02), along, direction < 0)
                 props.car(site.builder, site.frame(kerb, turn=rng.normal(0, 0.02)), rng)
         for along in np.arange(span[0] + 1, span[1], 8.5):
             verge = at(direction * (half + 0.55 * PAVEMENT), along, direction > 0)
