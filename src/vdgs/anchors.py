@@ -73,23 +73,24 @@ class AnchorModel:
         """Write one safetensors file, atomically."""
         tensors = {f"anchors.{k}": v.contiguous() for k, v in self.anchors.tensors().items()}
         tensors |= {f"decoder.{k}": v.detach().contiguous() for k, v in self.decoder.tensors().items()}
-        header = {"format": FORMAT, "voxel": repr(self.voxel), "background": json.dumps(self.background), "facts": json.dumps(dict(self.facts))}
+        facts = {"voxel": self.voxel, "background": self.background, "facts": dict(self.facts)}
+        header = {FORMAT: json.dumps(facts)}  # a single key: several would be written in an order that varies
         write_atomically(path, lambda temporary: save_file(tensors, temporary, metadata=header))
 
     @staticmethod
     def load(path: Path) -> AnchorModel:
         """Read a model. Raises VdgsError if the file is missing, damaged or not an anchor model."""
         tensors, header = read_tensors(path)
-        if header.get("format") != FORMAT:
-            raise VdgsError(f"{path}: is not a vdgs anchor model (format {header.get('format')!r})")
+        if FORMAT not in header:
+            raise VdgsError(f"{path}: is not a vdgs anchor model (its header has no {FORMAT!r})")
         try:
             anchors = Anchors(**{n: tensors[f"anchors.{n}"] for n in ("positions", *TRAINED)})
             decoder = Decoder.from_tensors(
                 {name.removeprefix("decoder."): t for name, t in tensors.items() if name.startswith("decoder.")}
             )
-            red, green, blue = (float(value) for value in json.loads(header["background"]))
-            facts = json.loads(header["facts"])
-            model = AnchorModel(anchors, decoder, float(header["voxel"]), (red, green, blue), facts)
+            known = json.loads(header[FORMAT])
+            red, green, blue = (float(value) for value in known["background"])
+            model = AnchorModel(anchors, decoder, float(known["voxel"]), (red, green, blue), known["facts"])
             model.check()
         except (KeyError, ValueError, TypeError) as error:
             raise VdgsError(f"{path}: is damaged or incomplete ({error}). Restore it or train again.") from error

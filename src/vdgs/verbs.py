@@ -183,4 +183,4 @@ def _use_threads(count: int) -> None:
 def _console():  # type: ignore[no-untyped-def]
     from rich.console import Console
 
-    return Console()
+    return Console(soft_wrap=True)
