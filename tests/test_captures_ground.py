@@ -194,6 +194,13 @@ def test_a_georeferenced_world_keeps_its_axes_and_metres(tmp_path):
     assert (frame.scale, frame.metric, frame.origin_geo) == (1.0, True, ORIGIN)
 
 
+def test_a_georeference_that_contradicts_the_cameras_is_a_warning(tmp_path):
+    georef(tmp_path / "georef.json")
+    sideways = moved(tiny_scene(), 1.0, np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.zeros(3))
+    _, warnings = ground_of(sideways, tmp_path)
+    assert any("90 degrees away" in warning for warning in warnings)
+
+
 def test_a_far_origin_is_moved_so_that_float32_is_safe(tmp_path):
     georef(tmp_path / "georef.json")
     shift = np.array([432_100.4, -5_187_300.7, 20.0])
