@@ -98,6 +98,8 @@ def test_up_can_be_said_outright(tmp_path, up, vector):
 def test_up_contradicts_a_georeference_that_is_asked_for(tmp_path):
     with pytest.raises(CaptureError, match="--up contradicts"):
         ground_of(tiny_scene(), tmp_path, up="z", gps=tmp_path / "gps.csv")
+    with pytest.raises(CaptureError, match="give one"):
+        ground_of(tiny_scene(), tmp_path, georef=tmp_path / "georef.json", gps=tmp_path / "gps.csv")
 
 
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 1e-3))

@@ -72,6 +72,8 @@ def find_ground_frame(
             warnings.append("--up is given, so georef.json is not used: the frame is not metric.")
         rotation = rotation_to_z(AXES[options.up])
         return _unscaled(scene, rotation, f"up = {options.up} as given", warnings), warnings
+    if options.georef and options.gps:
+        raise CaptureError("--georef and --gps both say where the world is; give one.")
     georef = options.georef or (root / "georef.json" if (root / "georef.json").is_file() else None)
     if georef and options.georef is None and options.gps is not None:
         georef = None  # what was asked for wins over what lies about
