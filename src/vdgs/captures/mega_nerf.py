@@ -118,8 +118,7 @@ def _array(content: dict[str, Any], key: str, shape: tuple[int, ...], file: Path
 
 
 def _aliases(root: Path, views: list[SourceView]) -> dict[str, str]:
-    """Original image names to ours, from mappings.txt ("DJI_0001.JPG,000000.pt"), for COLMAP models of "
-    "the originals."""
+    """Original image names to ours, from mappings.txt ("DJI_0001.JPG,000000.pt")."""
     file = root / "mappings.txt"
     if not file.is_file():
         return {}
