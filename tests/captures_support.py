@@ -40,8 +40,7 @@ def ground_colour(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def look_down(position: np.ndarray, tilt_deg: float = 0.0, yaw_deg: float = 0.0) -> np.ndarray:
-    """camera_from_world [4, 4] of a camera above the plane: +x right, +y down in the picture, +z towards "
-    "the ground."""
+    """camera_from_world [4, 4] of a camera above the plane, looking down but for `tilt_deg`."""
     yaw, tilt = np.radians(yaw_deg), np.radians(tilt_deg)
     forward = np.array([np.sin(tilt) * np.sin(yaw), np.sin(tilt) * np.cos(yaw), -np.cos(tilt)])
     right = np.array([np.cos(yaw), -np.sin(yaw), 0.0])
@@ -186,8 +185,7 @@ def write_ply(file: Path, points: np.ndarray, colours: np.ndarray, *, text: bool
 
 
 def data_folder(name: str) -> Path:
-    """A real capture by name ("copr"), from $VDGS_DATA or ../shared/data; skips the test where it is "
-    "absent."""
+    """A real capture by name ("copr"), from $VDGS_DATA or ../shared/data; skips the test without it."""
     base = Path(os.environ.get("VDGS_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
     if not (base / name / "sparse").is_dir():
         pytest.skip(f"no real capture {name!r} (set VDGS_DATA)")

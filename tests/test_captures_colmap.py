@@ -20,7 +20,7 @@ from vdgs.captures.options import CaptureOptions
 from vdgs.captures.source import CAMERA_MODELS
 from vdgs.errors import CaptureError
 
-FUZZ = settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def assert_same(model, scene: TinyScene) -> None:

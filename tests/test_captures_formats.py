@@ -22,7 +22,7 @@ from vdgs.errors import CaptureError
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 #: DRB axes (down, right, back) of a z-up world whose x is right and y is forward.
 DRB = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-FUZZ = settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture

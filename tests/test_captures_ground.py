@@ -98,6 +98,8 @@ def test_up_can_be_said_outright(tmp_path, up, vector):
 def test_up_contradicts_a_georeference_that_is_asked_for(tmp_path):
     with pytest.raises(CaptureError, match="--up contradicts"):
         ground_of(tiny_scene(), tmp_path, up="z", gps=tmp_path / "gps.csv")
+    with pytest.raises(CaptureError, match="give one"):
+        ground_of(tiny_scene(), tmp_path, georef=tmp_path / "georef.json", gps=tmp_path / "gps.csv")
 
 
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 1e-3))
@@ -192,6 +194,13 @@ def test_a_georeferenced_world_keeps_its_axes_and_metres(tmp_path):
     np.testing.assert_array_equal(frame.rotation, np.eye(3))
     np.testing.assert_array_equal(frame.translation, 0)
     assert (frame.scale, frame.metric, frame.origin_geo) == (1.0, True, ORIGIN)
+
+
+def test_a_georeference_that_contradicts_the_cameras_is_a_warning(tmp_path):
+    georef(tmp_path / "georef.json")
+    sideways = moved(tiny_scene(), 1.0, np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.zeros(3))
+    _, warnings = ground_of(sideways, tmp_path)
+    assert any("90 degrees away" in warning for warning in warnings)
 
 
 def test_a_far_origin_is_moved_so_that_float32_is_safe(tmp_path):

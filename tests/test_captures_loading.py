@@ -117,6 +117,13 @@ def test_an_image_of_another_shape_is_named_with_both_sizes(folder, scene):
         load_capture(folder, UP)
 
 
+def test_up_to_ten_images_that_do_not_fit_are_listed(folder, scene):
+    for name in scene.cameras:
+        cv2.imwrite(str(folder / "images" / name), np.zeros((64, 48, 3), np.uint8))
+    with pytest.raises(CaptureError, match=r"12 images cannot be used(?s:.)*frame_009(?s:.)*and 2 more"):
+        load_capture(folder, UP)
+
+
 def test_scaling_keeps_lens_parameters_and_the_field_of_view():
     lens = Intrinsics("OPENCV", (800.0, 810.0, 320.0, 240.0, 0.1, 0.01, 0.001, 0.002), 640, 480)
     half = scaled(lens, 320, 240)
@@ -299,6 +306,10 @@ def test_undistorting_gives_the_pinhole_picture(tmp_path, model, extra):
         grid = (rays * [camera.fx, camera.fy] + [160.0, 120.0] - 0.5).astype(np.float32).reshape(120, 160, 2)
         bent = cv2.remap(render_plane(wide), grid[..., 0], grid[..., 1], cv2.INTER_CUBIC)
         cv2.imwrite(str(tmp_path / "images" / name), bent[:, :, ::-1])
+    half = np.zeros((120, 160), np.uint8)
+    half[:, :80] = 255
+    (tmp_path / "masks").mkdir()
+    cv2.imwrite(str(tmp_path / "masks" / "frame_002.png"), half)
     capture = load_capture(tmp_path, up(undistort=True))
     assert any("undistorted into" in warning for warning in capture.warnings)
     for view in capture.views:
@@ -308,6 +319,11 @@ def test_undistorting_gives_the_pinhole_picture(tmp_path, model, extra):
         )  # fmt: skip
         straight = decode_photograph(view.image_path)[0].astype(float)
         assert np.abs(straight - render_plane(truth)).mean() < 3.0
+    mask = load_picture(capture.views[2]).mask
+    assert mask is not None
+    assert mask.float().mean() == pytest.approx(0.5, abs=0.03)
+    assert mask[:, :60].all()
+    assert [view.mask_path is not None for view in capture.views] == [False, False, True, False]
     written = {file: file.stat().st_mtime_ns for file in (tmp_path / "undistorted").rglob("*.jpg")}
     again = load_capture(tmp_path, up(undistort=True))
     assert len(again.views) == len(written) == 4

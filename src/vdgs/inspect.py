@@ -18,8 +18,10 @@ from scipy.spatial import cKDTree
 
 from vdgs.captures.capture import Capture, View
 
-#: Points drawn from when there are more, and points per round: bounds time and memory.
+#: Points looked at when there are more, fewer where there are many cameras, and points per round.
 MOST_POINTS = 200_000
+LEAST_POINTS = 20_000
+MOST_PROJECTIONS = 2e8
 CHUNK = 50_000
 QUANTILES = (5, 25, 50, 75, 95)
 THIN = (3, 5, 10)
@@ -71,7 +73,8 @@ def inspect_capture(capture: Capture, output: Path) -> CaptureReport:
     from vdgs.inspect_figures import draw_map, draw_visibility
 
     output.mkdir(parents=True, exist_ok=True)
-    points = sample_points(capture.points)
+    few_enough = int(np.clip(MOST_PROJECTIONS / len(capture.train_views), LEAST_POINTS, MOST_POINTS))
+    points = sample_points(capture.points, few_enough)
     visibility = count_views(points, capture.train_views)
     report = measure(capture, points, visibility)
     figures = [output / "visibility_map.png", output / "visibility.png"]

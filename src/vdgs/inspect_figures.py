@@ -108,6 +108,7 @@ def draw_visibility(report: CaptureReport, visibility: np.ndarray, file: Path) -
     right.set_title("Poorly seen", loc="left", fontsize=11, color=INK)
     for axes in (left, right):
         _plain(axes)
+    left.xaxis.set_major_locator(MaxNLocator(integer=True))
     left.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
     right.xaxis.set_major_formatter(PercentFormatter(1, decimals=0))
     right.tick_params(axis="y", length=0)

@@ -26,7 +26,7 @@ from vdgs.captures.capture import GroundFrame
 from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.captures.georeference import match_gps, read_georef, read_gps
 from vdgs.captures.options import CaptureOptions
-from vdgs.captures.source import SourceCapture
+from vdgs.captures.source import KnownWorld, SourceCapture
 from vdgs.errors import CaptureError
 
 #: Median camera height above the ground, in units, where the capture has no metres (choice).
@@ -35,6 +35,8 @@ CAMERA_HEIGHT = 10.0
 FAR_FROM_ORIGIN_M = 1000.0
 #: Below this cosine between up and the mean view the sign of up is taken from the heights instead.
 LEVEL_VIEW = 0.1
+#: A told up axis farther than this from the estimated one is worth a warning.
+SUSPICIOUS_DEG = 30.0
 AXES = {
     sign + name: factor * np.eye(3)[index]
     for index, name in enumerate("xyz")
@@ -70,6 +72,8 @@ def find_ground_frame(
             warnings.append("--up is given, so georef.json is not used: the frame is not metric.")
         rotation = rotation_to_z(AXES[options.up])
         return _unscaled(scene, rotation, f"up = {options.up} as given", warnings), warnings
+    if options.georef and options.gps:
+        raise CaptureError("--georef and --gps both say where the world is; give one.")
     georef = options.georef or (root / "georef.json" if (root / "georef.json").is_file() else None)
     if georef and options.georef is None and options.gps is not None:
         georef = None  # what was asked for wins over what lies about
@@ -82,10 +86,9 @@ def find_ground_frame(
         if frame_or_none is not None:
             return frame_or_none, warnings
     if source.world is not None:
-        world = source.world
-        if world.metric:
-            return _centred(scene, world.rotation, world.scale, True, world.how), warnings
-        return _unscaled(scene, world.rotation, world.how, warnings), warnings
+        frame = _promised(scene, source.world, warnings)
+        _compare_up(scene, frame, warnings)
+        return frame, warnings
     up, how = estimate_up(scene.centres, scene.forwards, scene.points, warnings)
     return _unscaled(scene, rotation_to_z(up), how, warnings), warnings
 
@@ -156,11 +159,14 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
 
 
 def _compare_up(scene: _Scene, frame: GroundFrame, warnings: list[str]) -> None:
-    """Warn where the georeferenced up axis and the viewing directions contradict each other."""
-    mean_forward_z = float((scene.forwards @ frame.rotation.T)[:, 2].mean())
-    if mean_forward_z > LEVEL_VIEW:
+    """Warn where the up axis that was told and the one that the cameras suggest contradict each other."""
+    doubts: list[str] = []
+    up, _ = estimate_up(scene.centres, scene.forwards, scene.points, doubts)
+    angle = float(np.degrees(np.arccos(np.clip(frame.rotation[2] @ up, -1, 1))))
+    if angle > SUSPICIOUS_DEG and not doubts:
         warnings.append(
-            f"the cameras look upwards on average in this frame ({frame.how}); is it the right one?"
+            f"up is {angle:.0f} degrees away from what cameras and points suggest (used: {frame.how}). "
+            "If the scene looks tilted, give --up."
         )
 
 
@@ -230,6 +236,13 @@ def _unscaled(scene: _Scene, rotation: np.ndarray, how: str, warnings: list[str]
             "all cameras and points lie in one place; this is no scene. Check the sparse model."
         )
     return _centred(scene, rotation, CAMERA_HEIGHT / height, False, f"{how}; median camera height = 10 units")
+
+
+def _promised(scene: _Scene, world: KnownWorld, warnings: list[str]) -> GroundFrame:
+    """The frame that a format promises; its scale is chosen where the format knows no metres."""
+    if world.metric:
+        return _centred(scene, world.rotation, world.scale, True, world.how)
+    return _unscaled(scene, world.rotation, world.how, warnings)
 
 
 def _centred(scene: _Scene, rotation: np.ndarray, scale: float, metric: bool, how: str) -> GroundFrame:

@@ -84,18 +84,8 @@ def intrinsics_of(frame: dict[str, Any], common: dict[str, Any], image: Path, fi
     if width is None or height is None:
         header = read_header(image)
         width, height = header.width, header.height
-    fx, fy = get("fl_x"), get("fl_y")
-    angle_x, angle_y = get("camera_angle_x"), get("camera_angle_y")
-    if fx is None and angle_x is not None and 0 < angle_x < math.pi:
-        fx = width / 2 / math.tan(angle_x / 2)
-    if (
-        fy is None
-        and get("fl_y") is None
-        and get("fl_x") is None
-        and angle_y is not None
-        and 0 < angle_y < math.pi
-    ):
-        fy = height / 2 / math.tan(angle_y / 2)
+    fx = get("fl_x", _focal(width, get("camera_angle_x")))
+    fy = get("fl_y", fx if get("fl_x") is not None else _focal(height, get("camera_angle_y")))
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
     if fx is None or fy is None:
         raise CaptureError(f"{file}: no focal length for {image.name} (fl_x or camera_angle_x).")
@@ -109,6 +99,11 @@ def intrinsics_of(frame: dict[str, Any], common: dict[str, Any], image: Path, fi
 
 
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def _focal(side: float, angle: float | None) -> float | None:
+    """Focal length in pixels from the field of view (radians) across a side."""
+    return side / 2 / math.tan(angle / 2) if angle is not None and 0 < angle < math.pi else None
 
 
 def _lens(model: str, k: dict[str, float], file: Path) -> tuple[str, tuple[float, ...]]:

@@ -15,10 +15,10 @@ from vdgs.captures.matrixcity import pose_files, read_matrixcity
 from vdgs.captures.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.options import CaptureOptions
 from vdgs.captures.photographs import Names, find_images, find_mask, read_header
-from vdgs.captures.source import Intrinsics, SourceCapture, SourceView, listing
+from vdgs.captures.source import SINGLE_FOCAL, Intrinsics, SourceCapture, SourceView, listing
 from vdgs.captures.splits import choose_splits, nearest_to_middle
 from vdgs.captures.transforms import read_transforms
-from vdgs.captures.undistortion import undistort
+from vdgs.captures.undistortion import Photograph, undistort
 from vdgs.errors import CaptureError
 
 #: Points farther from the cameras than this many times their spread are strays of the matching.
@@ -27,11 +27,10 @@ FAR_POINT = 100.0
 
 @dataclass(frozen=True, eq=False)
 class _Photograph:
-    """A view whose image was found: intrinsics at the image's own size."""
+    """A view whose image was found."""
 
     view: SourceView
-    path: Path
-    intrinsics: Intrinsics
+    file: Photograph
 
 
 def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
@@ -51,7 +50,7 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     photographs = _find_photographs(root, source, options, warnings)
     photographs = _undistorted(root, photographs, options, warnings)
     ground, ground_warnings = find_ground_frame(source, root, options)
-    views = [_view(photo, root, options, ground) for photo in photographs]
+    views = [_view(photo, options, ground) for photo in photographs]
     points, colours = ground.to_ground(source.points), source.colours
     if options.max_images is not None and options.max_images < len(views):
         warnings.append(f"using the {options.max_images} of {len(views)} photographs nearest to the middle.")
@@ -210,10 +209,27 @@ def _find_photographs(
     if spare:
         shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
         warnings.append(f"{len(spare)} images have no camera and are not used ({shown}).")
-    return [
-        _Photograph(view, path, fit_to_image(view, path))
-        for view, path in zip(source.views, paths, strict=True)
-    ]
+    return _fitted(root, source, paths, options)
+
+
+def _fitted(
+    root: Path, source: SourceCapture, paths: list[Path], options: CaptureOptions
+) -> list[_Photograph]:
+    """The views with their images, masks and intrinsics at the images' sizes; collects what does not fit."""
+    photographs, problems = [], []
+    for view, path in zip(source.views, paths, strict=True):
+        mask = view.mask_path or find_mask(root / options.masks, view.name)
+        try:
+            photographs.append(_Photograph(view, Photograph(view.name, path, mask, fit_to_image(view, path))))
+        except CaptureError as error:
+            problems.append(str(error))
+    if len(problems) > 1:
+        raise CaptureError(
+            f"{root / source.images}: {len(problems)} images cannot be used.{listing(problems)}"
+        )
+    if problems:
+        raise CaptureError(problems[0])
+    return photographs
 
 
 def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
@@ -232,8 +248,7 @@ def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
         raise CaptureError(
             f"{path}: is {header.width}x{header.height}, but its camera is "
             f"{intrinsics.width}x{intrinsics.height}: another shape, so the two do not belong together. "
-            f"{hint}"
-            "Use the images that the model was made from, or shrink them evenly."
+            f"{hint}Use the images that the model was made from, or shrink them evenly."
         )
     return scaled(intrinsics, header.width, header.height)
 
@@ -244,8 +259,7 @@ def scaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
     (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.principal_point
     if not intrinsics.distorted:
         return Intrinsics("PINHOLE", (fx * sx, fy * sy, cx * sx, cy * sy), width, height)
-    single = len(intrinsics.params) and intrinsics.focal[0] == intrinsics.params[0] == intrinsics.focal[1]
-    head = (fx * (sx + sy) / 2,) if single and intrinsics.params[1] == cx else (fx * sx, fy * sy)
+    head = (fx * (sx + sy) / 2,) if intrinsics.model in SINGLE_FOCAL else (fx * sx, fy * sy)
     tail = intrinsics.params[len(head) + 2 :]
     return Intrinsics(intrinsics.model, (*head, cx * sx, cy * sy, *tail), width, height)
 
@@ -254,32 +268,30 @@ def _undistorted(
     root: Path, photographs: list[_Photograph], options: CaptureOptions, warnings: list[str]
 ) -> list[_Photograph]:
     """Pinhole photographs only: undistorts on request, else refuses lens distortion."""
-    bent = [photo for photo in photographs if photo.intrinsics.distorted]
+    bent = [photo for photo in photographs if photo.file.intrinsics.distorted]
     if not bent:
         return photographs
     if not options.undistort:
-        models = sorted({photo.intrinsics.model for photo in bent})
+        models = sorted({photo.file.intrinsics.model for photo in bent})
         raise CaptureError(
             f"{root}: {len(bent)} photographs have a camera with lens distortion ({', '.join(models)}); "
             "training needs a pinhole. Add --undistort, or run colmap image_undistorter."
             f"{listing(photo.view.name for photo in bent)}"
         )
-    inputs = [(photo.view.name, photo.path, photo.intrinsics) for photo in photographs]
-    outputs = undistort(root, inputs, options, warnings)
-    return [
-        replace(photo, path=path, intrinsics=intrinsics)
-        for photo, (path, intrinsics) in zip(photographs, outputs, strict=True)
-    ]
+    folder = options.undistorted_folder or root / "undistorted" / (options.images or "images")
+    straight = undistort(folder, [photo.file for photo in photographs])
+    warnings.append(f"{len(bent)} photographs were undistorted into {folder}.")
+    return [_Photograph(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
 
 
-def _view(photo: _Photograph, root: Path, options: CaptureOptions, ground: GroundFrame) -> View:
-    (fx, fy), (cx, cy) = photo.intrinsics.focal, photo.intrinsics.principal_point
-    width, height = photo.intrinsics.width, photo.intrinsics.height
+def _view(photo: _Photograph, options: CaptureOptions, ground: GroundFrame) -> View:
+    intrinsics = photo.file.intrinsics
+    (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.principal_point
+    width, height = intrinsics.width, intrinsics.height
     pose = transform_pose(photo.view.camera_from_world, ground)
     camera = Camera(pose, fx, fy, cx, cy, width, height)
     if options.downscale != 1:
         camera = camera.resized(
             max(1, int(width / options.downscale)), max(1, int(height / options.downscale))
         )
-    mask = photo.view.mask_path or find_mask(root / options.masks, photo.view.name)
-    return View(photo.view.name, camera, photo.path, mask, "train")
+    return View(photo.view.name, camera, photo.file.path, photo.file.mask, "train")

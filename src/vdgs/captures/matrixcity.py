@@ -3,7 +3,7 @@
 Two forms are published. pose/<block>/ holds transforms_train.json and transforms_test.json
 (`transform_matrix`, unit 100 m, file_path relative to the dataset). train/<block>/ and test/<block>_test/
 hold one transforms.json each (`rot_mat`, `frame_index`; unit 1 m, the rotation to be multiplied by 100).
-Either folder, or the one above the blocks of the second form, may be given. The same reader serves other
+The capture is the folder pose/<block>, or the one above train/ and test/. The same reader serves other
 transforms_train/transforms_test pairs (Blender): then the world's scale is not known.
 """
 

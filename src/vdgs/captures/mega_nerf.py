@@ -8,7 +8,6 @@ describes the originals: the images are already undistorted.
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -100,15 +99,7 @@ def _load(file: Path) -> dict[str, Any]:
         content = torch.load(file, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise CaptureError(f"{file}: no such file; Mega-NeRF's layout needs it.") from None
-    except (
-        OSError,
-        RuntimeError,
-        ValueError,
-        EOFError,
-        KeyError,
-        pickle.UnpicklingError,
-        AttributeError,
-    ) as error:
+    except Exception as error:  # its parsers raise many kinds on damaged files
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CaptureError(f"{file}: cannot be read as a torch file ({first}). Copy it again.") from None
     if not isinstance(content, dict):
@@ -127,8 +118,7 @@ def _array(content: dict[str, Any], key: str, shape: tuple[int, ...], file: Path
 
 
 def _aliases(root: Path, views: list[SourceView]) -> dict[str, str]:
-    """Original image names to ours, from mappings.txt ("DJI_0001.JPG,000000.pt"), for COLMAP models of "
-    "the originals."""
+    """Original image names to ours, from mappings.txt ("DJI_0001.JPG,000000.pt")."""
     file = root / "mappings.txt"
     if not file.is_file():
         return {}

@@ -9,7 +9,7 @@ import warnings as python_warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
@@ -77,7 +77,8 @@ def find_images(folder: Path) -> dict[str, Path]:
 
 def without_suffix(name: str) -> str:
     """The key by which names match across extensions: no suffix, lower case."""
-    return str(Path(name).with_suffix("")).lower() if name else name
+    path = PurePosixPath(name)
+    return str(path.with_suffix("")).lower() if path.suffix else name.lower()
 
 
 class Names:

@@ -5,55 +5,55 @@ from __future__ import annotations
 import json
 import os
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
 
-from vdgs.captures.options import CaptureOptions
-from vdgs.captures.photographs import decode_photograph
+from vdgs.captures.photographs import decode_mask, decode_photograph
 from vdgs.captures.source import Intrinsics
 from vdgs.errors import CaptureError
 
 JPEG_QUALITY = 95
-#: One undistorted photograph: name, file, intrinsics at the file's size.
-Photograph = tuple[str, Path, Intrinsics]
 
 
-def undistort(
-    root: Path, photographs: list[Photograph], options: CaptureOptions, warnings: list[str]
-) -> list[tuple[Path, Intrinsics]]:
-    """Pinhole versions of the photographs: their files and PINHOLE intrinsics.
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph on disk: name, image, mask where there is one, intrinsics at the image's size."""
 
-    Files are written under `options.undistorted_folder` (default `root`/undistorted/<image folder's
-    name>), each beside a small JSON that says from which file, of which size and date, and with which
-    camera it was made; what matches is reused. Photographs without distortion pass through. Raises
-    `CaptureError` if the folder cannot be written or an image cannot be decoded.
+    name: str
+    path: Path
+    mask: Path | None
+    intrinsics: Intrinsics
+
+
+def undistort(folder: Path, photographs: list[Photograph]) -> list[Photograph]:
+    """Pinhole versions of the photographs and their masks.
+
+    Files are written under `folder`, each image beside a small JSON that says from which files, of which
+    size and date, and with which camera it was made; what matches is reused. Photographs without
+    distortion pass through. Raises `CaptureError` if the folder cannot be written or an image cannot be
+    decoded.
     """
-    folder = options.undistorted_folder or root / "undistorted" / (options.images or "images")
-    bent = [photo for photo in photographs if photo[2].distorted]
-    targets = {intrinsics: pinhole_for(intrinsics) for _, _, intrinsics in bent}
+    targets = {
+        photo.intrinsics: pinhole_for(photo.intrinsics) for photo in photographs if photo.intrinsics.distorted
+    }
+
+    def one(photo: Photograph) -> Photograph:
+        target = targets.get(photo.intrinsics)
+        return photo if target is None else _undistort_one(folder, photo, target)
+
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with ThreadPoolExecutor(2) as pool:
-            files = dict(
-                zip(
-                    (name for name, _, _ in bent),
-                    pool.map(lambda photo: _undistorted_file(folder, photo, targets[photo[2]]), bent),
-                    strict=True,
-                )
-            )
+            return list(pool.map(one, photographs))
     except OSError as error:
         raise CaptureError(
             f"{folder}: cannot be written ({error.strerror or error}). "
             "Choose a folder for the undistorted photographs with --undistorted-folder."
         ) from error
-    warnings.append(f"{len(bent)} photographs were undistorted into {folder}.")
-    return [
-        (files[name], targets[intrinsics]) if name in files else (path, intrinsics)
-        for name, path, intrinsics in photographs
-    ]
 
 
 def pinhole_for(intrinsics: Intrinsics) -> Intrinsics:
@@ -71,10 +71,9 @@ def pinhole_for(intrinsics: Intrinsics) -> Intrinsics:
 
 
 def sampling_map(distorted: Intrinsics, pinhole: Intrinsics) -> np.ndarray:
-    """Where each pixel of the pinhole picture lies in the distorted one, [h, w, 2] float32, OpenCV's
-    convention.
+    """Where each pixel of the pinhole picture lies in the distorted one, [h, w, 2] float32.
 
-    Pixel centres are at 0.5 here and at 0 in `cv2.remap`.
+    In OpenCV's convention: pixel centres are at 0.5 here and at 0 in `cv2.remap`.
     """
     (fx, fy), (cx, cy) = pinhole.focal, pinhole.principal_point
     x = (np.arange(pinhole.width) + 0.5 - cx) / fx
@@ -85,26 +84,41 @@ def sampling_map(distorted: Intrinsics, pinhole: Intrinsics) -> np.ndarray:
     return (pixels - 0.5).reshape(pinhole.height, pinhole.width, 2).astype(np.float32)
 
 
-def _undistorted_file(folder: Path, photo: Photograph, pinhole: Intrinsics) -> Path:
-    name, path, intrinsics = photo
-    target = folder / Path(name).with_suffix(".jpg")
-    stamp_file = target.with_suffix(".json")
-    status = path.stat()
-    stamp = {
-        "source": str(path.resolve()), "bytes": status.st_size, "modified_ns": status.st_mtime_ns,
-        "camera": [intrinsics.model, *intrinsics.params, intrinsics.width, intrinsics.height],
-    }  # fmt: skip
-    if target.is_file() and _read_json(stamp_file) == stamp:
-        return target
-    pixels, _ = decode_photograph(path)
-    grid = sampling_map(intrinsics, pinhole)
-    straight = cv2.remap(pixels, grid[..., 0], grid[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+def _undistort_one(folder: Path, photo: Photograph, pinhole: Intrinsics) -> Photograph:
+    plain = photo.name if photo.name.lower().endswith((".jpg", ".jpeg")) else photo.name + ".jpg"
+    target = folder / plain
+    mask_target, stamp_file = (target.with_name(target.name + suffix) for suffix in (".mask.png", ".json"))
+    lens = photo.intrinsics
+    stamp: dict[str, object] = {"camera": [lens.model, *lens.params, lens.width, lens.height]}
+    for kind, file in (("image", photo.path), ("mask", photo.mask)):
+        status = file.stat() if file else None
+        stamp[kind] = status and [str(file), status.st_size, status.st_mtime_ns]
+    known = _read_json(stamp_file)
+    if not (target.is_file() and isinstance(known, dict) and known.get("made_from") == stamp):
+        keep = _write_straight(photo, pinhole, target, mask_target)
+        _write(stamp_file, json.dumps({"made_from": stamp, "mask": keep}).encode())
+        known = {"mask": keep}
+    mask = mask_target if known.get("mask") and mask_target.is_file() else None
+    return Photograph(photo.name, target, mask, pinhole)
+
+
+def _write_straight(photo: Photograph, pinhole: Intrinsics, target: Path, mask_target: Path) -> bool:
+    """Write the straightened image, and its mask if there is one (from a file or from transparency)."""
+    pixels, keep = decode_photograph(photo.path)
+    if photo.mask is not None:
+        masked = decode_mask(photo.mask, pixels.shape[1], pixels.shape[0])
+        keep = masked if keep is None else masked & keep
+    grid = sampling_map(photo.intrinsics, pinhole)
+    x, y = grid[..., 0], grid[..., 1]
+    straight = cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
-    encoded = cv2.imencode(".jpg", cv2.cvtColor(straight, cv2.COLOR_RGB2BGR), settings)[1]
     target.parent.mkdir(parents=True, exist_ok=True)
-    _write(target, encoded.tobytes())
-    _write(stamp_file, json.dumps(stamp).encode())
-    return target
+    _write(target, cv2.imencode(".jpg", cv2.cvtColor(straight, cv2.COLOR_RGB2BGR), settings)[1].tobytes())
+    if keep is None:
+        return False
+    mask = cv2.remap(keep.astype(np.uint8) * 255, x, y, cv2.INTER_NEAREST, borderValue=(0.0,))
+    _write(mask_target, cv2.imencode(".png", mask)[1].tobytes())
+    return True
 
 
 def _read_json(file: Path) -> object:
