@@ -2,7 +2,7 @@
 #include <vector>
 
 #include "bindings.h"
-#include "math.h"
+#include "gaussian_math.h"
 #include "threads.h"
 
 namespace vdgs {

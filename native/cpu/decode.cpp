@@ -9,8 +9,8 @@
 namespace vdgs {
 namespace {
 
-constexpr int64_t kPiece = 256;                 // anchors per task
-constexpr int64_t kStoredSplats = int64_t{1} << 19;  // 32 MiB, what the store keeps at most
+constexpr int64_t kPiece = 256;                      // anchors per task
+constexpr int64_t kStoredSplats = int64_t{1} << 20;  // 64 MiB, the most that the store keeps
 
 // Memory of pieces that are done. Never destroyed: views may outlive everything else.
 struct Store {

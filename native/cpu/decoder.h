@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <memory>
 
-#include "math.h"
+#include "gaussian_math.h"
 #include "products.h"
 
 namespace vdgs {

@@ -27,6 +27,7 @@ VDGS_FN float fma(float a, float b, float c) { return a * b + c; }
 VDGS_FN float sqrt(float a) { return ::sqrtf(a); }
 VDGS_FN float abs(float a) { return ::fabsf(a); }
 VDGS_FN float exp(float a) { return ::expf(a); }
+VDGS_FN float log(float a) { return ::logf(a); }
 VDGS_FN float min(float a, float b) { return a < b ? a : b; }
 VDGS_FN float max(float a, float b) { return a > b ? a : b; }
 VDGS_FN bool lt(float a, float b) { return a < b; }
@@ -87,7 +88,7 @@ VDGS_FN Vec3<T> cross(Vec3<T> a, Vec3<T> b) {
 }
 template <class T>
 VDGS_FN Mask<T> finite(T a) {
-  return lt(abs(a), constant<T>(__builtin_inff()));
+  return le(abs(a), constant<T>(3.402823466e38f));
 }
 
 // ---------------------------------------------------------------------------------------- camera
