@@ -54,7 +54,7 @@ VDGS_INLINE uint64_t blend_block(const Batch& batch, uint64_t chosen, int block,
     const M16 reached = reaches(exponent) & live;
     F16 alpha = zero_unless(reached, min(exp2_bounded(exponent), splat(kAlphaMax)));
     F16 t_next = fnma(alpha, t, t);
-    if (none(reached)) touched &= ~(uint64_t{1} << j);
+    touched ^= static_cast<uint64_t>(none(reached)) << j;  // no branch: it would be hard to predict
     const M16 finishing = lt(t_next, splat(kTransmittanceMin));
     if (__builtin_expect(any(finishing), 0)) {
       // These pixels are finished before this entry: it does not contribute to them.
