@@ -110,13 +110,18 @@ void slab_gradients(const Frame& frame, Slab& slab, int tile, uint32_t& seen, Ti
   const uint32_t n = slab.visited[static_cast<size_t>(tile)];
   const uint32_t* entries = slab.entries.data() + begin;
   const uint16_t* touched = slab.touched.data() + begin;
+  float* sums = slab.sums.data() + begin * kStride;
   seen -= n;
   for (uint32_t i = n; i-- > 0;) {
     if (i >= 12) __builtin_prefetch(slab.records.data() + entries[i - 12]);
-    if (!touched[i]) continue;
-    entry_gradients<with_depth, any_stop>(slab.records[entries[i]], origins, touched[i], order_of(seen + i), g,
-                                          slab.sums.data() + (begin + i) * kStride);
+    float* out = sums + i * size_t{kStride};
+    if (touched[i])
+      entry_gradients<with_depth, any_stop>(slab.records[entries[i]], origins, touched[i], order_of(seen + i), g, out);
+    else
+      std::memset(out, 0, kStride * sizeof(float));
   }
+  const size_t hidden = slab.tile_begin[static_cast<size_t>(tile) + 1] - (begin + n);
+  std::memset(sums + n * size_t{kStride}, 0, hidden * kStride * sizeof(float));
 }
 
 template <bool with_depth>

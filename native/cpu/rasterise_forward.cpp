@@ -29,7 +29,7 @@ void prepare_batch(const Record* records, const uint32_t* entries, int n, int ah
     if (j + 12 < ahead) __builtin_prefetch(records + entries[j + 12]);
     const Record& r = records[entries[j]];
     const F16 dx = origins.x - splat(r.mean_x), dy = origins.y - splat(r.mean_y);
-    batch.in_reach[j] = static_cast<uint16_t>(blocks_in_reach(r, dx, dy));
+    batch.in_reach[j] = static_cast<uint16_t>(bits(squares_in_reach(r, dx, dy, 3.0f)));
     make_falloff(r, dx, dy, batch.falloff[j]);
     batch.paint[j] = {{r.colour[0], r.colour[1], r.colour[2]}, r.depth};
     batch.log2_opacity[j] = r.log2_opacity;
