@@ -205,10 +205,8 @@ def test_every_seed_gives_a_town_of_its_own() -> None:
     towns = [build_town(seed, 50.0) for seed in (0, 1)]
     assert towns[0].mesh.vertices.shape != towns[1].mesh.vertices.shape
     for town in towns:
-        kinds, counts = np.unique(town.zones.cells, return_counts=True)
-        assert {Zone.LAWN, Zone.BUILDING, Zone.SQUARE, Zone.PATIO} <= set(kinds.tolist())
-        square_metres = dict(zip(kinds.tolist(), counts * town.zones.cell**2, strict=True))
-        assert square_metres[Zone.BUILDING] > 400
+        square_metres = np.bincount(town.zones.cells.ravel(), minlength=len(Zone)) * town.zones.cell**2
+        assert (square_metres[[Zone.LAWN, Zone.BUILDING, Zone.SQUARE]] > 400).all()
         assert np.isfinite(town.mesh.vertices).all()
         assert np.isfinite(town.mesh.normals).all()
         assert town.mesh.faces.max() < len(town.mesh.vertices)
