@@ -20,12 +20,16 @@ from vdgs.synth import SynthOptions, generate
 from vdgs.synth.flight import fly
 from vdgs.synth.photography import sample_offsets
 from vdgs.synth.streets import street_plan
+from vdgs.synth.terrain import Terrain
 from vdgs.synth.town import build_town
 from vdgs.synth.zones import Zone
 
 TINY = SynthOptions(
     seed=3, images=6, width=96, height=72, extent_m=50.0, points=400, noise_px=0.3, truth=True
 )
+
+
+FLAT = Terrain(60.0, (0.0, 1.0, 2.0, 3.0))
 
 
 @pytest.fixture(scope="module")
@@ -112,11 +116,6 @@ def test_the_same_options_give_the_same_bytes(capture: Path, tmp_path: Path) -> 
     assert [name for name in first if first[name] != second[name]] == []
 
 
-def test_another_seed_gives_another_town() -> None:
-    heights = [build_town(seed, 50.0).mesh.vertices[:, 2].max() for seed in (0, 1)]
-    assert heights[0] != heights[1]
-
-
 def test_pictures_show_something_everywhere(capture: Path) -> None:
     for path in sorted((capture / "images").glob("*.jpg")):
         image = np.asarray(Image.open(path), np.float64) / 255
@@ -177,21 +176,20 @@ def test_options_import_no_numerics() -> None:
 @pytest.mark.parametrize("images", [48, 120, 41])
 def test_test_views_fall_all_over_the_place(flight: str, images: int) -> None:
     options = replace(SynthOptions(images=images), flight=flight).resolved()
-    town = build_town(0, 50.0)
-    places = np.array([camera.position[:2] for camera in fly(options, town.terrain)])
+    cameras = fly(options, FLAT)
+    places = np.array([camera.position[:2] for camera in cameras])
     held_out = places[::8]
     assert (np.abs(held_out.mean(0) - places.mean(0)) < 0.25 * options.extent_m).all()
     assert (held_out.std(0) > 0.6 * places.std(0)).all()
-    tilts = [camera.forward[2] for camera in fly(options, town.terrain)]
+    tilts = [camera.forward[2] for camera in cameras]
     assert max(tilts) < -np.cos(np.radians(52)), "no camera looks near the horizon"
 
 
 def test_uneven_flight_is_denser_over_the_centre() -> None:
-    town = build_town(0, 50.0)
     share = {}
     for flight in ("uneven", "even"):
         options = replace(SynthOptions(), flight=flight).resolved()
-        places = np.array([camera.position[:2] for camera in fly(options, town.terrain)])
+        places = np.array([camera.position[:2] for camera in fly(options, FLAT)])
         share[flight] = np.mean(np.abs(places).max(1) < 0.3 * options.extent_m)
     assert share["uneven"] > 1.2 * share["even"]
 
@@ -203,17 +201,20 @@ def test_plan_coordinates_invert() -> None:
     np.testing.assert_allclose(back, (p, q), atol=1e-4)
 
 
-def test_land_use_of_a_town() -> None:
-    town = build_town(0, 50.0)
-    kinds, counts = np.unique(town.zones.cells, return_counts=True)
-    assert {Zone.LAWN, Zone.BUILDING, Zone.SQUARE, Zone.PATIO} <= set(kinds.tolist())
-    square_metres = dict(zip(kinds.tolist(), counts * town.zones.cell**2, strict=True))
-    assert square_metres[Zone.BUILDING] > 400
+def test_every_seed_gives_a_town_of_its_own() -> None:
+    towns = [build_town(seed, 50.0) for seed in (0, 1)]
+    assert towns[0].mesh.vertices.shape != towns[1].mesh.vertices.shape
+    for town in towns:
+        square_metres = np.bincount(town.zones.cells.ravel(), minlength=len(Zone)) * town.zones.cell**2
+        assert (square_metres[[Zone.LAWN, Zone.BUILDING, Zone.SQUARE]] > 400).all()
+        assert np.isfinite(town.mesh.vertices).all()
+        assert np.isfinite(town.mesh.normals).all()
+        assert town.mesh.faces.max() < len(town.mesh.vertices)
 
 
 @pytest.mark.parametrize("count", [1, 4, 7, 9])
 def test_samples_surround_the_pixel_centre(count: int) -> None:
     offsets = sample_offsets(count)
     assert offsets.shape == (count, 2)
-    assert np.abs(offsets).max() < 0.6
-    assert np.abs(offsets.mean(0)).max() < 0.13
+    assert np.abs(offsets).max() < 0.8
+    assert np.abs(offsets.mean(0)).max() < 1e-12

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ def write_model(folder: Path, cameras: list[Camera], names: list[str], cloud: Sp
         rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3]), pose[:3, 3])
         model.add_image_with_trivial_frame(image, rigid)
     ends = np.searchsorted(cloud.observed_point, np.arange(len(cloud.points) + 1))
-    for k, (start, end) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
+    for k, (start, end) in enumerate(pairwise(ends)):
         track = pycolmap.Track(
             [
                 pycolmap.TrackElement(int(cloud.observed_image[m]) + 1, int(place_in_image[m]))

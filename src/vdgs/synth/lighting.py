@@ -65,9 +65,9 @@ def sky_map(tracer: Tracer, terrain: Terrain, zones: ZoneMap, half_size: float) 
             [radius * np.cos(angle), radius * np.sin(angle), np.full(len(x), np.sqrt(1 - radius**2))], 1
         )
         free += ~tracer.occluded(origins, directions.astype(np.float32), np.full(len(x), 30.0))
-    free = (free / _RAYS).reshape(side, side)
+    openness = (free / _RAYS).reshape(side, side)
     open_air = (zones.at(x, y) != Zone.BUILDING).reshape(side, side).astype(np.float32)
-    blurred = cv2.GaussianBlur(free * open_air, (0, 0), 1.1)
+    blurred = cv2.GaussianBlur(openness * open_air, (0, 0), 1.1)
     weight = cv2.GaussianBlur(open_air, (0, 0), 1.1)
     return SkyMap(
         np.where(weight > 0.02, blurred / np.maximum(weight, 0.02), 0.6).astype(np.float32), half_size

@@ -146,7 +146,8 @@ def _shore(site: Site, plot: Plot) -> None:
         y = pond.y + (pond.ry + away) * np.sin(angle)
         if pond.distance(np.array(x), np.array(y)) < 1.0 or _on_street(site, x, y):
             continue
-        from_here = site.frame(Plot(*map(float, site.plan.to_plan(x, y)), 1, 1))
+        p, q = site.plan.to_plan(np.array([x]), np.array([y]))
+        from_here = site.frame(Plot(float(p[0]), float(q[0]), 1, 1))
         tree(site.builder, from_here, rng, str(rng.choice(["round", "bush", "bush", "poplar"])))
 
 

@@ -23,7 +23,8 @@ def sample_offsets(count: int) -> np.ndarray:
     if count == 4:
         return _SPREAD * np.array([(-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125)])
     k = np.arange(count)[:, None]
-    return _SPREAD * ((0.5 + k * np.array([0.7548776662466927, 0.5698402909980532])) % 1 - 0.5)
+    offsets = (0.5 + k * np.array([0.7548776662466927, 0.5698402909980532])) % 1
+    return _SPREAD * (offsets - offsets.mean(0))
 
 
 def pixel_rays(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

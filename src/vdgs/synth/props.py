@@ -121,13 +121,14 @@ def bale(builder: MeshBuilder, frame: Frame) -> None:
     """A round bale of straw that lies on its side."""
     straw = Skin(Material.TIMBER, palette.STRAW, 0.5)
     angle = np.linspace(0, 2 * np.pi, 14, endpoint=False)
+    half = np.array([0.7, 0, 0])
     ring = np.stack([np.zeros(14), 0.75 * np.cos(angle), 0.72 + 0.75 * np.sin(angle)], 1)
     for k in range(14):
         a, b = ring[k], ring[(k + 1) % 14]
-        side = np.array([a - [0.7, 0, 0], b - [0.7, 0, 0], b + [0.7, 0, 0], a + [0.7, 0, 0]])
+        side = np.stack([a - half, b - half, b + half, a + half])
         face(builder, frame, side[::-1], straw)
-    face(builder, frame, ring + [0.7, 0, 0], straw)
-    face(builder, frame, (ring - [0.7, 0, 0])[::-1], straw)
+    face(builder, frame, ring + half, straw)
+    face(builder, frame, (ring - half)[::-1], straw)
 
 
 def pool(builder: MeshBuilder, frame: Frame, size: tuple[float, float]) -> None:

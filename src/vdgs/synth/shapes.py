@@ -55,7 +55,7 @@ class Box:
 
 
 #: Which corners make the front, right, back, left side of a box.
-SIDES = ((0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7))
+SIDES = np.array([(0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)])
 
 
 @dataclass(frozen=True)
@@ -81,12 +81,12 @@ def box(
     inset: tuple[float, float] = (0.0, 0.0),
 ) -> None:
     """A box without a bottom; `inset` pulls the top edges in (x, y), `top` None leaves it open."""
-    corners = shape.corners(*inset)
+    corners = frame.world(shape.corners(*inset))
     skins = sides if isinstance(sides, tuple) else (sides,) * 4
-    for indices, skin in zip(SIDES, skins, strict=True):
-        face(builder, frame, corners[list(indices)], skin)
+    for ring, skin in zip(corners[SIDES], skins, strict=True):
+        builder.polygon(ring, skin.material, skin.colour, skin.seed)
     if top is not None:
-        face(builder, frame, corners[4:], top)
+        builder.polygon(corners[4:], top.material, top.colour, top.seed)
 
 
 def frustum(
@@ -103,8 +103,8 @@ def frustum(
     ring = np.stack([np.cos(angle), np.sin(angle)], 1)
     low = np.column_stack([ring * radii[0], np.full(sides, heights[0])])
     high = np.column_stack([ring * max(radii[1], 1e-3), np.full(sides, heights[1])])
-    for k in range(sides):
-        following = (k + 1) % sides
-        face(builder, frame, np.array([low[k], low[following], high[following], high[k]]), skin)
+    low, high = frame.world(low), frame.world(high)
+    for quad in np.stack([low, np.roll(low, -1, 0), np.roll(high, -1, 0), high], axis=1):
+        builder.polygon(quad, skin.material, skin.colour, skin.seed)
     if cap is not None:
-        face(builder, frame, high, cap)
+        builder.polygon(high, cap.material, cap.colour, cap.seed)

@@ -83,7 +83,8 @@ def _matched(
     visible: np.ndarray,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """In which of the pictures that see it a place is also recognised: sooner if seen from nearby directions."""
+    """In which of the pictures that see it a place is also recognised: the likelier, the nearer to the
+    direction of the picture it was found in (`home`), [n, cameras] bool."""
     positions = np.stack([camera.position for camera in cameras])
     ray = places[:, None] - positions
     ray /= np.linalg.norm(ray, axis=2, keepdims=True)

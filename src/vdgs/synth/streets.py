@@ -15,8 +15,11 @@ KERB_RADIUS = 2.6
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """Places beside a street (m, [n] float32): signed offset from its centre line, distance outside its
-    carriageway (negative: on it), half the carriageway's width, and whether the street has ended ([n] bool)."""
+    """Places beside a street (m, [n] float32).
+
+    Signed offset from its centre line, distance outside its carriageway (negative: on it), half the
+    carriageway's width, and whether the street has ended there ([n] bool).
+    """
 
     offset: np.ndarray
     outside: np.ndarray

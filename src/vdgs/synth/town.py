@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -86,7 +87,7 @@ def _traffic(site: Site) -> None:
         (plan.q, plan.q_half, plan.p, False),
     ):
         for position, half in zip(streets, halves, strict=True):
-            for start, end in zip(others[:-1], others[1:], strict=True):
+            for start, end in pairwise(others):
                 _stretch(site, position, half, (start + 13, end - 13), along_q)
 
 

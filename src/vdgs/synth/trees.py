@@ -11,6 +11,15 @@ from vdgs.synth import palette
 from vdgs.synth.mesh import Material, MeshBuilder
 from vdgs.synth.shapes import Box, Frame, Skin, box, frustum
 
+#: Least and greatest height of each kind of tree, m.
+_HEIGHTS = {
+    "round": (5.5, 9.0),
+    "poplar": (8.0, 12.0),
+    "bush": (0.9, 1.7),
+    "conifer": (7.0, 11.0),
+    "blossom": (3.5, 4.8),
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Crown:
@@ -82,7 +91,9 @@ def _round_crown(variant: int, fine: bool) -> Crown:
 def _conifer_crown(variant: int) -> Crown:
     """Skirts of branches, one above the other, with ragged rims."""
     rng = np.random.default_rng([22, variant])
-    vertices, faces, openness = [], [], []
+    vertices: list[np.ndarray] = []
+    faces: list[np.ndarray] = []
+    openness: list[np.ndarray] = []
     around, skirts = 22, 6
     for k in range(skirts):
         share = k / skirts
@@ -122,8 +133,7 @@ def tree(
     fine: bool = True,
 ) -> None:
     """One tree on the ground at a frame: round, poplar, conifer, blossom or bush."""
-    tall = height or {"round": rng.uniform(5.5, 9), "poplar": rng.uniform(8, 12), "bush": rng.uniform(0.9, 1.7),
-                      "conifer": rng.uniform(7, 11), "blossom": rng.uniform(3.5, 4.8)}[kind]  # fmt: skip
+    tall = height or rng.uniform(*_HEIGHTS[kind])
     at = Frame(frame.x, frame.y, frame.z, rng.uniform(0, 6.28))
     seed, variant = float(rng.random()), int(rng.integers(6))
     bark = Skin(Material.BARK, palette.BARK)
