@@ -97,7 +97,11 @@ def view_bins(
     result: list[Bin] = []
     for group in quantile_groups(counts, n_bins):
         members = order[ends[group[0]] : ends[group[-1] + 1]]
-        entry: Bin = {"lower": float(values[group[0]]), "upper": float(values[group[-1]]), "views": len(members)}
+        entry: Bin = {
+            "lower": float(values[group[0]]),
+            "upper": float(values[group[-1]]),
+            "views": len(members),
+        }
         for name in figures[members[0]]:
             entry[name] = mean_or_none([figures[i][name] for i in members])
         result.append(entry)

@@ -138,7 +138,9 @@ def evaluate(
     names = ["squared_error", "ssim"] + ["squared_error_cc", "ssim_cc"] * settings.colour_correction
     gathered = _Gathered(histogram=VisibilityHistogram(names) if visibility_map else None)
     stems = saving.file_stems([view.name for view in views])
-    on_sheet = set(np.linspace(0, len(views) - 1, min(len(views), settings.contact_views)).round().astype(int))
+    on_sheet = set(
+        np.linspace(0, len(views) - 1, min(len(views), settings.contact_views)).round().astype(int)
+    )
     indices: Iterable[int] = range(len(views))
     for index in progress(indices, len(views)) if progress else indices:
         _evaluate_view(views[index], stems[index], index in on_sheet, inputs, gathered)
@@ -167,7 +169,11 @@ def _evaluate_view(view: View, stem: str, on_sheet: bool, inputs: _Inputs, gathe
     saving.write_png(inputs.output / "renders" / f"{stem}.png", image)
     raw = _Pair(image, reference, mask)
     maps = _maps(raw, "")
-    row: dict[str, Any] = {"name": view.name, "render": f"renders/{stem}.png", **_figures(raw, maps, "", inputs.lpips)}
+    row: dict[str, Any] = {
+        "name": view.name,
+        "render": f"renders/{stem}.png",
+        **_figures(raw, maps, "", inputs.lpips),
+    }
     if settings.colour_correction:
         correction = correct_colours(image, reference, mask)
         corrected = _Pair(metrics.to_8bit(correction.image), reference, mask)
@@ -190,7 +196,10 @@ def _photograph(
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
     reference, mask = inputs.load_image(view), inputs.load_mask(view)
     wanted = (view.camera.height, view.camera.width)
-    for what, shape in (("photograph", reference.shape[:2]), ("mask", wanted if mask is None else mask.shape)):
+    for what, shape in (
+        ("photograph", reference.shape[:2]),
+        ("mask", wanted if mask is None else mask.shape),
+    ):
         if shape != wanted:
             raise CaptureError(
                 f"{view.image_path}: the {what} of {view.name} is {shape[1]} x {shape[0]} pixels, its camera "
@@ -199,7 +208,9 @@ def _photograph(
     return reference, mask
 
 
-def _rendered(view: View, render: Callable[[Camera], RenderedView]) -> tuple[UInt8[np.ndarray, "h w 3"], float]:
+def _rendered(
+    view: View, render: Callable[[Camera], RenderedView]
+) -> tuple[UInt8[np.ndarray, "h w 3"], float]:
     """The render in 8 bits and the seconds it took, the GPU's work included."""
     with torch.inference_mode():
         _wait_for_gpu()
@@ -243,7 +254,10 @@ def _figures(
     nothing_kept = pair.mask is not None and not pair.mask.any()
     if lpips is not None and not nothing_kept and min(pair.image.shape[:2]) >= MIN_SIDE_PX:
         scores = lpips(metrics.shown_within(pair.image, pair.reference, pair.mask), pair.reference)
-        figures[f"lpips_vgg{suffix}"], figures[f"lpips_vgg_01{suffix}"] = scores.lpips_vgg, scores.lpips_vgg_01
+        figures[f"lpips_vgg{suffix}"], figures[f"lpips_vgg_01{suffix}"] = (
+            scores.lpips_vgg,
+            scores.lpips_vgg_01,
+        )
     return figures
 
 
@@ -264,7 +278,13 @@ def _count_visibility(
 
 
 def _draw(
-    view: View, stem: str, on_sheet: bool, raw: _Pair, row: Mapping[str, Any], inputs: _Inputs, gathered: _Gathered
+    view: View,
+    stem: str,
+    on_sheet: bool,
+    raw: _Pair,
+    row: Mapping[str, Any],
+    inputs: _Inputs,
+    gathered: _Gathered,
 ) -> None:
     if inputs.settings.comparisons:
         picture = pictures.comparison(

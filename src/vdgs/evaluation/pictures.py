@@ -102,7 +102,9 @@ def contact_sheet(cells: list[Thumbnail], title: str, columns: int | None = None
     cell_height = 2 * height + between + text * 2 + gap
     canvas = Image.new("RGB", (gap + columns * (width + gap), head + rows * cell_height), PAPER)
     draw = ImageDraw.Draw(canvas)
-    draw.text((gap, 14), _fitted(title, font(22, bold=True), canvas.width - 2 * gap), INK, font(22, bold=True))
+    draw.text(
+        (gap, 14), _fitted(title, font(22, bold=True), canvas.width - 2 * gap), INK, font(22, bold=True)
+    )
     draw.text((gap, 42), "photograph above, render below", FAINT, font(13))
     for index, cell in enumerate(cells):
         left = gap + (index % columns) * (width + gap)

@@ -28,7 +28,9 @@ def write_atomically(path: Path, content: bytes) -> None:
         os.replace(temporary, path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
-        raise VdgsError(f"{path} cannot be written: {error.strerror}. Free space or choose another folder.") from error
+        raise VdgsError(
+            f"{path} cannot be written: {error.strerror}. Free space or choose another folder."
+        ) from error
 
 
 def write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
