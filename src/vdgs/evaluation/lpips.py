@@ -103,7 +103,7 @@ def load_lpips(weights: Path | None = None, heads: Path | None = None) -> tuple[
     `weights` is torchvision's VGG16 state dict (.pth or .safetensors); without it torch's own download
     folder is looked at. Raises VdgsError where a file that was named, or found, cannot be used.
     """
-    cached = Path(torch.hub.get_dir()) / "checkpoints" / VGG16_FILE
+    cached = cached_weights()
     source = weights or (cached if cached.is_file() else None)
     if source is None:
         return None, (
@@ -122,6 +122,11 @@ def load_lpips(weights: Path | None = None, heads: Path | None = None) -> tuple[
             f"({VGG16_URL}), the heads vgg.pth of torchmetrics or lpips."
         ) from error
     return metric, f"LPIPS from {source.name} ({_origin(source)})"
+
+
+def cached_weights() -> Path:
+    """Where torch keeps torchvision's VGG16 once something has downloaded it (TORCH_HOME moves it)."""
+    return Path(torch.hub.get_dir()) / "checkpoints" / VGG16_FILE
 
 
 def find_heads() -> Path | None:
