@@ -1,0 +1,136 @@
+"""Quality by visibility: the claim is about poorly seen places, so it is measured there.
+
+V is the number of training cameras that see a place (section III-B); rendered per pixel it is a map
+[h, w], NaN where the model shows nothing. Pixels of all test views are pooled and cut into quantiles
+of V. Nothing is kept but a histogram: one pass, memory bounded whatever the number of test views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from vdgs.evaluation.metrics import psnr_of
+
+#: Equal shares of pixels (or views) reported by default: quintiles.
+QUANTILE_BINS = 5
+#: Sign, exponent and 11 bits of mantissa of a float32 remain: counts up to 4096 stay exact, fractions
+#: to 1 in 2,000, and no range need be known beforehand. The bits of non-negative floats sort as numbers.
+_DROPPED_BITS = 12
+_KEYS = 1 << (31 - _DROPPED_BITS)
+
+Bin = dict[str, float | int | None]
+
+
+class VisibilityHistogram:
+    """Sums of named pixel values by visibility; `add` each test view, then read `bins`.
+
+    Names that begin with `squared_error` are reported as `psnr...`; the others as their mean.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._counts = np.zeros(_KEYS, np.int64)
+        self._sums = {name: np.zeros(_KEYS) for name in names}
+        self._empty_count = 0
+        self._empty_sums = dict.fromkeys(names, 0.0)
+
+    def add(
+        self,
+        visibility: Float[np.ndarray, "h w"],
+        values: Mapping[str, Float[np.ndarray, "h w"]],
+        mask: Bool[np.ndarray, "h w"] | None = None,
+    ) -> None:
+        """Count one view: V >= 0 or NaN, and a value per pixel under each name. O(pixels)."""
+        kept = np.ones(visibility.shape, bool) if mask is None else mask
+        empty = kept & np.isnan(visibility)
+        seen = kept & ~empty
+        keys = _key(visibility[seen])
+        self._counts += np.bincount(keys, minlength=_KEYS)
+        self._empty_count += int(empty.sum())
+        for name, total in self._sums.items():
+            total += np.bincount(keys, weights=values[name][seen], minlength=_KEYS)
+            self._empty_sums[name] += float(values[name][empty].sum())
+
+    def bins(self, n_bins: int = QUANTILE_BINS) -> list[Bin]:
+        """Quantile bins, least visible first: lower and upper V (inclusive), pixels, a figure per name.
+
+        Equal values of V are never split, so bins may differ in size and fewer than `n_bins` may come
+        back. Pixels where the model shows nothing, if any, lead as a bin without bounds (both None).
+        """
+        result: list[Bin] = []
+        if self._empty_count:
+            result.append(self._bin(None, None, self._empty_count, self._empty_sums))
+        keys = np.flatnonzero(self._counts)
+        for group in quantile_groups(self._counts[keys], n_bins):
+            chosen = keys[group]
+            sums = {name: float(total[chosen].sum()) for name, total in self._sums.items()}
+            lower, upper = _value(chosen[[0, -1]])
+            result.append(self._bin(float(lower), float(upper), int(self._counts[chosen].sum()), sums))
+        return result
+
+    @staticmethod
+    def _bin(lower: float | None, upper: float | None, pixels: int, sums: Mapping[str, float]) -> Bin:
+        figures: Bin = {"lower": lower, "upper": upper, "pixels": pixels}
+        for name, total in sums.items():
+            mean = total / pixels
+            if name.startswith("squared_error"):
+                figures[name.replace("squared_error", "psnr", 1)] = psnr_of(mean)
+            else:
+                figures[name] = mean
+        return figures
+
+
+def view_bins(
+    visibility: Sequence[float], figures: Sequence[Mapping[str, float | None]], n_bins: int = QUANTILE_BINS
+) -> list[Bin]:
+    """Quantile bins of whole test views by the mean V of what each sees, and their mean figures.
+
+    Each figure is the mean over the views of the bin that have it (None where none has). Views without
+    a finite visibility are left out.
+    """
+    visible = np.asarray(visibility, dtype=np.float64)
+    order = [int(i) for i in np.argsort(visible, kind="stable") if np.isfinite(visible[i])]
+    values, counts = np.unique(visible[order], return_counts=True)
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    result: list[Bin] = []
+    for group in quantile_groups(counts, n_bins):
+        members = order[ends[group[0]] : ends[group[-1] + 1]]
+        entry: Bin = {
+            "lower": float(values[group[0]]),
+            "upper": float(values[group[-1]]),
+            "views": len(members),
+        }
+        for name in figures[members[0]]:
+            entry[name] = mean_or_none([figures[i][name] for i in members])
+        result.append(entry)
+    return result
+
+
+def mean_or_none(values: Sequence[float | None]) -> float | None:
+    """Mean of the figures that are there (neither None nor NaN); None where none is."""
+    known = [value for value in values if value is not None and not np.isnan(value)]
+    return float(np.mean(known)) if known else None
+
+
+def quantile_groups(counts: np.ndarray, n_bins: int) -> list[np.ndarray]:
+    """Consecutive indices of ascending classes of `counts` members [n], cut into about equal shares.
+
+    A class belongs to the share that holds its middle member; shares that hold none are left out.
+    """
+    if not len(counts):
+        return []
+    middle = np.cumsum(counts) - counts / 2.0
+    share = np.minimum((middle / counts.sum() * n_bins).astype(np.int64), n_bins - 1)
+    return [np.flatnonzero(share == each) for each in np.unique(share)]
+
+
+def _key(visibility: np.ndarray) -> np.ndarray:
+    # Adding zero turns a negative zero, whose bits would be a huge key, into a positive one.
+    positive = np.maximum(visibility, 0.0).astype(np.float32) + np.float32(0.0)
+    return (positive.view(np.uint32) >> _DROPPED_BITS).astype(np.int64)
+
+
+def _value(keys: np.ndarray) -> np.ndarray:
+    return (keys.astype(np.uint32) << _DROPPED_BITS).view(np.float32)

@@ -1,0 +1,332 @@
+"""Evaluate a model on its test views: every figure that papers report, raw and colour-corrected, and by
+visibility, with the pictures behind them. One view is in memory at a time.
+
+    OUTPUT/
+      metrics.json        means over the test views, bins by visibility, size and speed of the model
+      per_view.json       the same figures for each view
+      renders/NAME.png    what the model shows, 8 bits: the images that are measured
+      comparisons/        photograph | render | error
+      contact_sheet.png   all test views (or an even choice of them) at a glance
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from rich.console import Console
+from torch import Tensor
+
+from vdgs.cameras import Camera
+from vdgs.captures.capture import View
+from vdgs.errors import CaptureError, RunError, TrainingDiverged
+from vdgs.evaluation import metrics, pictures, saving
+from vdgs.evaluation.by_visibility import QUANTILE_BINS, VisibilityHistogram, mean_or_none, view_bins
+from vdgs.evaluation.colour import correct_colours
+from vdgs.evaluation.lpips import MIN_SIDE_PX, Lpips
+from vdgs.evaluation.tables import metrics_table
+
+RAW = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")
+CORRECTED = tuple(f"{name}_cc" for name in RAW)
+
+
+class RenderedView(Protocol):
+    """What a renderer returns; more may come with it (alpha, depth)."""
+
+    @property
+    def image(self) -> Float[Tensor, "h w 3"]: ...
+
+
+@dataclass(frozen=True)
+class ModelFacts:
+    """What the evaluation reports of the model but cannot measure itself; None is unknown."""
+
+    n_anchors: int | None = None
+    model_bytes: int | None = None
+    train_seconds: float | None = None
+    peak_memory_bytes: int | None = None
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What to measure and draw."""
+
+    #: Also report every figure after colour correction (fitted on the test image itself).
+    colour_correction: bool = True
+    #: Bins by visibility, of about equal size.
+    visibility_bins: int = QUANTILE_BINS
+    #: Write photograph | render | error for every test view.
+    comparisons: bool = True
+    #: Views on the contact sheet at most, chosen evenly.
+    contact_views: int = 40
+    #: Error at the bright end of the colour map, where white is 1.
+    error_limit: float = pictures.ERROR_LIMIT
+
+
+@dataclass(frozen=True, eq=False)
+class _Inputs:
+    """Where the images of a view come from."""
+
+    load_image: Callable[[View], UInt8[np.ndarray, "h w 3"]]
+    load_mask: Callable[[View], Bool[np.ndarray, "h w"] | None]
+    render: Callable[[Camera], RenderedView]
+    visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]] | None
+    lpips: Lpips | None
+    settings: EvaluationSettings
+    output: Path
+
+
+@dataclass(eq=False)
+class _Gathered:
+    """What accumulates over the views."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    cells: list[pictures.Thumbnail] = field(default_factory=list)
+    histogram: VisibilityHistogram | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """A render (8 bits) against its photograph, and the mask of what counts."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    reference: UInt8[np.ndarray, "h w 3"]
+    mask: Bool[np.ndarray, "h w"] | None
+
+
+def evaluate(
+    views: Sequence[View],
+    load_image: Callable[[View], UInt8[np.ndarray, "h w 3"]],
+    render: Callable[[Camera], RenderedView],
+    output: Path,
+    *,
+    visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]] | None = None,
+    lpips: Lpips | None = None,
+    lpips_note: str = "",
+    load_mask: Callable[[View], Bool[np.ndarray, "h w"] | None] | None = None,
+    facts: ModelFacts | None = None,
+    settings: EvaluationSettings | None = None,
+    console: Console | None = None,
+    progress: Callable[[Iterable[int], int], Iterable[int]] | None = None,
+) -> dict[str, Any]:
+    """Render and measure every view, write `output`, and return what `metrics.json` holds.
+
+    `visibility_map(camera)` is V per pixel [h, w], NaN where the model shows nothing. `lpips_note` says
+    why LPIPS is null. `load_mask` reads `view.mask_path` by default (white = keep). A table is printed to
+    `console` if there is one; `progress(indices, total)` may wrap the loop. fps is one over the median
+    time of `render`, which on a GPU includes waiting for it.
+
+    Raises RunError without views, CaptureError where a photograph or mask does not fit its camera,
+    TrainingDiverged where a render is not finite.
+    """
+    if not views:
+        raise RunError(
+            f"{output}: there are no test views to evaluate. Hold some out when the capture is read "
+            "(by default every 8th image is)."
+        )
+    settings = settings or EvaluationSettings()
+    inputs = _Inputs(load_image, load_mask or read_mask, render, visibility_map, lpips, settings, output)
+    names = ["squared_error", "ssim"] + ["squared_error_cc", "ssim_cc"] * settings.colour_correction
+    gathered = _Gathered(histogram=VisibilityHistogram(names) if visibility_map else None)
+    stems = saving.file_stems([view.name for view in views])
+    on_sheet = set(
+        np.linspace(0, len(views) - 1, min(len(views), settings.contact_views)).round().astype(int)
+    )
+    indices: Iterable[int] = range(len(views))
+    for index in progress(indices, len(views)) if progress else indices:
+        _evaluate_view(views[index], stems[index], index in on_sheet, inputs, gathered)
+    result = _summary(gathered, facts or ModelFacts(), lpips_note, settings)
+    _write(output, result, gathered, len(views))
+    if console is not None:
+        console.print(metrics_table(result))
+    return result
+
+
+def read_mask(view: View) -> Bool[np.ndarray, "h w"] | None:
+    """The view's mask at the size of its camera, true where it is white; None where it has none."""
+    if view.mask_path is None:
+        return None
+    mask = cv2.imread(str(view.mask_path), cv2.IMREAD_GRAYSCALE) if view.mask_path.is_file() else None
+    if mask is None:
+        raise CaptureError(f"{view.mask_path}: the mask of {view.name} cannot be read. Restore or remove it.")
+    size = (view.camera.width, view.camera.height)
+    return cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 127
+
+
+def _evaluate_view(view: View, stem: str, on_sheet: bool, inputs: _Inputs, gathered: _Gathered) -> None:
+    settings = inputs.settings
+    reference, mask = _photograph(view, inputs)
+    image, seconds = _rendered(view, inputs.render)
+    saving.write_png(inputs.output / "renders" / f"{stem}.png", image)
+    raw = _Pair(image, reference, mask)
+    maps = _maps(raw, "")
+    row: dict[str, Any] = {
+        "name": view.name,
+        "render": f"renders/{stem}.png",
+        **_figures(raw, maps, "", inputs.lpips),
+    }
+    if settings.colour_correction:
+        correction = correct_colours(image, reference, mask)
+        corrected = _Pair(metrics.to_8bit(correction.image), reference, mask)
+        corrected_maps = _maps(corrected, "_cc")
+        row |= _figures(corrected, corrected_maps, "_cc", inputs.lpips)
+        row["colour_fitted"] = correction.fitted
+        maps |= corrected_maps
+    else:
+        row |= dict.fromkeys(CORRECTED)
+    row["mean_visibility"] = _count_visibility(view, inputs, gathered, maps, mask)
+    row["kept_pixels"] = image.shape[0] * image.shape[1] if mask is None else int(mask.sum())
+    row["render_seconds"] = seconds
+    gathered.rows.append(row)
+    gathered.seconds.append(seconds)
+    _draw(view, stem, on_sheet, raw, row, inputs, gathered)
+
+
+def _photograph(
+    view: View, inputs: _Inputs
+) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
+    reference, mask = inputs.load_image(view), inputs.load_mask(view)
+    wanted = (view.camera.height, view.camera.width)
+    for what, shape in (
+        ("photograph", reference.shape[:2]),
+        ("mask", wanted if mask is None else mask.shape),
+    ):
+        if shape != wanted:
+            raise CaptureError(
+                f"{view.image_path}: the {what} of {view.name} is {shape[1]} x {shape[0]} pixels, its camera "
+                f"{wanted[1]} x {wanted[0]}. Use images of the size that the camera describes."
+            )
+    return reference, mask
+
+
+def _rendered(
+    view: View, render: Callable[[Camera], RenderedView]
+) -> tuple[UInt8[np.ndarray, "h w 3"], float]:
+    """The render in 8 bits and the seconds it took, the GPU's work included."""
+    with torch.inference_mode():
+        _wait_for_gpu()
+        start = time.perf_counter()
+        rendered = render(view.camera).image
+        _wait_for_gpu()
+        seconds = time.perf_counter() - start
+        pixels = torch.as_tensor(rendered).detach().to("cpu", torch.float32).numpy()
+    if pixels.shape != (view.camera.height, view.camera.width, 3):
+        raise ValueError(f"the render of {view.name} has shape {list(pixels.shape)}")
+    if not np.isfinite(pixels).all():
+        raise TrainingDiverged(
+            f"the render of {view.name} holds values that are not finite numbers: the model is damaged. "
+            "Evaluate an earlier state, or train again with lower rates."
+        )
+    return metrics.to_8bit(pixels), seconds
+
+
+def _wait_for_gpu() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def _maps(pair: _Pair, suffix: str) -> dict[str, Float[np.ndarray, "h w"]]:
+    return {
+        f"squared_error{suffix}": metrics.squared_error(pair.image, pair.reference),
+        f"ssim{suffix}": metrics.ssim_map(pair.image, pair.reference, pair.mask),
+    }
+
+
+def _figures(
+    pair: _Pair, maps: Mapping[str, np.ndarray], suffix: str, lpips: Lpips | None
+) -> dict[str, float | None]:
+    """The four figures of a pair; LPIPS is None without weights or where the image is too small for it."""
+    figures: dict[str, float | None] = {
+        f"psnr{suffix}": metrics.psnr_of(metrics.masked_mean(maps[f"squared_error{suffix}"], pair.mask)),
+        f"ssim{suffix}": metrics.masked_mean(maps[f"ssim{suffix}"], pair.mask),
+        f"lpips_vgg{suffix}": None,
+        f"lpips_vgg_01{suffix}": None,
+    }
+    nothing_kept = pair.mask is not None and not pair.mask.any()
+    if lpips is not None and not nothing_kept and min(pair.image.shape[:2]) >= MIN_SIDE_PX:
+        scores = lpips(metrics.shown_within(pair.image, pair.reference, pair.mask), pair.reference)
+        figures[f"lpips_vgg{suffix}"], figures[f"lpips_vgg_01{suffix}"] = (
+            scores.lpips_vgg,
+            scores.lpips_vgg_01,
+        )
+    return figures
+
+
+def _count_visibility(
+    view: View,
+    inputs: _Inputs,
+    gathered: _Gathered,
+    maps: Mapping[str, np.ndarray],
+    mask: Bool[np.ndarray, "h w"] | None,
+) -> float | None:
+    """Pool the pixels by V; the mean V of what the view sees, None where nothing is known."""
+    if inputs.visibility_map is None or gathered.histogram is None:
+        return None
+    visibility = np.asarray(inputs.visibility_map(view.camera))
+    gathered.histogram.add(visibility, maps, mask)
+    seen = ~np.isnan(visibility) if mask is None else mask & ~np.isnan(visibility)
+    return float(visibility[seen].mean(dtype=np.float64)) if seen.any() else None
+
+
+def _draw(
+    view: View,
+    stem: str,
+    on_sheet: bool,
+    raw: _Pair,
+    row: Mapping[str, Any],
+    inputs: _Inputs,
+    gathered: _Gathered,
+) -> None:
+    if inputs.settings.comparisons:
+        picture = pictures.comparison(
+            raw.reference, raw.image, view.name, f"{row['psnr']:.2f} dB   SSIM {row['ssim']:.3f}",
+            raw.mask, inputs.settings.error_limit,
+        )  # fmt: skip
+        saving.write_png(inputs.output / "comparisons" / f"{stem}.png", np.asarray(picture))
+    if on_sheet:
+        small = pictures.thumbnail(raw.reference), pictures.thumbnail(raw.image)
+        gathered.cells.append(pictures.Thumbnail(view.name, f"{row['psnr']:.2f} dB", *small))
+
+
+def _summary(
+    gathered: _Gathered, facts: ModelFacts, lpips_note: str, settings: EvaluationSettings
+) -> dict[str, Any]:
+    rows = gathered.rows
+    means = {name: mean_or_none([row[name] for row in rows]) for name in RAW + CORRECTED}
+    pixel_bins = gathered.histogram.bins(settings.visibility_bins) if gathered.histogram else None
+    visible = [np.nan if row["mean_visibility"] is None else row["mean_visibility"] for row in rows]
+    figures = [{name: row[name] for name in RAW + CORRECTED} for row in rows]
+    unfitted = sum(row.get("colour_fitted") is False for row in rows)
+    notes = [lpips_note] if lpips_note else []
+    if unfitted:
+        notes.append(f"colour correction: too few unsaturated pixels in {unfitted} views, left as they are")
+    result = {
+        **means,
+        "by_visibility": pixel_bins,
+        "views_by_visibility": view_bins(visible, figures, settings.visibility_bins) if pixel_bins else None,
+        **asdict(facts),
+        "fps": 1.0 / max(statistics.median(gathered.seconds), 1e-9),
+        "test_views": len(rows),
+        "notes": notes,
+    }
+    return saving.jsonable(result)
+
+
+def _write(output: Path, result: Mapping[str, Any], gathered: _Gathered, n_views: int) -> None:
+    if gathered.cells:
+        shown = f"{len(gathered.cells)} of {n_views}" if len(gathered.cells) < n_views else f"{n_views}"
+        psnr = "PSNR –" if result["psnr"] is None else f"PSNR {result['psnr']:.2f} dB"
+        ssim = "SSIM –" if result["ssim"] is None else f"SSIM {result['ssim']:.3f}"
+        sheet = pictures.contact_sheet(gathered.cells, f"{shown} test views · {psnr} · {ssim}")
+        saving.write_png(output / "contact_sheet.png", np.asarray(sheet))
+    saving.write_json(output / "per_view.json", gathered.rows)
+    saving.write_json(output / "metrics.json", result)  # last: where it stands, the rest is complete

@@ -1,0 +1,173 @@
+"""Pictures for people: photograph, render and error side by side; one sheet of all test views.
+
+Everything is drawn with Pillow on white, with the font that matplotlib ships, so that a sheet looks
+the same on every machine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+#: Mean absolute error per channel at the bright end of the colour map: one scale for all views of all
+#: runs, so that two pictures can be held side by side.
+ERROR_LIMIT = 0.2
+#: Perceptually uniform: equal steps of error look equal.
+ERROR_COLOURS = "inferno"
+INK, FAINT, PAPER = (28, 30, 34), (120, 124, 130), (255, 255, 255)
+#: Panels are shown between these widths; the renders themselves are saved untouched.
+PANEL_MIN_PX, PANEL_MAX_PX = 320, 960
+THUMBNAIL_PX = 300
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """One cell of the contact sheet: pictures [h', w', 3] uint8 already reduced, and what stands below."""
+
+    name: str
+    caption: str
+    photograph: UInt8[np.ndarray, "h w 3"]
+    render: UInt8[np.ndarray, "h w 3"]
+
+
+def absolute_error(
+    image: UInt8[np.ndarray, "h w 3"], reference: UInt8[np.ndarray, "h w 3"]
+) -> Float[np.ndarray, "h w"]:
+    """Mean over the channels of |image - reference|, on the scale where white is 1."""
+    return np.abs(image.astype(np.int16) - reference.astype(np.int16)).mean(axis=2) / 255.0
+
+
+def colourise(
+    values: Float[np.ndarray, "h w"], limit: float, colours: str = ERROR_COLOURS
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Values from 0 to `limit` (clipped) to colours; NaN becomes white."""
+    table = (mpl.colormaps[colours](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0 + 0.5).astype(np.uint8)
+    known = ~np.isnan(values)
+    levels = np.clip(np.where(known, values, 0.0) / limit, 0.0, 1.0) * 255.0 + 0.5
+    picture = table[levels.astype(np.uint8)]
+    picture[~known] = 255
+    return picture
+
+
+def comparison(
+    reference: UInt8[np.ndarray, "h w 3"],
+    image: UInt8[np.ndarray, "h w 3"],
+    title: str,
+    figures: str = "",
+    mask: np.ndarray | None = None,
+    limit: float = ERROR_LIMIT,
+) -> Image.Image:
+    """Photograph | render | error with its colour bar. `figures` stands beside the render's label;
+    masked pixels of the error are white."""
+    error = absolute_error(image, reference)
+    if mask is not None:
+        error = np.where(mask, error, np.nan)
+    size = panel_size(reference.shape[1], reference.shape[0], PANEL_MIN_PX, PANEL_MAX_PX)
+    panels = [resize(picture, size) for picture in (reference, image, colourise(error, limit))]
+    unit = max(12, size[0] // 34)
+    margin, gap, head = unit * 3 // 2, unit, unit * 9 // 2
+    bar_width, ticks_width = unit, unit * 3
+    canvas = Image.new(
+        "RGB", (2 * margin + 3 * size[0] + 3 * gap + bar_width + ticks_width, head + size[1] + margin), PAPER
+    )
+    draw = ImageDraw.Draw(canvas)
+    draw.text((margin, unit * 9 // 10), title, INK, font(unit * 11 // 10, bold=True))
+    labels = ("photograph", "render", "absolute error")
+    for column, (panel, label) in enumerate(zip(panels, labels, strict=True)):
+        left = margin + column * (size[0] + gap)
+        canvas.paste(panel, (left, head))
+        draw.text((left, head - unit * 3 // 5), label, FAINT, font(unit), anchor="ls")
+    if figures:
+        right = margin + 2 * size[0] + gap
+        draw.text((right, head - unit * 3 // 5), figures, INK, font(unit), anchor="rs")
+    _colour_bar(canvas, (margin + 3 * (size[0] + gap), head, bar_width, size[1]), limit, unit)
+    return canvas
+
+
+def contact_sheet(cells: list[Thumbnail], title: str, columns: int | None = None) -> Image.Image:
+    """Cells in a grid, photograph above render, the name and the caption below each pair."""
+    if not cells:
+        raise ValueError("a contact sheet needs at least one view")
+    columns = columns or min(len(cells), max(1, round(np.sqrt(len(cells) * 1.9))))
+    rows = -(-len(cells) // columns)
+    width = max(cell.render.shape[1] for cell in cells)
+    height = max(cell.render.shape[0] for cell in cells)
+    gap, text, head, between = 18, 15, 64, 4
+    cell_height = 2 * height + between + text * 2 + gap
+    canvas = Image.new("RGB", (gap + columns * (width + gap), head + rows * cell_height), PAPER)
+    draw = ImageDraw.Draw(canvas)
+    draw.text(
+        (gap, 14), _fitted(title, font(22, bold=True), canvas.width - 2 * gap), INK, font(22, bold=True)
+    )
+    draw.text((gap, 42), "photograph above, render below", FAINT, font(13))
+    for index, cell in enumerate(cells):
+        left = gap + (index % columns) * (width + gap)
+        top = head + (index // columns) * cell_height
+        canvas.paste(Image.fromarray(cell.photograph), (left, top))
+        canvas.paste(Image.fromarray(cell.render), (left, top + height + between))
+        line = top + 2 * height + between + text // 3
+        draw.text((left + width, line), cell.caption, INK, font(text - 2), anchor="ra")
+        room = width - draw.textlength(cell.caption, font(text - 2)) - 10
+        draw.text((left, line), _fitted(cell.name, font(text - 2), room), FAINT, font(text - 2))
+    return canvas
+
+
+def thumbnail(picture: UInt8[np.ndarray, "h w 3"], width: int = THUMBNAIL_PX) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture at the width of a contact sheet cell; a tall one is bounded by the same height."""
+    scale = width / max(picture.shape[1], picture.shape[0])
+    size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
+    return np.asarray(resize(picture, size))
+
+
+def panel_size(width: int, height: int, smallest: int, largest: int) -> tuple[int, int]:
+    """The size nearest to the picture's own whose width is between the two."""
+    wanted = min(max(width, smallest), largest)
+    return wanted, max(1, round(height * wanted / width))
+
+
+def resize(picture: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> Image.Image:
+    """Reduced with a Lanczos filter, enlarged by repeating pixels (nothing is invented)."""
+    image = Image.fromarray(picture)
+    if image.size == size:
+        return image
+    method = Image.Resampling.LANCZOS if size[0] < image.width else Image.Resampling.NEAREST
+    return image.resize(size, method)
+
+
+@cache
+def font(size_px: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans as matplotlib ships it."""
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(str(Path(mpl.get_data_path()) / "fonts" / "ttf" / name), size_px)
+
+
+def _colour_bar(canvas: Image.Image, box: tuple[int, int, int, int], limit: float, unit: int) -> None:
+    """A vertical bar (left, top, width, height), 0 at the foot, labelled at five places."""
+    left, top, width, height = box
+    ramp = np.broadcast_to(np.linspace(limit, 0.0, height)[:, None], (height, width))
+    canvas.paste(Image.fromarray(colourise(ramp, limit)), (left, top))
+    draw = ImageDraw.Draw(canvas)
+    for tick in range(5):
+        value = limit * tick / 4
+        y = top + round((height - 1) * (1.0 - tick / 4))
+        draw.line([(left + width, y), (left + width + unit // 3, y)], FAINT)
+        anchor = {0: "ls", 4: "lt"}.get(tick, "lm")
+        label = f"{value:.2f}" if tick < 4 else f"≥{value:.2f}"
+        draw.text((left + width + unit // 2, y), label, FAINT, font(max(10, unit * 4 // 5)), anchor=anchor)
+
+
+def _fitted(text: str, face: ImageFont.FreeTypeFont, room_px: float) -> str:
+    """The text, or its two ends with an ellipsis where there is no room for all of it."""
+    if face.getlength(text) <= room_px:
+        return text
+    for kept in range(len(text) - 1, 0, -1):
+        short = f"{text[: kept // 2]}…{text[len(text) - (kept - kept // 2) :]}"
+        if face.getlength(short) <= room_px:
+            return short
+    return "…"

@@ -1,0 +1,85 @@
+"""Files of an evaluation: whole or absent, and never two views under one name."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from vdgs.errors import VdgsError
+
+_LONGEST_NAME = 120
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write to a temporary name beside `path`, then rename: a reader sees the old file or the new one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise VdgsError(
+            f"{path} cannot be written: {error.strerror}. Free space or choose another folder."
+        ) from error
+
+
+def write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Lossless RGB, atomically."""
+    done, content = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
+    if not done:
+        raise VdgsError(f"{path} cannot be encoded as PNG from an image of size {list(picture.shape)}.")
+    write_atomically(path, content.tobytes())
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Strict JSON, atomically: what is not a finite number becomes null."""
+    text = json.dumps(jsonable(value), indent=2, ensure_ascii=False, allow_nan=False)
+    write_atomically(path, (text + "\n").encode())
+
+
+def jsonable(value: Any) -> Any:
+    """The value with numpy scalars as Python numbers and NaN or infinity as None."""
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [jsonable(each) for each in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def file_stems(names: Sequence[str]) -> list[str]:
+    """One file name (without suffix) for each view name, in order, unique even where case is ignored.
+
+    `a/b.jpg` becomes `a__b`; where that name is taken the suffix joins it (`a__b_jpg`), then a number.
+    """
+    taken: set[str] = set()
+    stems = []
+    for name in names:
+        path = PurePosixPath(name.replace("\\", "/"))
+        plain = "__".join(_safe(part) for part in path.with_suffix("").parts)[-_LONGEST_NAME:] or "view"
+        stem, number = plain, 2
+        if stem.casefold() in taken and path.suffix:
+            plain = stem = f"{plain}_{_safe(path.suffix[1:])}"
+        while stem.casefold() in taken:
+            stem, number = f"{plain}_{number}", number + 1
+        taken.add(stem.casefold())
+        stems.append(stem)
+    return stems
+
+
+def _safe(part: str) -> str:
+    """Letters, digits and a few marks: no separators, drive letters or hidden files."""
+    return re.sub(r"[^\w.\- ]", "_", part).strip(". ") or "_"

@@ -1,0 +1,67 @@
+"""Tables of figures for the console."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+#: key in metrics.json, what people call it, format
+FIGURES = (
+    ("psnr", "PSNR (dB) ↑", "{:.2f}"),
+    ("ssim", "SSIM ↑", "{:.4f}"),
+    ("lpips_vgg", "LPIPS vgg ↓", "{:.4f}"),
+    ("lpips_vgg_01", "LPIPS vgg, [0,1] input ↓", "{:.4f}"),
+)
+
+
+def metrics_table(result: Mapping[str, Any]) -> RenderableType:
+    """What `metrics.json` holds: quality raw and corrected, quality by visibility, size and speed."""
+    quality = Table(box=box.SIMPLE_HEAD, title=f"{result['test_views']} test views", title_justify="left")
+    for column in ("", "raw", "colour-corrected"):
+        quality.add_column(column, justify="left" if not column else "right")
+    for key, label, form in FIGURES:
+        quality.add_row(label, shown(result[key], form), shown(result[f"{key}_cc"], form))
+    parts: list[RenderableType] = [quality]
+    if result["by_visibility"]:
+        parts.append(_visibility_table(result["by_visibility"]))
+    parts.append(Text(_model_line(result), style="dim"))
+    parts += [Text(note, style="yellow") for note in result["notes"]]
+    return Group(*parts)
+
+
+def shown(value: float | None, form: str) -> str:
+    """The figure, or a dash where there is none."""
+    return "–" if value is None else form.format(value)
+
+
+def _visibility_table(bins: list[Mapping[str, Any]]) -> Table:
+    table = Table(
+        box=box.SIMPLE_HEAD, title="by visibility (training cameras that see a pixel)", title_justify="left"
+    )
+    for column in ("V", "pixels", "PSNR (dB)", "SSIM", "PSNR cc"):
+        table.add_column(column, justify="right")
+    for each in bins:
+        bounds = "nothing drawn" if each["lower"] is None else f"{each['lower']:.3g} to {each['upper']:.3g}"
+        table.add_row(
+            bounds, f"{each['pixels']:,}", shown(each["psnr"], "{:.2f}"), shown(each["ssim"], "{:.4f}"),
+            shown(each.get("psnr_cc"), "{:.2f}"),
+        )  # fmt: skip
+    return table
+
+
+def _model_line(result: Mapping[str, Any]) -> str:
+    parts = [f"{result['fps']:.3g} images a second"]
+    if result["n_anchors"] is not None:
+        parts.append(f"{result['n_anchors']:,} anchors")
+    if result["model_bytes"] is not None:
+        parts.append(f"{result['model_bytes'] / 1e6:.1f} MB")
+    if result["train_seconds"] is not None:
+        parts.append(f"trained in {result['train_seconds']:,.0f} s")
+    if result["peak_memory_bytes"] is not None:
+        parts.append(f"peak memory {result['peak_memory_bytes'] / 1e9:.2f} GB")
+    return " · ".join(parts)
