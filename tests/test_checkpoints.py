@@ -11,11 +11,15 @@ from vdgs.errors import VdgsError
 
 def state(iteration: int) -> SavedState:
     generator = torch.Generator().manual_seed(iteration)
-    return SavedState(iteration, {"loss": "nan"}, {"a": torch.randn(50, 3, generator=generator), "b": torch.arange(4)})
+    return SavedState(
+        iteration, {"loss": "nan"}, {"a": torch.randn(50, 3, generator=generator), "b": torch.arange(4)}
+    )
 
 
 def same(left: SavedState, right: SavedState) -> bool:
-    return left.iteration == right.iteration and all(torch.equal(left.tensors[k], right.tensors[k]) for k in "ab")
+    return left.iteration == right.iteration and all(
+        torch.equal(left.tensors[k], right.tensors[k]) for k in "ab"
+    )
 
 
 def test_what_is_saved_is_loaded(tmp_path):
@@ -80,7 +84,7 @@ def test_a_refusing_disk_is_reported_and_loses_nothing(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("vdgs.checkpoints.save_file", full)
-    with pytest.raises(VdgsError, match="No space left.*continues"):
+    with pytest.raises(VdgsError, match=r"No space left.*continues"):
         save_state(tmp_path, state(2))
     loaded, _ = load_newest(tmp_path)
     assert loaded is not None

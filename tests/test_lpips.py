@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from evaluation_support import noisy, photograph
 from safetensors.torch import save_file
 from torch import nn
 
+from evaluation_support import noisy, photograph
 from vdgs.errors import VdgsError
 from vdgs.evaluation import lpips
 from vdgs.evaluation.lpips import Lpips, load_lpips

@@ -29,7 +29,7 @@ def test_changed_settings_are_refused_with_the_difference(tmp_path):
 
 def test_a_folder_with_other_files_is_refused(tmp_path):
     (tmp_path / "holiday.jpg").write_bytes(b"x")
-    with pytest.raises(RunError, match="holiday.jpg"):
+    with pytest.raises(RunError, match=r"holiday\.jpg"):
         RunFolder(tmp_path).begin(settings())
 
 
@@ -42,7 +42,7 @@ def test_one_process_at_a_time(tmp_path):
 @pytest.mark.parametrize("text", ["", "capture: [", "- 1\n- 2", "\x00\x01"])
 def test_a_damaged_config_is_named(tmp_path, text):
     (tmp_path / "config.yaml").write_text(text)
-    with pytest.raises(RunError, match="config.yaml"):
+    with pytest.raises(RunError, match=r"config\.yaml"):
         RunFolder(tmp_path).settings()
 
 

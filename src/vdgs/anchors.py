@@ -86,20 +86,31 @@ class AnchorModel:
         try:
             anchors = Anchors(**{n: tensors[f"anchors.{n}"] for n in ("positions", *TRAINED)})
             decoder = Decoder.from_tensors(
-                {name.removeprefix("decoder."): t for name, t in tensors.items() if name.startswith("decoder.")}
+                {
+                    name.removeprefix("decoder."): t
+                    for name, t in tensors.items()
+                    if name.startswith("decoder.")
+                }
             )
             known = json.loads(header[FORMAT])
             red, green, blue = (float(value) for value in known["background"])
             model = AnchorModel(anchors, decoder, float(known["voxel"]), (red, green, blue), known["facts"])
             model.check()
         except (KeyError, ValueError, TypeError) as error:
-            raise VdgsError(f"{path}: is damaged or incomplete ({error}). Restore it or train again.") from error
+            raise VdgsError(
+                f"{path}: is damaged or incomplete ({error}). Restore it or train again."
+            ) from error
         return model
 
     def check(self) -> None:
         """Raise ValueError unless shapes and types agree with each other and all numbers are finite."""
         n, k = len(self.anchors), self.anchors.offsets.shape[1] if self.anchors.offsets.ndim == 3 else 0
-        shapes = {"positions": (n, 3), "features": (n, FEATURE_SIZE), "offsets": (n, k, 3), "log_scales": (n, 6)}
+        shapes = {
+            "positions": (n, 3),
+            "features": (n, FEATURE_SIZE),
+            "offsets": (n, k, 3),
+            "log_scales": (n, 6),
+        }
         for name, shape in shapes.items():
             tensor = getattr(self.anchors, name)
             if tuple(tensor.shape) != shape or tensor.dtype != torch.float32:
@@ -120,7 +131,9 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     except FileNotFoundError as error:
         raise VdgsError(f"{path}: is not there. Train first, or point to the right run.") from error
     except (OSError, SafetensorError, ValueError) as error:
-        raise VdgsError(f"{path}: cannot be read ({error}). It is damaged; restore it or train again.") from error
+        raise VdgsError(
+            f"{path}: cannot be read ({error}). It is damaged; restore it or train again."
+        ) from error
 
 
 def automatic_voxel(points: np.ndarray) -> float:
@@ -138,9 +151,7 @@ def automatic_voxel(points: np.ndarray) -> float:
     return float(np.median(distances[:, 1]))
 
 
-def initial_anchors(
-    points: np.ndarray, colours: np.ndarray, config: AnchorConfig
-) -> tuple[Anchors, float]:
+def initial_anchors(points: np.ndarray, colours: np.ndarray, config: AnchorConfig) -> tuple[Anchors, float]:
     """Anchors on the voxel grid of the sparse points [n, 3], and the voxel used.
 
     Points are rounded to the grid and made unique (Scaffold-GS eq. 3). Log-scales start at the logarithm of

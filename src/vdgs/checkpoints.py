@@ -35,9 +35,16 @@ class SavedState:
 def save_state(folder: Path, state: SavedState) -> None:
     """Write a state and remove all but the newest two. Raises VdgsError if the disk refuses."""
     path = folder / f"{state.iteration:08d}.safetensors"
-    write_atomically(path, lambda temporary: save_file({k: v.contiguous() for k, v in state.tensors.items()}, temporary))
+    write_atomically(
+        path, lambda temporary: save_file({k: v.contiguous() for k, v in state.tensors.items()}, temporary)
+    )
     data = path.read_bytes()
-    sidecar = {"iteration": state.iteration, "bytes": len(data), "crc32": zlib.crc32(data), "facts": dict(state.facts)}
+    sidecar = {
+        "iteration": state.iteration,
+        "bytes": len(data),
+        "crc32": zlib.crc32(data),
+        "facts": dict(state.facts),
+    }
     write_json(path.with_suffix(".json"), sidecar)
     for old in sorted(folder.glob("*.json"))[:-KEPT]:
         old.unlink()
@@ -52,7 +59,9 @@ def load_newest(folder: Path) -> tuple[SavedState | None, list[str]]:
         try:
             return _read(sidecar), complaints
         except (OSError, ValueError, KeyError, TypeError) as error:
-            complaints.append(f"{sidecar.with_suffix('.safetensors')}: is damaged ({error}); using the state before it")
+            complaints.append(
+                f"{sidecar.with_suffix('.safetensors')}: is damaged ({error}); using the state before it"
+            )
     return None, complaints
 
 

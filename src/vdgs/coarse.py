@@ -29,7 +29,16 @@ from vdgs.files import write_json
 from vdgs.progress import TrainingProgress, peak_memory_bytes
 from vdgs.run import RunFolder
 from vdgs.run_options import CoarseOptions
-from vdgs.training import Stage, StepReport, TrainingState, from_saved, mean_colour, start_state, to_saved, train
+from vdgs.training import (
+    Stage,
+    StepReport,
+    TrainingState,
+    from_saved,
+    mean_colour,
+    start_state,
+    to_saved,
+    train,
+)
 
 
 class Stopped(VdgsError):
@@ -98,7 +107,9 @@ def camera_height(capture: Capture) -> float:
     return max(height, 1e-3 * float(np.ptp(capture.points, axis=0).max()), 1e-9)
 
 
-def _train(run: RunFolder, capture: Capture, config: TrainConfig, options: CoarseOptions, console: Console) -> None:
+def _train(
+    run: RunFolder, capture: Capture, config: TrainConfig, options: CoarseOptions, console: Console
+) -> None:
     folder, views = run.coarse, capture.train_views
     folder.checkpoints.mkdir(parents=True, exist_ok=True)
     state, voxel = _continue_or_start(run, capture, config, console)
@@ -128,7 +139,11 @@ def _train(run: RunFolder, capture: Capture, config: TrainConfig, options: Coars
             complete = train(state, stage, stop=stop, after_step=after_step)
     except TrainingDiverged as error:
         kept, _ = load_newest(folder.checkpoints)
-        where = f"the state of iteration {kept.iteration} is kept in {folder.checkpoints}" if kept else "no state was saved yet"
+        where = (
+            f"the state of iteration {kept.iteration} is kept in {folder.checkpoints}"
+            if kept
+            else "no state was saved yet"
+        )
         folder.set_status("failed", iteration=state.iteration, why=str(error))
         raise TrainingDiverged(
             f"{error} Training stopped; {where}. Lower --rates.* or raise --growth.threshold in a new --output, "
@@ -155,9 +170,13 @@ def _continue_or_start(
         try:
             state = from_saved(saved)
         except (KeyError, TypeError, ValueError) as error:
-            raise RunError(f"{run.coarse.checkpoints}: holds a state of another version ({error}). Start a new --output.") from error
+            raise RunError(
+                f"{run.coarse.checkpoints}: holds a state of another version ({error}). Start a new --output."
+            ) from error
         if state.iteration > config.iterations:
-            raise RunError(f"{run.coarse.checkpoints}: is at iteration {state.iteration}, beyond {config.iterations}.")
+            raise RunError(
+                f"{run.coarse.checkpoints}: is at iteration {state.iteration}, beyond {config.iterations}."
+            )
         console.print(f"continuing at iteration {state.iteration}")
     else:
         if complaints:
@@ -232,7 +251,9 @@ def _board(run: RunFolder, options: CoarseOptions) -> Any:
     return SummaryWriter(str(run.coarse.path / "tensorboard"))
 
 
-def _announce(capture: Capture, state: TrainingState, config: TrainConfig, budget: int, console: Console) -> None:
+def _announce(
+    capture: Capture, state: TrainingState, config: TrainConfig, budget: int, console: Console
+) -> None:
     camera = capture.train_views[0].camera
     pixels = sum(view.camera.width * view.camera.height for view in capture.train_views)
     console.print(

@@ -28,16 +28,25 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
         temporary.unlink(missing_ok=True)
         raise VdgsError(
             f"{path}: cannot be written ({error.strerror or error}). Free some space or choose another "
-            "--output, then run the same command again: it continues from the last good state."
+            "folder, then run the same command again: it continues from the last good state."
         ) from error
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
 
 
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file atomically."""
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(content)
+
+    write_atomically(path, write)
+
+
 def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically."""
-    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8") and None)
+    """Write a text file (UTF-8) atomically."""
+    write_bytes(path, text.encode())
 
 
 def write_json(path: Path, value: Any) -> None:

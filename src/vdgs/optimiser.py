@@ -52,7 +52,12 @@ class Optimiser:
         return Optimiser(Moments.zeros(trained), Moments.zeros(decoder.tensors()))
 
     def update_anchors(
-        self, anchors: Anchors, rows: Tensor, gradients: dict[str, Tensor | None], rates: dict[str, float], step: int
+        self,
+        anchors: Anchors,
+        rows: Tensor,
+        gradients: dict[str, Tensor | None],
+        rates: dict[str, float],
+        step: int,
     ) -> bool:
         """Move the given rows of features, offsets and log-scales, in place. False: a gradient is not finite."""
         finite = True

@@ -14,9 +14,9 @@ import psutil
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from vdgs.config import TrainConfig
 from vdgs.run import StageFolder
 from vdgs.training import StepReport, TrainingState, downscale_at
-from vdgs.config import TrainConfig
 
 #: Iterations between two lines of log.jsonl.
 LOG_INTERVAL = 50
@@ -35,7 +35,9 @@ def peak_memory_bytes() -> int:
 class TrainingProgress:
     """A bar on a terminal, a line now and then elsewhere, and log.jsonl always."""
 
-    def __init__(self, console: Console, folder: StageFolder, config: TrainConfig, start: int, board: Any = None):
+    def __init__(
+        self, console: Console, folder: StageFolder, config: TrainConfig, start: int, board: Any = None
+    ):
         self._console, self._config, self._board = console, config, board
         self._log: TextIO = folder.log.open("a", encoding="utf-8")
         self._recent: deque[tuple[float, int]] = deque([(time.monotonic(), start)], maxlen=200)

@@ -3,62 +3,61 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
-import cv2
 import matplotlib
 import numpy as np
 from rich.console import Console
 from rich.progress import track
 from torch import Tensor
 
+from vdgs import render_paths
 from vdgs.cameras import Camera
-from vdgs.errors import VdgsError
 from vdgs.evaluation.of_run import TrainedRun, open_run
-from vdgs.files import write_atomically
+from vdgs.evaluation.saving import file_stems, write_png
 from vdgs.render import render, render_values
 from vdgs.verbs import RenderArguments
+from vdgs.video import VideoWriter
+
+#: Pace of a film of separate views.
+SLIDES_PER_SECOND = 2.0
 
 
 def render_run(asked: RenderArguments, console: Console) -> None:
     """Render what was asked for. Raises VdgsError for an unusable path, codec or output."""
     run = open_run(asked.run)
-    named = _cameras(asked, run)
+    named, fps = _cameras(asked, run)
     if asked.width:
         named = [(name, camera.resized(asked.width, _height(camera, asked.width))) for name, camera in named]
     frames = _frames(asked.kind, run, named, console)
-    if asked.output.suffix == ".mp4":
-        from vdgs.video import write_video
-
-        write_video(asked.output, (frame for _, frame in frames), asked.fps)
-    elif asked.output.suffix:
-        raise VdgsError(f"{asked.output}: give a folder (for PNG files) or a file that ends in .mp4")
+    if asked.output.suffix:
+        with VideoWriter(asked.output, fps) as film:
+            for _, frame in frames:
+                film.write(frame)
     else:
         for name, frame in frames:
             write_png(asked.output / f"{name}.png", frame)
     console.print(f"{len(named)} views: {asked.output}", highlight=False)
 
 
-def write_png(path: Path, image: np.ndarray) -> None:
-    """Write uint8 RGB [h, w, 3] atomically."""
-    encoded = cv2.imencode(".png", image[..., ::-1])[1]
-    write_atomically(path, lambda temporary: temporary.write_bytes(encoded.tobytes()) and None)
-
-
-def _cameras(asked: RenderArguments, run: TrainedRun) -> list[tuple[str, Camera]]:
-    from vdgs import render_paths
-
-    count = max(2, round(asked.seconds * asked.fps))
+def _cameras(asked: RenderArguments, run: TrainedRun) -> tuple[list[tuple[str, Camera]], float]:
+    """The cameras with their names, and the frames per second for a film of them."""
+    capture = run.capture
+    if asked.path is None and asked.views in ("test", "train"):
+        views = capture.test_views if asked.views == "test" else capture.train_views
+        stems = file_stems([view.name for view in views])
+        cameras, fps = [view.camera for view in views], asked.fps or SLIDES_PER_SECOND
+        return list(zip(stems, cameras, strict=True)), fps
+    flown, template = [view.camera for view in capture.train_views], capture.train_views[0].camera
+    length, rate = asked.seconds or render_paths.SECONDS, asked.fps or render_paths.FPS
     if asked.path is not None:
-        cameras = render_paths.load_path(asked.path, count)
+        path = render_paths.load_path(
+            asked.path, template, capture.ground, asked.seconds or None, asked.fps or None
+        )
     elif asked.views == "orbit":
-        cameras = render_paths.orbit(run.capture, count)
-    elif asked.views == "flyover":
-        cameras = render_paths.flyover(run.capture, count)
+        path = render_paths.orbit(capture.points, flown, template, length, rate)
     else:
-        views = run.capture.test_views if asked.views == "test" else run.capture.train_views
-        return [(str(Path(view.name).with_suffix("")), view.camera) for view in views]
-    return [(f"{i:05d}", camera) for i, camera in enumerate(cameras)]
+        path = render_paths.flyover(flown, template, length, rate)
+    return [(f"{i:05d}", camera) for i, camera in enumerate(path.cameras)], path.fps
 
 
 def _height(camera: Camera, width: int) -> int:

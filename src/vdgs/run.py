@@ -47,7 +47,9 @@ class StageFolder:
             return {"state": "new"}
         status = read_json(self.status_file)
         if not isinstance(status, dict) or not isinstance(status.get("state"), str):
-            raise RunError(f"{self.status_file}: is damaged. Delete this file and run the same command again.")
+            raise RunError(
+                f"{self.status_file}: is damaged. Delete this file and run the same command again."
+            )
         return status
 
     def set_status(self, state: str, **facts: Any) -> None:
@@ -117,13 +119,17 @@ class RunFolder:
     def settings(self) -> dict[str, Any]:
         """The settings of the run, without the header that says which version wrote them."""
         if not self.config_file.exists():
-            raise RunError(f"{self.path}: is not a run folder (no config.yaml). Train first: vdgs coarse CAPTURE --output RUN")
+            raise RunError(
+                f"{self.path}: is not a run folder (no config.yaml). Train first: vdgs coarse CAPTURE --output RUN"
+            )
         try:
             settings = yaml.safe_load(self.config_file.read_text(encoding="utf-8"))
         except (yaml.YAMLError, UnicodeDecodeError) as error:
             raise RunError(f"{self.config_file}: is damaged, not valid YAML ({error})") from error
         if not isinstance(settings, dict) or not {"capture", "training"} <= settings.keys():
-            raise RunError(f"{self.config_file}: is damaged or not of a vdgs run (no `capture` and `training`)")
+            raise RunError(
+                f"{self.config_file}: is damaged or not of a vdgs run (no `capture` and `training`)"
+            )
         settings.pop("vdgs", None)
         return settings
 
@@ -134,12 +140,16 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             handle = (self.path / ".lock").open("w")
         except OSError as error:
-            raise RunError(f"{self.path}: cannot be written ({error.strerror}). Choose another --output.") from error
+            raise RunError(
+                f"{self.path}: cannot be written ({error.strerror}). Choose another --output."
+            ) from error
         with handle:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError as error:
-                raise RunError(f"{self.path}: another vdgs process works on this run. Wait for it or stop it.") from error
+                raise RunError(
+                    f"{self.path}: another vdgs process works on this run. Wait for it or stop it."
+                ) from error
             yield
 
 
@@ -148,5 +158,7 @@ def _commit() -> str | None:
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists() or not (root / "native").exists():
         return None
-    found = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    found = subprocess.run(
+        ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
+    )
     return found.stdout.strip() or None

@@ -148,7 +148,12 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     growing = iteration + 1 <= config.growth.until * config.iterations
     if growing and iteration + 1 > config.growth.statistics_from and splats.means_px.grad is not None:
         state.statistics.add_view(
-            visible.rows, splats.source, splats.opacities.detach(), splats.means_px.grad, camera.width, camera.height
+            visible.rows,
+            splats.source,
+            splats.opacities.detach(),
+            splats.means_px.grad,
+            camera.width,
+            camera.height,
         )
     state.iteration += 1
     grown = pruned = None
@@ -187,7 +192,9 @@ def _background(stage: Stage, iteration: int) -> Tensor:
     return torch.rand(3, generator=torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration))
 
 
-def mean_colour(images: TrainingImages, count: int, downscale: int, at_most: int = 32) -> tuple[float, float, float]:
+def mean_colour(
+    images: TrainingImages, count: int, downscale: int, at_most: int = 32
+) -> tuple[float, float, float]:
     """Mean colour in [0, 1] of the pixels that count, over up to `at_most` evenly chosen training views."""
     total, pixels = np.zeros(3), 0
     for index in np.unique(np.linspace(0, count - 1, min(count, at_most)).astype(int)):

@@ -78,10 +78,10 @@ class RenderArguments:
     """Which cameras; `orbit` and `flyover` are paths made from the capture."""
     path: Path | None = None
     """JSON file with a camera path (docs/conventions.md); overrides --views."""
-    seconds: float = 10.0
-    """Length of a camera path."""
-    fps: float = 24.0
-    """Frames per second of a camera path and of the video."""
+    seconds: float = 0.0
+    """Length of a camera path; 0: what its file says, or 12 seconds."""
+    fps: float = 0.0
+    """Frames per second of a camera path and of the video; 0: what its file says, or 30 (2 for separate views)."""
     width: int = 0
     """Image width; 0 takes that of the training views."""
     kind: Literal["image", "depth", "visibility"] = "image"
@@ -109,7 +109,7 @@ class DoctorArguments:
 
 def inspect(arguments: list[str]) -> None:
     asked = tyro.cli(InspectArguments, args=arguments, prog="vdgs inspect")
-    from vdgs.captures.images import check_images
+    from vdgs.captures.checks import check_images
     from vdgs.captures.loading import load_capture
     from vdgs.inspect import inspect_capture, print_report
 
@@ -147,9 +147,21 @@ def render(arguments: list[str]) -> None:
 
 def synth(arguments: list[str]) -> None:
     asked = tyro.cli(SynthArguments, args=arguments, prog="vdgs synth")
+    from rich.progress import Progress, TaskID
+
     from vdgs.synth import generate
 
-    generate(asked.output, asked.options)
+    console = _console()
+    with Progress(console=console, disable=not console.is_terminal) as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done)
+
+        generate(asked.output, asked.options, show)
+    console.print(f"capture: {asked.output}", highlight=False)
 
 
 def doctor(arguments: list[str]) -> int:
