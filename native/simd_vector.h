@@ -121,22 +121,25 @@ VDGS_INLINE M16 mask_of_bits(unsigned u) {
 }
 VDGS_INLINE M16 first_lanes(int count) { return mask_of_bits((1u << count) - 1u); }
 
-// Part by part: a copy of all 64 bytes at once goes through the stack in pieces of 16 bytes, and the
-// wider load that follows stalls on them.
-#define VDGS_LOADS_AND_STORES(Lanes, Scalar)                                                  \
-  VDGS_INLINE Lanes loadu(const Scalar* p) {                                                  \
-    Lanes r;                                                                                  \
-    VDGS_EACH std::memcpy(&r.v[k], p + k * kPartLanes, sizeof r.v[k]);                        \
-    return r;                                                                                 \
-  }                                                                                           \
-  VDGS_INLINE void storeu(Scalar* p, Lanes a) {                                               \
-    VDGS_EACH std::memcpy(p + k * kPartLanes, &a.v[k], sizeof a.v[k]);                        \
-  }                                                                                           \
-  VDGS_INLINE Lanes load(const Scalar* p) {                                                   \
-    return loadu(static_cast<const Scalar*>(__builtin_assume_aligned(p, 64)));                \
-  }                                                                                           \
-  VDGS_INLINE void store(Scalar* p, Lanes a) {                                                \
-    storeu(static_cast<Scalar*>(__builtin_assume_aligned(p, 64)), a);                         \
+// Part by part: as one copy of 64 bytes the compiler would take the long way round, through the stack.
+#define VDGS_LOADS_AND_STORES(Lanes, Scalar)                                                               \
+  typedef Scalar Aligned##Lanes##Part __attribute__((vector_size(kPartLanes * 4), may_alias));             \
+  typedef Scalar Any##Lanes##Part __attribute__((vector_size(kPartLanes * 4), aligned(4), may_alias));     \
+  VDGS_INLINE Lanes load(const Scalar* p) {                                                                \
+    Lanes r;                                                                                               \
+    VDGS_EACH r.v[k] = *reinterpret_cast<const Aligned##Lanes##Part*>(p + k * kPartLanes);                 \
+    return r;                                                                                              \
+  }                                                                                                        \
+  VDGS_INLINE Lanes loadu(const Scalar* p) {                                                               \
+    Lanes r;                                                                                               \
+    VDGS_EACH r.v[k] = *reinterpret_cast<const Any##Lanes##Part*>(p + k * kPartLanes);                     \
+    return r;                                                                                              \
+  }                                                                                                        \
+  VDGS_INLINE void store(Scalar* p, Lanes a) {                                                             \
+    VDGS_EACH *reinterpret_cast<Aligned##Lanes##Part*>(p + k * kPartLanes) = a.v[k];                       \
+  }                                                                                                        \
+  VDGS_INLINE void storeu(Scalar* p, Lanes a) {                                                            \
+    VDGS_EACH *reinterpret_cast<Any##Lanes##Part*>(p + k * kPartLanes) = a.v[k];                           \
   }
 VDGS_LOADS_AND_STORES(F16, float)
 VDGS_LOADS_AND_STORES(I16, int32_t)
