@@ -37,11 +37,12 @@ struct alignas(64) Record {
   float best_y_per_x;  // -b/c: on a vertical line at dx the splat is strongest at dy = this * dx
   float best_x_per_y;  // -b/a
   float opacity;
-  float unused[3];
+  uint32_t columns, rows;  // tiles of the splat's box: first | last << 16; none if columns is kNoTiles
+  uint32_t unused;
 };
+constexpr uint32_t kNoTiles = 1;  // first 1, last 0
 static_assert(sizeof(Record) == 64);
 
-// Which tiles a splat may touch, both ends included, packed as first | last << 16.
 struct TileGrid {
   int width = 0, height = 0, columns = 0, rows = 0;
   int tiles() const { return columns * rows; }
@@ -61,14 +62,19 @@ struct Candidates {
 
 struct DepthKey {
   uint32_t key;  // orders as the depth does
-  int32_t splat;
+  uint32_t pick;
 };
 
 // A contiguous part of a slab's depth order, worked on by one thread until the tiles are binned.
+//
+// Its splats ("picks") are numbered in the order of the input. All that touches the rows of the input,
+// or of its gradients, goes through them in that order: memory is far slower the other way.
 struct SlabPart {
   int64_t rank_begin = 0;  // in the slab
   int64_t count = 0, n_entries = 0;
-  Buffer<DepthKey> order, scratch;
+  Buffer<int32_t> splat;           // [count] of each pick, ascending
+  Buffer<Record> picks;            // [count]; the backward pass keeps sums in them
+  Buffer<DepthKey> order, scratch;  // [count] the picks by depth
   Buffer<uint32_t> first;  // [count + 1] where a splat's entries begin in `where`
   Buffer<uint32_t> where;  // [n_entries] splat by splat: first the tile, then the entry's place in it
   Buffer<uint32_t> cursor;  // [tiles] where this part's next entry of a tile goes
@@ -127,7 +133,7 @@ struct Frame {
 };
 
 // Names of Frame::seconds.
-enum Phase { kCull, kSort, kRecords, kScatter, kForward, kBackward, kReduce };
+enum Phase { kCull, kSelect, kBin, kScatter, kForward, kBackward, kReduce };
 
 class Stopwatch {
  public:
@@ -157,9 +163,11 @@ struct DepthRange {
   size_t begin, end;    // in the sample
 };
 DepthRange next_slab(const DepthSample& sample, const TileGrid& grid, const DepthRange& previous, int number);
-void select_and_sort(const Frame& frame, const DepthSample& sample, const DepthRange& range, Slab& slab);
+void select_and_sort(const Frame& frame, const Splats& splats, const DepthSample& sample, const DepthRange& range,
+                     Slab& slab);
+void make_records(const Splats& splats, const TileGrid& grid, SlabPart& part);
 
-void make_records(const Frame& frame, const Splats& splats, Slab& slab);
+void note_tiles(const Frame& frame, Slab& slab);
 void scatter_entries(const TileGrid& grid, Slab& slab);
 
 void forward_tiles(Frame& frame, Slab& slab, bool last, const float background[3], const Picture& out,

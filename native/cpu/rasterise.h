@@ -11,7 +11,8 @@
 //   slabs     a few ranges of depth, front to back; a tile of 16 x 16 pixels that
 //             is finished takes no part in the slabs behind, so that what is hidden
 //             is never sorted or binned                                          rasterise_slabs.cpp
-//   bin       records in depth order; the entries of each tile                   rasterise_bin.cpp
+//   records   what the tiles need of a splat, in one cache line                  rasterise_records.cpp
+//   bin       the entries of each tile, in the order of depth                    rasterise_bin.cpp
 //   forward   per tile: sixteen blocks of 4 x 4 pixels, one vector each          rasterise_forward.cpp
 //   backward  per tile, back to front; ten sums per entry                        rasterise_backward.cpp
 //   reduce    the entries of a splat added up, in a fixed order                  rasterise_reduce.cpp

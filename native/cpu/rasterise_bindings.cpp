@@ -77,7 +77,7 @@ void py_backward(std::shared_ptr<Frame> frame, const nb::tuple& background, std:
 }
 
 nb::dict seconds(const Frame& frame) {
-  static const char* const names[] = {"cull", "sort", "records", "scatter", "forward", "backward", "reduce"};
+  static const char* const names[] = {"cull", "select", "bin", "scatter", "forward", "backward", "reduce"};
   nb::dict out;
   for (size_t i = 0; i < 7; ++i) out[names[i]] = frame.seconds[i];
   return out;

@@ -53,11 +53,13 @@ void select(const Frame& frame, float low, float high, bool first_slab, SlabPart
       unsigned chosen = bits(ge(depth, low16) & lt(depth, high16));
       if (end - i < kLanes) chosen &= (1u << (end - i)) - 1u;
       if (!chosen) continue;
-      DepthKey* out = part.order.grow(n, n + kLanes);
+      DepthKey* order = part.order.grow(n, n + kLanes);
+      int32_t* splat = part.splat.grow(n, n + kLanes);
       for (; chosen; chosen &= chosen - 1) {
         const size_t j = i + static_cast<size_t>(__builtin_ctz(chosen));
         if (!first_slab && open_tiles(frame, all.columns[j], all.rows[j]) == 0) continue;
-        out[n++] = {key_of_depth(all.depth[j]), all.splat[j]};
+        order[n] = {key_of_depth(all.depth[j]), static_cast<uint32_t>(n)};
+        splat[n++] = all.splat[j];
       }
     }
   }
@@ -132,7 +134,8 @@ DepthRange next_slab(const DepthSample& sample, const TileGrid& grid, const Dept
   return range;
 }
 
-void select_and_sort(const Frame& frame, const DepthSample& sample, const DepthRange& range, Slab& slab) {
+void select_and_sort(const Frame& frame, const Splats& splats, const DepthSample& sample, const DepthRange& range,
+                     Slab& slab) {
   const int64_t in_sample = static_cast<int64_t>(range.end - range.begin);
   const int64_t estimate = in_sample * frame.candidates.count / std::max<int64_t>(1, static_cast<int64_t>(sample.depth.size()));
   slab.n_parts = n_parts(estimate, 4096);
@@ -152,6 +155,7 @@ void select_and_sort(const Frame& frame, const DepthSample& sample, const DepthR
   parallel_for(slab.n_parts, [&](int64_t p) {
     SlabPart& part = *slab.parts[static_cast<size_t>(p)];
     select(frame, cut(static_cast<int>(p)), cut(static_cast<int>(p) + 1), first_slab, part);
+    make_records(splats, frame.grid, part);
     sort(part);
   });
   slab.count = 0;
