@@ -20,7 +20,8 @@ class AnchorConfig:
     offsets: int = 10
     """Gaussians per anchor (k)."""
     voxel: float = 0.0
-    """Edge of the initial voxel grid in units of the ground frame; 0 takes the median nearest-neighbour distance of the sparse points."""
+    """Edge of the initial voxel grid in units of the ground frame; 0 takes the median nearest-neighbour distance of the
+    sparse points."""
     distance: bool = False
     """Feed the distance between camera and anchor to the decoder too."""
     appearance: int = 0
@@ -70,7 +71,7 @@ class GrowthConfig:
     gate: float = 0.4
     """An offset is judged once it was rendered more often than this share of the interval."""
     prune_opacity: float = 0.005
-    """An anchor goes when the opacity of its Gaussians, summed over them and averaged over the views, is below this."""
+    """An anchor goes when the opacity of its Gaussians, summed over them, averaged over the views, is below this."""
     prune_views: float = 0.8
     """... and it was seen more often than this share of the interval."""
     max_anchors: int = 0
@@ -85,9 +86,12 @@ class LossConfig:
     """Loss = (1 - w) L1 + w (1 - SSIM) + volume."""
     volume_weight: float = 0.01
     """Weight of the mean product of the three scales of the Gaussians that are drawn."""
-    background: Literal["mean", "black", "random"] = "mean"
-    """Colour behind the scene: the mean of the training photographs (choice: what no photograph shows is then drawn in a
-    colour of the place), black, or a random one in training and the mean afterwards."""
+    background: Literal["mean", "black"] = "mean"
+    """Colour behind the scene: the mean of the training photographs (choice: what no photograph shows is then drawn
+    in a colour of the place), or black."""
+    background_noise: float = 0.3
+    """In training the background is this much brighter or darker in each channel, at random: no transparent hole can
+    then pass for ground of the background's colour (choice)."""
 
 
 @dataclass(frozen=True)

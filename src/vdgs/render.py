@@ -55,7 +55,8 @@ def render(
 ) -> Raster:
     """One view of a model: image [h, w, 3] (not clamped), alpha [h, w], depth [h, w] or None.
 
-    `background` replaces the model's own. `image` is the index of a training image whose appearance to use; None takes the mean appearance.
+    `background` replaces the model's own. `image` is the index of a training image whose appearance to use;
+    None takes the mean appearance.
     """
     visible = gather_visible(model.anchors, camera)
     splats = decode_visible(visible.anchors, model.decoder.for_image(image), camera)

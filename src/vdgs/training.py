@@ -187,9 +187,11 @@ def reorder(state: TrainingState) -> None:
 
 
 def _background(stage: Stage, iteration: int) -> Tensor:
-    if stage.config.loss.background != "random":
-        return torch.tensor(stage.background)
-    return torch.rand(3, generator=torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration))
+    colour, noise = torch.tensor(stage.background), stage.config.loss.background_noise
+    if noise == 0:
+        return colour
+    generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)
+    return colour + noise * (2 * torch.rand(3, generator=generator) - 1)
 
 
 def mean_colour(
