@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from evaluation_support import photograph
 
+from evaluation_support import photograph
 from vdgs.evaluation import metrics
 from vdgs.evaluation.colour import correct_colours
 

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from evaluation_support import noisy, photograph, real_photographs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import convolve2d
 
+from evaluation_support import noisy, photograph, real_photographs
 from vdgs.evaluation import metrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram, quantile_groups, view_bins
 
