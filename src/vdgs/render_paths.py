@@ -131,19 +131,22 @@ def orbit(
 ) -> CameraPath:
     """Once around the middle of the scene, looking at it, as high as the flight.
 
-    The middle is the median of the points; the radius two thirds of the 90 % extent of the training
-    cameras about it, but at least half the height, so that a small flight is not looked at from
-    straight above (choices). `template` gives intrinsics and size.
+    The middle is the median of the points. The orbit is an ellipse along the axes of the flight, so that
+    a long narrow one is not left sideways: its half axes are two thirds of the 90 % extent of the
+    training cameras, but at least a quarter of the height (choices). `template` gives intrinsics and size.
     """
     centre = np.median(points, axis=0)
     positions = np.stack([camera.position for camera in cameras])
     height = max(float(np.median(positions[:, 2]) - centre[2]), 1e-3)
-    reach = float(np.quantile(np.linalg.norm(positions[:, :2] - centre[:2], axis=1), 0.9))
-    radius = max(2.0 / 3.0 * reach, 0.5 * height)
+    offsets = positions[:, :2] - centre[:2]
+    axes = np.linalg.svd(offsets, full_matrices=False)[2] if len(offsets) > 1 else np.eye(2)
+    reach = np.quantile(np.abs(offsets @ axes.T), 0.9, axis=0)
+    radii = np.maximum(2.0 / 3.0 * reach, 0.25 * height)
     frames = []
     for angle in np.linspace(0.0, 2.0 * np.pi, max(1, round(seconds * fps)), endpoint=False):
-        offset = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
-        frames.append(replace(template, camera_from_world=look_at(centre + offset, centre)))
+        level = (radii * [np.cos(angle), np.sin(angle)]) @ axes
+        pose = look_at(centre + np.append(level, height), centre)
+        frames.append(replace(template, camera_from_world=pose))
     return CameraPath(tuple(frames), fps)
 
 
