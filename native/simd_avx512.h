@@ -180,8 +180,14 @@ VDGS_INLINE void store3(float* p, F16 x, F16 y, F16 z) {
   for (int r = 0; r < 3; ++r) storeu(p + 16 * r, shuffles::pick(shuffles::pick(x, xy[r], y), with_z[r], z));
 }
 
-VDGS_INLINE void compress_store(float* p, M16 m, F16 a) { _mm512_mask_compressstoreu_ps(p, m.m, a.v); }
-VDGS_INLINE void compress_store(int32_t* p, M16 m, I16 a) { _mm512_mask_compressstoreu_epi32(p, m.m, a.v); }
+// In a register first: compressing straight to memory is very slow on some processors.
+VDGS_INLINE void compress_store(float* p, M16 m, F16 a) {
+  store_first(p, __builtin_popcount(m.m), {_mm512_maskz_compress_ps(m.m, a.v)});
+}
+VDGS_INLINE void compress_store(int32_t* p, M16 m, I16 a) {
+  const __mmask16 packed = first_lanes(__builtin_popcount(m.m)).m;
+  _mm512_mask_storeu_epi32(p, packed, _mm512_maskz_compress_epi32(m.m, a.v));
+}
 
 VDGS_INLINE F16 load_quads(const float* p, ptrdiff_t stride) {
   __m512 r = _mm512_castps128_ps512(_mm_loadu_ps(p));

@@ -121,19 +121,26 @@ VDGS_INLINE M16 mask_of_bits(unsigned u) {
 }
 VDGS_INLINE M16 first_lanes(int count) { return mask_of_bits((1u << count) - 1u); }
 
-#define VDGS_LOADS_AND_STORES(Lanes, Scalar)                                                           \
-  VDGS_INLINE Lanes load(const Scalar* p) {                                                            \
-    Lanes r;                                                                                           \
-    std::memcpy(&r, __builtin_assume_aligned(p, 64), 64);                                              \
-    return r;                                                                                          \
-  }                                                                                                    \
-  VDGS_INLINE Lanes loadu(const Scalar* p) {                                                           \
-    Lanes r;                                                                                           \
-    std::memcpy(&r, p, 64);                                                                            \
-    return r;                                                                                          \
-  }                                                                                                    \
-  VDGS_INLINE void store(Scalar* p, Lanes a) { std::memcpy(__builtin_assume_aligned(p, 64), &a, 64); } \
-  VDGS_INLINE void storeu(Scalar* p, Lanes a) { std::memcpy(p, &a, 64); }
+// Part by part: as one copy of 64 bytes the compiler would take the long way round, through the stack.
+#define VDGS_LOADS_AND_STORES(Lanes, Scalar)                                                               \
+  typedef Scalar Aligned##Lanes##Part __attribute__((vector_size(kPartLanes * 4), may_alias));             \
+  typedef Scalar Any##Lanes##Part __attribute__((vector_size(kPartLanes * 4), aligned(4), may_alias));     \
+  VDGS_INLINE Lanes load(const Scalar* p) {                                                                \
+    Lanes r;                                                                                               \
+    VDGS_EACH r.v[k] = *reinterpret_cast<const Aligned##Lanes##Part*>(p + k * kPartLanes);                 \
+    return r;                                                                                              \
+  }                                                                                                        \
+  VDGS_INLINE Lanes loadu(const Scalar* p) {                                                               \
+    Lanes r;                                                                                               \
+    VDGS_EACH r.v[k] = *reinterpret_cast<const Any##Lanes##Part*>(p + k * kPartLanes);                     \
+    return r;                                                                                              \
+  }                                                                                                        \
+  VDGS_INLINE void store(Scalar* p, Lanes a) {                                                             \
+    VDGS_EACH *reinterpret_cast<Aligned##Lanes##Part*>(p + k * kPartLanes) = a.v[k];                       \
+  }                                                                                                        \
+  VDGS_INLINE void storeu(Scalar* p, Lanes a) {                                                            \
+    VDGS_EACH *reinterpret_cast<Any##Lanes##Part*>(p + k * kPartLanes) = a.v[k];                           \
+  }
 VDGS_LOADS_AND_STORES(F16, float)
 VDGS_LOADS_AND_STORES(I16, int32_t)
 #undef VDGS_LOADS_AND_STORES

@@ -36,9 +36,8 @@ struct alignas(64) Record {
   float depth;
   float best_y_per_x;  // -b/c: on a vertical line at dx the splat is strongest at dy = this * dx
   float best_x_per_y;  // -b/a
-  float reach_x, reach_y;  // half the size of the box outside which alpha < 1/255
   float opacity;
-  float unused;
+  float unused[3];
 };
 static_assert(sizeof(Record) == 64);
 

@@ -40,7 +40,7 @@ void load_gradients(const Frame& frame, int tile, const float background[3], con
     const F16 t = load(frame.transmittance.data() + first + static_cast<size_t>(i));
     const F16 g0 = load(g.image[0] + i), g1 = load(g.image[1] + i), g2 = load(g.image[2] + i);
     store(g.transmittance + i, t);
-    store(g.behind + i, t * fma(b0, g0, fma(b1, g1, fma(b2, g2, load(g.behind + i)))));
+    store(g.behind + i, fma(b0, g0, fma(b1, g1, fma(b2, g2, load(g.behind + i)))));
     s0 = fma(t, g0, s0), s1 = fma(t, g1, s1), s2 = fma(t, g2, s2);
   }
   background_sums[0] = hsum(s0), background_sums[1] = hsum(s1), background_sums[2] = hsum(s2);
@@ -54,18 +54,25 @@ VDGS_INLINE void entry_gradients(const Record& r, const BlockOrigins& origins, u
   Falloff falloff;
   make_falloff(r, origins.x - splat(r.mean_x), origins.y - splat(r.mean_y), falloff);
   const F16 one = splat(1.0f), zero = splat(0.0f);
+  // Two loops: the first is one long chain of dependent steps per block, of which the processor can
+  // keep several under way only if nothing else fills its queue.
+  alignas(64) float alphas[kTileBlocks][kLanes], inverses[kTileBlocks][kLanes];
+  for (unsigned rest = touched; rest; rest &= rest - 1) {
+    const int block = __builtin_ctz(rest);
+    const F16 exponent = exponent_in_block(falloff, block, r.log2_opacity).value;
+    M16 reached = reaches(exponent);
+    if (any_stop) reached = reached & lt(splat(order), load(g.stop + block * kLanes));
+    const F16 alpha = zero_unless(reached, min(exp2_bounded(exponent), splat(kAlphaMax)));
+    store(alphas[block], alpha);
+    store(inverses[block], reciprocal(one - alpha));
+  }
   const F16 red = splat(r.colour[0]), green = splat(r.colour[1]), blue = splat(r.colour[2]);
   F16 s0 = zero, su = zero, sv = zero, suu = zero, suv = zero, svv = zero;
   F16 w_red = zero, w_green = zero, w_blue = zero, w_depth = zero;
   for (; touched; touched &= touched - 1) {
     const int block = __builtin_ctz(touched), at = block * kLanes;
-    const Exponent e = exponent_in_block(falloff, block, r.log2_opacity);
-    M16 reached = reaches(e.value);
-    if (any_stop) reached = reached & lt(splat(order), load(g.stop + at));
     // Where alpha is 0 everything below leaves the pixel exactly as it was.
-    const F16 unclamped = exp2_bounded(e.value);
-    const F16 alpha = zero_unless(reached, min(unclamped, splat(kAlphaMax)));
-    const F16 inverse = reciprocal(one - alpha);
+    const F16 alpha = load(alphas[block]), inverse = load(inverses[block]);
     const F16 t_behind = load(g.transmittance + at);
     const F16 t = fma(alpha * t_behind, inverse, t_behind);
     const F16 weight = alpha * t;
@@ -77,15 +84,17 @@ VDGS_INLINE void entry_gradients(const Record& r, const BlockOrigins& origins, u
       w_depth = fma(weight, gd, w_depth);
     }
     const F16 behind = load(g.behind + at);
-    const F16 d_alpha = fnma(behind, inverse, t * shade);
+    const F16 difference = shade - behind;
     store(g.transmittance + at, t);
-    store(g.behind + at, fma(weight, shade, behind));
+    store(g.behind + at, fma(alpha, difference, behind));
     // dL/d(exponent), which a clamped alpha does not depend on.
-    const F16 s = zero_unless(lt(unclamped, splat(kAlphaMax)), alpha * d_alpha);
+    const F16 s = zero_unless(lt(alpha, splat(kAlphaMax)), weight * difference);
     w_red = fma(weight, g0, w_red), w_green = fma(weight, g1, w_green), w_blue = fma(weight, g2, w_blue);
-    const F16 s_u = s * e.u, s_v = s * e.v;
+    const F16 u = load(falloff.u_pixel) + splat(falloff.u_block[block]);
+    const F16 v = load(falloff.v_pixel) + splat(falloff.v_block[block]);
+    const F16 s_u = s * u, s_v = s * v;
     s0 = s0 + s, su = su + s_u, sv = sv + s_v;
-    suu = fma(s_u, e.u, suu), suv = fma(s_u, e.v, suv), svv = fma(s_v, e.v, svv);
+    suu = fma(s_u, u, suu), suv = fma(s_u, v, suv), svv = fma(s_v, v, svv);
   }
   hsum4(out + kSum, s0, su, sv, suu);
   hsum4(out + kSumUV, suv, svv, w_red, w_green);
@@ -101,13 +110,18 @@ void slab_gradients(const Frame& frame, Slab& slab, int tile, uint32_t& seen, Ti
   const uint32_t n = slab.visited[static_cast<size_t>(tile)];
   const uint32_t* entries = slab.entries.data() + begin;
   const uint16_t* touched = slab.touched.data() + begin;
+  float* sums = slab.sums.data() + begin * kStride;
   seen -= n;
   for (uint32_t i = n; i-- > 0;) {
     if (i >= 12) __builtin_prefetch(slab.records.data() + entries[i - 12]);
-    if (!touched[i]) continue;
-    entry_gradients<with_depth, any_stop>(slab.records[entries[i]], origins, touched[i], order_of(seen + i), g,
-                                          slab.sums.data() + (begin + i) * kStride);
+    float* out = sums + i * size_t{kStride};
+    if (touched[i])
+      entry_gradients<with_depth, any_stop>(slab.records[entries[i]], origins, touched[i], order_of(seen + i), g, out);
+    else
+      std::memset(out, 0, kStride * sizeof(float));
   }
+  const size_t hidden = slab.tile_begin[static_cast<size_t>(tile) + 1] - (begin + n);
+  std::memset(sums + n * size_t{kStride}, 0, hidden * kStride * sizeof(float));
 }
 
 template <bool with_depth>

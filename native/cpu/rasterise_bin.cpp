@@ -2,17 +2,19 @@
 #include <cmath>
 #include <stdexcept>
 
-#include "frame.h"
-#include "simd.h"
 #include "threads.h"
+#include "tile.h"
 
 namespace vdgs::raster {
 namespace {
 
+constexpr const char* kTooManyEntries = "too many splats cover the whole picture: draw it in parts";
+
 // Sixteen splats of a part, field by field.
 struct alignas(64) Sixteen {
   float x[16], y[16], a[16], b[16], c[16], det[16], opacity[16];
-  float ux[16], uy[16], vy[16], log2_opacity[16], best_y[16], best_x[16], reach_x[16], reach_y[16];
+  float ux[16], uy[16], vy[16], log2_opacity[16], best_y[16], best_x[16];
+  int32_t column0[16], column1[16], row0[16], row1[16];  // of tiles; none if column0 > column1
 };
 
 void prefetch(const Splats& s, int64_t i) {
@@ -34,7 +36,7 @@ void gather_splats(const Splats& s, const DepthKey* order, int n, Sixteen& out) 
   }
 }
 
-VDGS_INLINE void derive(Sixteen& s) {
+VDGS_INLINE void derive(Sixteen& s, const TileGrid& grid) {
   const F16 a = load(s.a), b = load(s.b), c = load(s.c), det = load(s.det);
   const F16 inverse_a = splat(1.0f) / a, b_over_a = b * inverse_a;
   const F16 log2_opacity = log2(load(s.opacity));
@@ -46,8 +48,13 @@ VDGS_INLINE void derive(Sixteen& s) {
   store(s.log2_opacity, log2_opacity);
   store(s.best_y, splat(0.0f) - b / c);
   store(s.best_x, splat(0.0f) - b_over_a);
-  store(s.reach_x, sqrt(scale * c));
-  store(s.reach_y, sqrt(scale * a));
+  const TileInterval columns = tile_interval(load(s.x), sqrt(scale * c) + splat(1e-3f), grid.width);
+  const TileInterval rows = tile_interval(load(s.y), sqrt(scale * a) + splat(1e-3f), grid.height);
+  const M16 drawn = columns.hit & rows.hit & gt(det, splat(0.0f));
+  store(s.column0, to_int(select(drawn, columns.first, splat(1.0f))));
+  store(s.column1, to_int(zero_unless(drawn, columns.last)));
+  store(s.row0, to_int(zero_unless(drawn, rows.first)));
+  store(s.row1, to_int(zero_unless(drawn, rows.last)));
 }
 
 // The key is a bijection of the depth: no need to fetch it again.
@@ -58,109 +65,100 @@ float depth_of_key(uint32_t key) {
   return depth;
 }
 
-// False if the splat is not to be drawn after all.
-bool write_record(const Sixteen& s, int k, const float* colour, uint32_t key, Record& r) {
+void write_record(const Sixteen& s, int k, const float* colour, uint32_t key, Record& r) {
   r = Record{s.x[k], s.y[k], s.ux[k], s.uy[k], s.vy[k], s.log2_opacity[k], {colour[0], colour[1], colour[2]},
-             depth_of_key(key), s.best_y[k], s.best_x[k], s.reach_x[k], s.reach_y[k], s.opacity[k], 0.0f};
-  const float total = std::fabs(colour[0]) + std::fabs(colour[1]) + std::fabs(colour[2]);
-  return s.det[k] > 0.0f && total < __builtin_inff();
+             depth_of_key(key), s.best_y[k], s.best_x[k], s.opacity[k], {}};
 }
 
-// First and last pixel whose centre lies in [low, high], within the image; none if first > last.
-struct PixelInterval {
-  int first, last;
-};
-PixelInterval pixels_between(float low, float high, int n_pixels) {
-  const float limit = static_cast<float>(n_pixels);
-  return {static_cast<int>(std::ceil(std::min(std::max(low - 0.5f, 0.0f), limit))),
-          static_cast<int>(std::floor(std::max(std::min(high - 0.5f, limit - 1.0f), -1.0f)))};
+bool is_finite(const float* colour) {
+  return std::fabs(colour[0]) + std::fabs(colour[1]) + std::fabs(colour[2]) < __builtin_inff();
 }
 
-// Calls visit(row, first_column, last_column) for the tiles that the ellipse alpha >= 1/255 reaches.
-template <class Visit>
-void for_each_tile_row(const Record& r, const TileGrid& grid, const Visit& visit) {
-  const PixelInterval x = pixels_between(r.mean_x - r.reach_x, r.mean_x + r.reach_x, grid.width);
-  const PixelInterval y = pixels_between(r.mean_y - r.reach_y, r.mean_y + r.reach_y, grid.height);
-  if (x.first > x.last || y.first > y.last) return;
-  const int column0 = x.first / kTileSide, column1 = x.last / kTileSide;
-  const int row0 = y.first / kTileSide, row1 = y.last / kTileSide;
-  if (column0 == column1 || row0 == row1) {  // the box is exact enough
-    for (int row = row0; row <= row1; ++row) visit(row, column0, column1);
-    return;
-  }
-  // On a line at dy the ellipse spans  (-uy dy +- sqrt(limit - (vy dy)^2)) / ux.
-  const float limit = r.log2_opacity - (kLog2AlphaMin - kExponentSlack);
-  const float inverse_ux = 1.0f / r.ux, slack = 2e-3f;
-  const float dy_of_rightmost = r.best_y_per_x * r.reach_x;
-  const auto root = [&](float dy) { return std::sqrt(std::max(0.0f, limit - r.vy * dy * (r.vy * dy))); };
-  for (int row = row0; row <= row1; ++row) {
-    const float top = static_cast<float>(row * kTileSide) + 0.5f - r.mean_y;
-    const float low = std::max(top, -r.reach_y), high = std::min(top + (kTileSide - 1), r.reach_y);
-    const float dy_right = std::min(std::max(dy_of_rightmost, low), high);
-    const float dy_left = std::min(std::max(-dy_of_rightmost, low), high);
-    const float right = (root(dy_right) - r.uy * dy_right) * inverse_ux + slack;
-    const float left = (-root(dy_left) - r.uy * dy_left) * inverse_ux - slack;
-    const PixelInterval span = pixels_between(r.mean_x + left, r.mean_x + right, grid.width);
-    const int first = std::max(x.first, span.first), last = std::min(x.last, span.last);
-    if (first <= last) visit(row, first / kTileSide, last / kTileSide);
-  }
-}
-
-// Notes the tiles of one splat in part.where and counts them in part.cursor.
-void note_tiles(const Frame& frame, const Record& r, SlabPart& part) {
-  const TileGrid& grid = frame.grid;
-  size_t n = static_cast<size_t>(part.n_entries);
-  for_each_tile_row(r, grid, [&](int row, int column0, int column1) {
-    uint32_t* where = part.where.grow(n, n + static_cast<size_t>(column1 - column0 + 1));
-    for (int tile = row * grid.columns + column0; tile <= row * grid.columns + column1; ++tile) {
-      if (frame.state[static_cast<size_t>(tile)] == TileState::finished) continue;
-      where[n++] = static_cast<uint32_t>(tile);
-      ++part.cursor[static_cast<size_t>(tile)];
+// Adds the tiles that the ellipse alpha >= 1/255 reaches to `where`, sixteen tested at a time; returns
+// how many `where` holds then.
+size_t note_tiles(const Record& r, const Sixteen& s, int k, int columns, I16 tile_of_lane, size_t n,
+                  Buffer<uint32_t>& where) {
+  const F16 x = load(kLaneX) * splat(static_cast<float>(kTileSide)) + splat(0.5f - r.mean_x);
+  const F16 y = load(kLaneY) * splat(static_cast<float>(kTileSide)) + splat(0.5f - r.mean_y);
+  for (int row = s.row0[k]; row <= s.row1[k]; row += 4)
+    for (int column = s.column0[k]; column <= s.column1[k]; column += 4) {
+      const F16 dx = x + splat(static_cast<float>(column * kTileSide));
+      const F16 dy = y + splat(static_cast<float>(row * kTileSide));
+      const unsigned in_columns = 0x1111u * ((1u << std::min(4, s.column1[k] - column + 1)) - 1u);
+      const unsigned in_rows = (1u << 4 * std::min(4, s.row1[k] - row + 1)) - 1u;
+      const M16 reached = squares_in_reach(r, dx, dy, kTileSide - 1) & mask_of_bits(in_columns & in_rows);
+      int32_t* end = reinterpret_cast<int32_t*>(where.grow(n, n + kLanes) + n);
+      compress_store(end, reached, tile_of_lane + splat(row * columns + column));
+      n += static_cast<size_t>(__builtin_popcount(bits(reached)));
     }
-  });
-  part.n_entries = static_cast<int64_t>(n);
+  return n;
+}
+
+// Takes the finished tiles out of where[begin, end); returns the new end.
+size_t drop_finished(const Frame& frame, uint32_t* where, size_t begin, size_t end) {
+  size_t kept = begin;
+  for (size_t i = begin; i < end; ++i) {
+    where[kept] = where[i];
+    kept += frame.state[where[i]] != TileState::finished;
+  }
+  return kept;
 }
 
 void make_part(const Frame& frame, const Splats& splats, Slab& slab, SlabPart& part) {
-  const size_t tiles = static_cast<size_t>(frame.grid.tiles());
-  std::memset(part.cursor.reserve(tiles), 0, tiles * sizeof(uint32_t));
   uint32_t* first = part.first.reserve(static_cast<size_t>(part.count) + 1);
   const DepthKey* order = part.order.data();
   Record* records = slab.records.data() + part.rank_begin;
-  part.n_entries = 0;
+  alignas(64) int32_t tile_of_lane[16];
+  for (int i = 0; i < 16; ++i) tile_of_lane[i] = (i >> 2) * frame.grid.columns + (i & 3);
+  size_t n_entries = 0;
   Sixteen sixteen = {};
   for (int64_t i = 0; i < part.count; i += kLanes) {
     const int n = static_cast<int>(std::min<int64_t>(kLanes, part.count - i));
     const int64_t ahead = std::min<int64_t>(i + 2 * kLanes, part.count);
     for (int64_t k = i + kLanes; k < ahead; ++k) prefetch(splats, order[k].splat);
     gather_splats(splats, order + i, n, sixteen);
-    derive(sixteen);
+    derive(sixteen, frame.grid);
     for (int k = 0; k < n; ++k) {
-      first[i + k] = static_cast<uint32_t>(part.n_entries);
-      const DepthKey& item = order[i + k];
-      if (write_record(sixteen, k, splats.colours + 3 * static_cast<int64_t>(item.splat), item.key, records[i + k]))
-        note_tiles(frame, records[i + k], part);
-      // Places in a slab are 32-bit. A slab holds some hundred entries per tile, far from this limit
-      // unless tens of thousands of splats each cover a picture of hundreds of megapixels.
-      if (part.n_entries > INT32_MAX)
-        throw std::length_error("too many splats cover the whole picture: draw it in parts");
+      const float* colour = splats.colours + 3 * static_cast<int64_t>(order[i + k].splat);
+      Record& record = records[i + k];
+      write_record(sixteen, k, colour, order[i + k].key, record);
+      const size_t begin = n_entries;
+      first[i + k] = static_cast<uint32_t>(begin);
+      if (!is_finite(colour)) continue;
+      n_entries = note_tiles(record, sixteen, k, frame.grid.columns, load(tile_of_lane), begin, part.where);
+      if (frame.n_slabs > 1) n_entries = drop_finished(frame, part.where.data(), begin, n_entries);
     }
+    // Places in a slab are 32-bit. A slab holds some hundred entries per tile, far from this limit
+    // unless thousands of splats each cover a picture of hundreds of megapixels.
+    if (n_entries > INT32_MAX) throw std::length_error(kTooManyEntries);
   }
-  first[part.count] = static_cast<uint32_t>(part.n_entries);
+  first[part.count] = static_cast<uint32_t>(n_entries);
+  part.n_entries = static_cast<int64_t>(n_entries);
+}
+
+void count_per_tile(const TileGrid& grid, SlabPart& part) {
+  const size_t tiles = static_cast<size_t>(grid.tiles());
+  uint32_t* cursor = part.cursor.reserve(tiles);
+  std::memset(cursor, 0, tiles * sizeof(uint32_t));
+  for (size_t i = 0; i < static_cast<size_t>(part.n_entries); ++i) ++cursor[part.where[i]];
 }
 
 }  // namespace
 
 void make_records(const Frame& frame, const Splats& splats, Slab& slab) {
   slab.records.reserve(static_cast<size_t>(slab.count));
-  parallel_for(slab.n_parts, [&](int64_t p) { make_part(frame, splats, slab, *slab.parts[static_cast<size_t>(p)]); });
+  parallel_for(slab.n_parts, [&](int64_t p) {
+    SlabPart& part = *slab.parts[static_cast<size_t>(p)];
+    make_part(frame, splats, slab, part);
+    count_per_tile(frame.grid, part);
+  });
 }
 
 void scatter_entries(const TileGrid& grid, Slab& slab) {
   const size_t tiles = static_cast<size_t>(grid.tiles());
   slab.n_entries = 0;
   for (int p = 0; p < slab.n_parts; ++p) slab.n_entries += static_cast<uint64_t>(slab.parts[static_cast<size_t>(p)]->n_entries);
-  if (slab.n_entries > UINT32_MAX) throw std::length_error("too many splats cover the whole picture: draw it in parts");
+  if (slab.n_entries > UINT32_MAX) throw std::length_error(kTooManyEntries);
   slab.entries.reserve(slab.n_entries), slab.touched.reserve(slab.n_entries), slab.visited.reserve(tiles);
   // Within a tile the parts follow each other, as they do in depth.
   uint32_t* tile_begin = slab.tile_begin.reserve(tiles + 1);

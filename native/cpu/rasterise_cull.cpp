@@ -1,27 +1,11 @@
 // Which splats can reach a pixel centre, and how many tiles their boxes hold.
-#include "frame.h"
-#include "simd.h"
 #include "threads.h"
+#include "tile.h"
 
 namespace vdgs::raster {
 namespace {
 
 constexpr float kInfinity = __builtin_inff();
-
-// First and last tile of the pixels whose centres lie within `reach` of `mean`, along one axis.
-struct TileInterval {
-  F16 first, last;
-  M16 hit;
-};
-
-VDGS_INLINE TileInterval tile_interval(F16 mean, F16 reach, int pixels) {
-  const F16 centre = mean - splat(0.5f);
-  const F16 low = splat(0.0f) - floor(reach - centre);  // ceil(centre - reach)
-  const F16 first = max(low, splat(0.0f));
-  const F16 last = min(floor(centre + reach), splat(static_cast<float>(pixels - 1)));
-  const F16 per_tile = splat(1.0f / kTileSide);
-  return {floor(first * per_tile), floor(last * per_tile), le(first, last)};
-}
 
 VDGS_INLINE I16 pack(F16 first, F16 last) { return to_int(first) | shift_left<16>(to_int(last)); }
 

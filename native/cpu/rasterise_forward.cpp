@@ -29,7 +29,7 @@ void prepare_batch(const Record* records, const uint32_t* entries, int n, int ah
     if (j + 12 < ahead) __builtin_prefetch(records + entries[j + 12]);
     const Record& r = records[entries[j]];
     const F16 dx = origins.x - splat(r.mean_x), dy = origins.y - splat(r.mean_y);
-    batch.in_reach[j] = static_cast<uint16_t>(blocks_in_reach(r, dx, dy));
+    batch.in_reach[j] = static_cast<uint16_t>(bits(squares_in_reach(r, dx, dy, 3.0f)));
     make_falloff(r, dx, dy, batch.falloff[j]);
     batch.paint[j] = {{r.colour[0], r.colour[1], r.colour[2]}, r.depth};
     batch.log2_opacity[j] = r.log2_opacity;
@@ -54,7 +54,7 @@ VDGS_INLINE uint64_t blend_block(const Batch& batch, uint64_t chosen, int block,
     const M16 reached = reaches(exponent) & live;
     F16 alpha = zero_unless(reached, min(exp2_bounded(exponent), splat(kAlphaMax)));
     F16 t_next = fnma(alpha, t, t);
-    if (none(reached)) touched &= ~(uint64_t{1} << j);
+    touched ^= static_cast<uint64_t>(none(reached)) << j;  // no branch: it would be hard to predict
     const M16 finishing = lt(t_next, splat(kTransmittanceMin));
     if (__builtin_expect(any(finishing), 0)) {
       // These pixels are finished before this entry: it does not contribute to them.

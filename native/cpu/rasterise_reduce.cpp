@@ -1,5 +1,6 @@
 // Gradients of the splats from the sums of their entries, added in a fixed order.
 #include "frame.h"
+#include "simd.h"
 #include "sums.h"
 #include "threads.h"
 
@@ -36,26 +37,36 @@ void write_gradients(const Record& r, const float* sum, int64_t i, const SplatGr
   if (out.depths) out.depths[i] = sum[kSumDepth];
 }
 
+void prefetch_for_writing(const SplatGradients& out, int64_t i) {
+  __builtin_prefetch(out.means + 2 * i, 1);
+  __builtin_prefetch(out.conics + 3 * i, 1);
+  __builtin_prefetch(out.colours + 3 * i, 1);
+  __builtin_prefetch(out.opacities + i, 1);
+}
+
 template <bool with_depth>
 void reduce_part(const Slab& slab, const SlabPart& part, const SplatGradients& out) {
   constexpr int kStride = n_sums(with_depth);
+  constexpr uint32_t kEntriesAhead = 24;
+  constexpr int64_t kSplatsAhead = 8;
   const uint32_t *first = part.first.data(), *where = part.where.data();
-  constexpr uint32_t kAhead = 24;
   const uint32_t n_entries = static_cast<uint32_t>(part.n_entries);
+  const float* sums = slab.sums.data();
   for (int64_t i = 0; i < part.count; ++i) {
-    float sum[kStride] = {};
-    bool drawn = false;
+    if (i + kSplatsAhead < part.count) prefetch_for_writing(out, part.order[static_cast<size_t>(i + kSplatsAhead)].splat);
+    if (first[i] == first[i + 1]) continue;
+    F16 total = splat(0.0f);  // its first kStride lanes; the others add up what nobody reads
     for (uint32_t k = first[i]; k < first[i + 1]; ++k) {
-      if (k + kAhead < n_entries) {
-        __builtin_prefetch(slab.touched.data() + where[k + kAhead]);
-        __builtin_prefetch(slab.sums.data() + static_cast<size_t>(where[k + kAhead]) * kStride);
+      if (k + kEntriesAhead < n_entries) {
+        const float* later = sums + size_t{where[k + kEntriesAhead]} * kStride;
+        __builtin_prefetch(later);
+        __builtin_prefetch(later + kStride - 1);
       }
-      if (!slab.touched[where[k]]) continue;
-      drawn = true;
-      const float* entry = slab.sums.data() + static_cast<size_t>(where[k]) * kStride;
-      for (int q = 0; q < kStride; ++q) sum[q] += entry[q];
+      total = total + loadu(sums + size_t{where[k]} * kStride);
     }
-    if (drawn) write_gradients(slab.records[static_cast<size_t>(part.rank_begin + i)], sum, part.order[static_cast<size_t>(i)].splat, out);
+    alignas(64) float sum[kLanes];
+    store(sum, total);
+    write_gradients(slab.records[static_cast<size_t>(part.rank_begin + i)], sum, part.order[static_cast<size_t>(i)].splat, out);
   }
 }
 

@@ -92,7 +92,7 @@ void sort(SlabPart& part) {
 }  // namespace
 
 DepthSample sample_depths(const Candidates& all) {
-  const int64_t stride = std::max<int64_t>(1, all.count / 4096);
+  const int64_t stride = std::max<int64_t>(16, all.count / 4096);
   std::vector<std::pair<float, double>> sample;
   int64_t next = 0, before = 0;  // counted over all candidates
   for (size_t chunk = 0; chunk < all.chunk_count.size(); ++chunk) {

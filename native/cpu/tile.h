@@ -21,6 +21,20 @@ struct BlockOrigins {
         y(load(kLaneY) * splat(4.0f) + splat(static_cast<float>(tile / grid.columns * kTileSide) + 0.5f)) {}
 };
 
+// First and last tile of the pixels whose centres lie within `reach` of `mean`, along one axis.
+struct TileInterval {
+  F16 first, last;
+  M16 hit;  // there is such a pixel
+};
+VDGS_INLINE TileInterval tile_interval(F16 mean, F16 reach, int n_pixels) {
+  const F16 centre = mean - splat(0.5f);
+  const F16 low = splat(0.0f) - floor(reach - centre);  // ceil(centre - reach)
+  const F16 first = max(low, splat(0.0f));
+  const F16 last = min(floor(centre + reach), splat(static_cast<float>(n_pixels - 1)));
+  const F16 per_tile = splat(1.0f / kTileSide);
+  return {floor(first * per_tile), floor(last * per_tile), le(first, last)};
+}
+
 // u and v of a record (see frame.h) at the first pixel of each block, and from there to each pixel.
 struct alignas(64) Falloff {
   float u_block[16], v_block[16], u_pixel[16], v_pixel[16];
@@ -34,11 +48,12 @@ VDGS_INLINE void make_falloff(const Record& r, F16 dx, F16 dy, Falloff& out) {
   store(out.v_pixel, vy * load(kLaneY));
 }
 
-// The blocks that a splat may reach: those where the largest exponent over the block's rectangle
-// suffices. A concave function takes it on the edge that faces its centre, or inside.
-VDGS_INLINE unsigned blocks_in_reach(const Record& r, F16 dx, F16 dy) {
-  const F16 zero = splat(0.0f), side = splat(3.0f);
-  const F16 dx_end = dx + side, dy_end = dy + side;
+// Which of sixteen squares a splat may reach: those where the largest exponent over the pixel centres'
+// rectangle suffices. dx, dy lead from the mean to the first centre of each, `side` from there to the
+// last. A concave function is largest on the edge that faces its centre, or inside.
+VDGS_INLINE M16 squares_in_reach(const Record& r, F16 dx, F16 dy, float side) {
+  const F16 zero = splat(0.0f);
+  const F16 dx_end = dx + splat(side), dy_end = dy + splat(side);
   const F16 x_near = min(max(zero, dx), dx_end), y_near = min(max(zero, dy), dy_end);
   const F16 y_best = min(max(splat(r.best_y_per_x) * x_near, dy), dy_end);
   const F16 x_best = min(max(splat(r.best_x_per_y) * y_near, dx), dx_end);
@@ -46,7 +61,7 @@ VDGS_INLINE unsigned blocks_in_reach(const Record& r, F16 dx, F16 dy) {
   const F16 u1 = fma(ux, x_near, uy * y_best), v1 = vy * y_best;
   const F16 u2 = fma(ux, x_best, uy * y_near), v2 = vy * y_near;
   const F16 loss = min(fma(u1, u1, v1 * v1), fma(u2, u2, v2 * v2));
-  return bits(le(loss, splat(r.log2_opacity - (kLog2AlphaMin - kExponentSlack))));
+  return le(loss, splat(r.log2_opacity - (kLog2AlphaMin - kExponentSlack)));
 }
 
 // log2 of alpha before the clamp, for the pixels of a block, and u, v there.

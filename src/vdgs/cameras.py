@@ -59,7 +59,13 @@ class Camera:
         """The same view on an image of another size."""
         sx, sy = width / self.width, height / self.height
         return replace(
-            self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+            self,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+            width=width,
+            height=height,
         )
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -14,23 +12,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from vdgs import files
 from vdgs.errors import VdgsError
 
 _LONGEST_NAME = 120
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write to a temporary name beside `path`, then rename: a reader sees the old file or the new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        temporary.write_bytes(content)
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise VdgsError(
-            f"{path} cannot be written: {error.strerror}. Free space or choose another folder."
-        ) from error
 
 
 def write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
@@ -38,13 +23,12 @@ def write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
     done, content = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
     if not done:
         raise VdgsError(f"{path} cannot be encoded as PNG from an image of size {list(picture.shape)}.")
-    write_atomically(path, content.tobytes())
+    files.write_bytes(path, content.tobytes())
 
 
 def write_json(path: Path, value: Any) -> None:
     """Strict JSON, atomically: what is not a finite number becomes null."""
-    text = json.dumps(jsonable(value), indent=2, ensure_ascii=False, allow_nan=False)
-    write_atomically(path, (text + "\n").encode())
+    files.write_json(path, jsonable(value))
 
 
 def jsonable(value: Any) -> Any:

@@ -1,6 +1,6 @@
 """Constants of the image formation model, shared by every implementation.
 
-They are repeated in native/math.h; a test holds the two against each other.
+They are repeated in native/gaussian_math.h; a test holds the two against each other.
 """
 
 #: A splat contributes to a pixel where its alpha is at least this.
@@ -11,3 +11,5 @@ ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
 #: Added to the diagonal of every projected covariance, in square pixels.
 DILATION_PX2 = 0.3
+#: The Jacobian of the projection is taken no further out than this many half-angles of the frustum.
+FRUSTUM_MARGIN = 1.3

@@ -1,1 +1,27 @@
 """C++ implementations for the CPU, chosen at run time by instruction set."""
+
+from vdgs.kernels.native.adam import adam_rows
+from vdgs.kernels.native.cells import cell_centres, cell_keys, contains, group_cells, group_max, morton_order
+from vdgs.kernels.native.cull import cull
+from vdgs.kernels.native.decode import decode
+from vdgs.kernels.native.loss import photometric_loss
+from vdgs.kernels.native.project import project
+from vdgs.kernels.native.rasterise import rasterise
+from vdgs.kernels.native.views import count_views, mark_views
+
+__all__ = [
+    "adam_rows",
+    "cell_centres",
+    "cell_keys",
+    "contains",
+    "count_views",
+    "cull",
+    "decode",
+    "group_cells",
+    "group_max",
+    "mark_views",
+    "morton_order",
+    "photometric_loss",
+    "project",
+    "rasterise",
+]

@@ -1,0 +1,55 @@
+# Two commands matter: `make demo` and `make test`. Both set everything up in .venv first.
+
+PYTHON ?= python3
+VENV   ?= .venv
+DEMO   ?= demo
+BIN     = $(VENV)/bin
+STAMP   = $(VENV)/.installed
+SOURCES = $(wildcard native/*.h native/*.cpp native/cpu/*.h native/cpu/*.cpp) CMakeLists.txt pyproject.toml constraints.txt
+
+# torch's threads block instead of spinning beside the kernels' own.
+export OMP_WAIT_POLICY = PASSIVE
+
+.PHONY: help setup demo test lint types clean
+
+help:
+	@echo "make demo    generate a small town, train on it, measure it (a few minutes, no GPU)"
+	@echo "make test    lint, types and the whole test suite"
+	@echo "make setup   only install into $(VENV)"
+	@echo "make clean   remove $(VENV), build/ and $(DEMO)/"
+
+setup: $(STAMP)
+
+$(BIN)/python:
+	$(PYTHON) -c 'import sys; sys.exit("vdgs needs Python 3.11 or newer, found " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv $(VENV)
+
+# PIP_CONSTRAINT also pins the tools that pip installs only for building.
+$(STAMP): $(BIN)/python $(SOURCES)
+	PIP_CONSTRAINT=constraints.txt $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'
+	@touch $(STAMP)
+
+demo: setup
+	rm -rf $(DEMO)
+	$(BIN)/vdgs synth $(DEMO)/capture
+	$(BIN)/vdgs inspect $(DEMO)/capture --output $(DEMO)/inspect
+	$(BIN)/vdgs coarse $(DEMO)/capture --output $(DEMO)/run --preset laptop --iterations 4000
+	$(BIN)/vdgs eval $(DEMO)/run
+	@echo
+	@echo "the place from above:  $(DEMO)/inspect/coverage.png"
+	@echo "test views:            $(DEMO)/run/evaluation/contact_sheet.png"
+	@echo "metrics:               $(DEMO)/run/evaluation/metrics.json"
+	@echo "model:                 $(DEMO)/run/coarse/model.safetensors"
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: setup
+	$(BIN)/mypy
+
+test: lint types
+	$(BIN)/python -m pytest
+
+clean:
+	rm -rf $(VENV) build $(DEMO)

@@ -1,0 +1,134 @@
+"""Where the time of one whole training step goes: cull, decode, rasterise, loss, backward, Adam, statistics.
+
+    python benchmarks/step.py [--threads 2] [--visible 20000]
+
+A random anchor scene seen from above, in which all anchors are visible, with about half of the opacities positive
+(what a fresh decoder gives). Prints the median of each phase, and the memory that an anchor costs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics as stats
+import time
+from collections.abc import Callable
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import numpy as np
+import psutil
+import torch
+from machine import describe
+
+from vdgs.anchors import TRAINED, Anchors
+from vdgs.cameras import Camera
+from vdgs.config import TrainConfig
+from vdgs.decoder import Decoder
+from vdgs.kernels import native as kernels
+from vdgs.kernels.native.module import set_threads
+from vdgs.optimiser import rates_at
+from vdgs.render import decode_visible, draw, gather_visible
+from vdgs.training import start_state
+
+PHASES = ("cull", "decode", "rasterise", "loss", "backward", "adam", "statistics")
+
+
+def scene(visible: int, width: int, height: int) -> tuple[Anchors, Camera]:
+    """Anchors on a bumpy ground that fills the view, one voxel apart, Gaussians about as large as their spacing."""
+    rng = np.random.default_rng(0)
+    focal, altitude = 1.2 * width, 20.0
+    extent = np.array([width, height]) / focal * altitude
+    ground = rng.uniform(-0.5, 0.5, (visible, 2)) * extent
+    points = np.column_stack([ground, rng.normal(0, 0.2, visible)])
+    points = points[np.lexsort(np.floor(points[:, :2] / (extent / 16)).T)]
+    spacing = float(np.sqrt(extent.prod() / visible))
+    g = torch.Generator().manual_seed(0)
+    anchors = Anchors(
+        positions=torch.from_numpy(points.astype(np.float32)),
+        features=0.5 * torch.randn(visible, 32, generator=g),
+        offsets=0.5 * torch.randn(visible, 10, 3, generator=g),
+        log_scales=torch.full((visible, 6), float(np.log(spacing))),
+    )
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])
+    pose[2, 3] = altitude
+    return anchors, Camera(pose, focal, focal, width / 2, height / 2, width, height)
+
+
+def timed(times: dict[str, list[float]], phase: str, work: Callable[[], Any]) -> Any:
+    begin = time.perf_counter()
+    result = work()
+    times[phase].append(1e3 * (time.perf_counter() - begin))
+    return result
+
+
+def one_step(
+    state: Any, camera: Camera, target: torch.Tensor, step: int, times: dict[str, list[float]]
+) -> tuple[int, int]:
+    """The work of vdgs.training.train_step, phase by phase."""
+    rates = rates_at(TrainConfig().rates, 0.1)
+    visible = timed(times, "cull", lambda: gather_visible(state.anchors, camera))
+    leaves = {name: getattr(visible.anchors, name).requires_grad_(True) for name in TRAINED}
+    splats = timed(
+        times, "decode", lambda: decode_visible(visible.anchors, state.decoder.for_image(0), camera)
+    )
+    splats.means_px.retain_grad()
+    raster = timed(times, "rasterise", lambda: draw(splats, camera, torch.zeros(3)))
+    photometric = timed(times, "loss", lambda: kernels.photometric_loss(raster.image, target, None))
+    timed(times, "backward", lambda: (photometric.loss + 0.01 * splats.volumes.mean()).backward())
+
+    def adam() -> None:
+        gradients = {name: leaf.grad for name, leaf in leaves.items()}
+        state.optimiser.update_anchors(state.anchors, visible.rows, gradients, rates, step)
+        state.optimiser.update_decoder(state.decoder, rates, step)
+
+    timed(times, "adam", adam)
+    timed(times, "statistics", lambda: state.statistics.add_view(
+        visible.rows, splats.source, splats.opacities.detach(), splats.means_px.grad, camera.width, camera.height
+    ))  # fmt: skip
+    return len(visible.rows), len(splats.opacities)
+
+
+def measure(visible: int, width: int, height: int, repeats: int) -> None:
+    process = psutil.Process()
+    before = process.memory_info().rss
+    anchors, camera = scene(visible, width, height)
+    state = start_state(anchors, Decoder.initial(10, False, 0, 1, torch.Generator().manual_seed(0)))
+    target = torch.randint(
+        0, 256, (height, width, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1)
+    )
+    times: dict[str, list[float]] = {phase: [] for phase in PHASES}
+    peak = before
+    for step in range(1, repeats + 4):
+        seen, splats = one_step(state, camera, target, step, times)
+        peak = max(peak, process.memory_info().rss)
+    medians = {phase: stats.median(values[3:]) for phase, values in times.items()}
+    total = stats.median(sum(step) for step in zip(*(values[3:] for values in times.values()), strict=True))
+    parts = "  ".join(f"{phase} {value:.1f}" for phase, value in medians.items())
+    print(
+        f"{width}x{height}  {seen} visible anchors, {splats} splats: {total:.1f} ms a step   ({parts})",
+        flush=True,
+    )
+    print(
+        f"    memory: {(peak - before) / visible:.0f} B an anchor (growth of the process, image buffers included)"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--visible", type=int, default=20_000)
+    parser.add_argument("--repeats", type=int, default=15)
+    arguments = parser.parse_args()
+    set_threads(arguments.threads)
+    torch.set_num_threads(arguments.threads)
+    print(describe())
+    for width, height in ((400, 300), (800, 600)):
+        measure(arguments.visible, width, height, arguments.repeats)
+
+
+if __name__ == "__main__":
+    main()

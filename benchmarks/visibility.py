@@ -1,0 +1,81 @@
+"""Counting views (V_i) of a drone flight: the native kernel beside brute force, in one run.
+
+    OMP_WAIT_POLICY=PASSIVE python benchmarks/visibility.py [--points 1000000] [--cameras 1000] [--threads 2]
+
+Brute force runs on the first few cameras only and is scaled up; both counts of those are compared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+
+import numpy as np
+import torch
+
+from stopwatch import describe
+from vdgs.cameras import Camera
+from vdgs.kernels.native import module
+from vdgs.kernels.native import views as native
+from vdgs.kernels.reference import views as reference
+
+BRUTE_FORCE_CAMERAS = 10
+#: Name, side of the square in metres, tilt of the cameras in degrees.
+FLIGHTS = [("nadir", 2000.0, 0.0), ("oblique", 2000.0, 55.0), ("all see all", 50.0, 0.0)]
+
+
+def flight(count: int, extent_m: float, height_m: float, tilt_deg: float) -> list[Camera]:
+    """Views over a square on a random course, tilted from the vertical in random directions."""
+    generator = np.random.default_rng(0)
+    cameras = []
+    for _ in range(count):
+        heading, tilt = generator.uniform(0, 2 * np.pi), np.deg2rad(tilt_deg)
+        c, s = np.cos(heading), np.sin(heading)
+        turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        c, s = np.cos(tilt), np.sin(tilt)
+        lean = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+        rigid = np.eye(4)
+        rigid[:3, :3] = lean @ np.diag([1.0, -1.0, -1.0]) @ turn
+        rigid[:3, 3] = -rigid[:3, :3] @ [*generator.uniform(0, extent_m, 2), height_m]
+        cameras.append(Camera(rigid, 900.0, 900.0, 600.0, 400.0, 1200, 800))
+    return cameras
+
+
+def scene(n: int, extent_m: float) -> torch.Tensor:
+    """Points of a city in no order: a plane with heights up to 60 m."""
+    generator = np.random.default_rng(1)
+    return torch.from_numpy(generator.uniform([0, 0, 0], [extent_m, extent_m, 60], (n, 3))).float()
+
+
+def main() -> None:
+    """Print one line for each kind of flight."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--points", type=int, default=1_000_000)
+    parser.add_argument("--cameras", type=int, default=1_000)
+    parser.add_argument("--threads", type=int, default=module.threads())
+    arguments = parser.parse_args()
+    module.set_threads(arguments.threads)
+    torch.set_num_threads(arguments.threads)
+    print(describe())
+    print(f"{arguments.points} points x {arguments.cameras} cameras")
+    print(f"{'flight':>22} {'native s':>9} {'brute force s (scaled)':>23} {'mean V':>7} {'differing':>9}")
+    for name, extent_m, tilt_deg in FLIGHTS:
+        points = scene(arguments.points, extent_m)
+        cameras = flight(arguments.cameras, extent_m, 120.0, tilt_deg)
+        start = time.perf_counter()
+        count = native.count_views(points, cameras)
+        seconds = time.perf_counter() - start
+        few = cameras[:BRUTE_FORCE_CAMERAS]
+        start = time.perf_counter()
+        expected = reference.count_views(points, few)
+        brute_force = (time.perf_counter() - start) * len(cameras) / len(few)
+        differing = int((native.count_views(points, few) != expected).sum())
+        print(
+            f"{name:>22} {seconds:9.2f} {brute_force:23.1f} {float(count.float().mean()):7.1f} {differing:9}"
+        )
+    print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB")
+
+
+if __name__ == "__main__":
+    main()

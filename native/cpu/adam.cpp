@@ -1,0 +1,124 @@
+// Adam is bound by memory: one pass over the gradient to see that it is finite, one over everything.
+#include <algorithm>
+#include <atomic>
+#include <cstdint>
+#include <cstring>
+#include <optional>
+
+#include <nanobind/stl/optional.h>
+
+#include "bindings.h"
+#include "simd.h"
+#include "threads.h"
+
+namespace vdgs {
+namespace {
+
+constexpr size_t kTaskFloats = 1 << 15;
+
+// parameter -= rate * m / (sqrt(v) * root + epsilon): both bias corrections are in rate and root.
+struct AdamStep {
+  double rate, root, beta1, beta2, epsilon;
+};
+
+struct Factors {
+  F16 rate, root, beta1, beta2, rest1, rest2, epsilon;
+  // 1 - beta is taken in float64: in float32 1 - 0.999 is off by 5e-5.
+  explicit Factors(const AdamStep& step)
+      : rate(rounded(step.rate)), root(rounded(step.root)), beta1(rounded(step.beta1)), beta2(rounded(step.beta2)),
+        rest1(rounded(1.0 - step.beta1)), rest2(rounded(1.0 - step.beta2)), epsilon(rounded(step.epsilon)) {}
+  static F16 rounded(double value) { return splat(static_cast<float>(value)); }
+};
+
+VDGS_INLINE void update(F16& parameter, F16& first, F16& second, F16 gradient, const Factors& f) {
+  first = fma(f.beta1, first, f.rest1 * gradient);
+  second = fma(f.beta2, second, f.rest2 * (gradient * gradient));
+  parameter = parameter - f.rate * first / fma(sqrt(second), f.root, f.epsilon);
+}
+
+// A stretch of floats that lie side by side in all four arrays.
+void update_stretch(float* parameter, float* first, float* second, const float* gradient, size_t size,
+                    const Factors& factors) {
+  size_t i = 0;
+  for (; i + kLanes <= size; i += kLanes) {
+    F16 p = loadu(parameter + i), m = loadu(first + i), v = loadu(second + i);
+    update(p, m, v, loadu(gradient + i), factors);
+    storeu(parameter + i, p), storeu(first + i, m), storeu(second + i, v);
+  }
+  if (i == size) return;
+  const int rest = static_cast<int>(size - i);
+  F16 p = load_first(parameter + i, rest), m = load_first(first + i, rest), v = load_first(second + i, rest);
+  update(p, m, v, load_first(gradient + i, rest), factors);
+  store_first(parameter + i, rest, p), store_first(first + i, rest, m), store_first(second + i, rest, v);
+}
+
+// Rows [begin, end) of the list; neighbours in the list that are neighbours in memory go together.
+void update_rows(float* parameter, const int64_t* rows, size_t begin, size_t end, size_t width,
+                 const float* gradient, float* first, float* second, const Factors& factors) {
+  while (begin < end) {
+    size_t stop = begin + 1;
+    if (rows) {
+      while (stop < end && rows[stop] == rows[stop - 1] + 1) ++stop;
+    } else {
+      stop = end;
+    }
+    const size_t at = (rows ? static_cast<size_t>(rows[begin]) : begin) * width;
+    update_stretch(parameter + at, first + at, second + at, gradient + begin * width, (stop - begin) * width, factors);
+    begin = stop;
+  }
+}
+
+bool stretch_finite(const float* values, size_t size) {
+  uint32_t bad = 0;
+  for (size_t i = 0; i < size; ++i) {
+    uint32_t bits;
+    std::memcpy(&bits, values + i, sizeof bits);
+    bad |= (bits & 0x7f800000u) == 0x7f800000u;
+  }
+  return bad == 0;
+}
+
+int64_t tasks(size_t size, size_t each) { return static_cast<int64_t>((size + each - 1) / each); }
+
+bool all_finite(const float* values, size_t size) {
+  std::atomic<bool> finite{true};
+  parallel_for(tasks(size, kTaskFloats), [&](int64_t task) {
+    const size_t begin = static_cast<size_t>(task) * kTaskFloats, end = std::min(size, begin + kTaskFloats);
+    if (!stretch_finite(values + begin, end - begin)) finite.store(false, std::memory_order_relaxed);
+  });
+  return finite.load();
+}
+
+// `count` rows of `width` floats. rows ascend without repetition, or null: row i is row i. The gradient holds
+// `count` packed rows; the other three are addressed by row.
+void adam_rows(float* parameter, const int64_t* rows, size_t count, size_t width, const float* gradient, float* first,
+               float* second, const AdamStep& step) {
+  // A row's lanes may be cut differently by different runs of neighbours, but every lane is computed alike.
+  const Factors factors(step);
+  const size_t each = std::max<size_t>(1, kTaskFloats / std::max<size_t>(1, width));
+  parallel_for(tasks(count, each), [&](int64_t task) {
+    const size_t begin = static_cast<size_t>(task) * each;
+    update_rows(parameter, rows, begin, std::min(count, begin + each), width, gradient, first, second, factors);
+  });
+}
+
+using State = Array<float, nb::ndim<2>>;
+
+bool bound(State parameter, std::optional<Array<const int64_t, nb::ndim<1>>> rows,
+           Array<const float, nb::ndim<2>> gradient, State first, State second, double rate, double root,
+           double beta1, double beta2, double epsilon) {
+  nb::gil_scoped_release release;
+  if (!all_finite(gradient.data(), gradient.size())) return false;
+  adam_rows(parameter.data(), rows ? rows->data() : nullptr, gradient.shape(0), gradient.shape(1), gradient.data(),
+            first.data(), second.data(), {rate, root, beta1, beta2, epsilon});
+  return true;
+}
+
+}  // namespace
+
+VDGS_BIND(adam_rows) {
+  m.def("adam_rows", &bound, nb::arg("parameter"), nb::arg("rows").none(), nb::arg("gradient"), nb::arg("first"),
+        nb::arg("second"), nb::arg("rate"), nb::arg("root"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"));
+}
+
+}  // namespace vdgs

@@ -1,0 +1,107 @@
+// Decoding, as Python sees it.
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+
+#include "bindings.h"
+#include "decode.h"
+
+namespace vdgs {
+namespace {
+
+template <class Scalar>
+using Rows = Array<Scalar>;
+using MaybeRows = std::optional<Array<float>>;
+using MaybeGradient = std::optional<Array<const float>>;
+
+// The arrays of the visible anchors, in the order of AnchorArrays.
+AnchorArrays anchor_arrays(const Rows<const float>& positions, const Rows<const float>& features,
+                           const Rows<const float>& offsets, const Rows<const float>& log_scales) {
+  return {positions.data(), features.data(), offsets.data(), log_scales.data(),
+          static_cast<int64_t>(positions.shape(0)), static_cast<int>(offsets.shape(1))};
+}
+
+// Twelve arrays, head by head, as three heads; throws where their shapes do not fit k.
+template <class Scalar>
+void heads_of(const nb::list& arrays, int k, Head<Scalar> (&heads)[kHeads]) {
+  if (nb::len(arrays) != 12) throw nb::value_error("a decoder has twelve arrays");
+  for (size_t h = 0; h < kHeads; ++h) {
+    const auto w1 = nb::cast<Array<Scalar, nb::ndim<2>>>(arrays[4 * h]);
+    const auto b1 = nb::cast<Array<Scalar, nb::ndim<1>>>(arrays[4 * h + 1]);
+    const auto w2 = nb::cast<Array<Scalar, nb::ndim<2>>>(arrays[4 * h + 2]);
+    const auto b2 = nb::cast<Array<Scalar, nb::ndim<1>>>(arrays[4 * h + 3]);
+    const size_t inputs = w1.shape(1), outputs = static_cast<size_t>(kOutputs[h] * k);
+    const bool fits = w1.shape(0) == kHidden && (inputs == kFeatures + 3 || inputs == kFeatures + 4) &&
+                      b1.shape(0) == kHidden && w2.shape(0) == outputs && w2.shape(1) == kHidden &&
+                      b2.shape(0) == outputs;
+    if (!fits) throw nb::value_error("a head must be [32, 35 or 36], [32], [outputs, 32], [outputs]");
+    heads[h] = {w1.data(), b1.data(), w2.data(), b2.data(), static_cast<int>(inputs)};
+  }
+}
+
+// The weights of twelve arrays in one piece.
+Floats pack_weights(const nb::list& arrays, WeightLayout layout) {
+  Head<const float> heads[kHeads];
+  heads_of(arrays, layout.k, heads);
+  Floats packed = make_floats(layout.size());
+  std::fill_n(packed.get(), layout.size(), 0.0f);
+  for_each_weight(layout, heads, [&](float weight, int place) { packed[place] = weight; });
+  return packed;
+}
+
+DecodedView decode_forward(const Rows<const float>& positions, const Rows<const float>& features,
+                           const Rows<const float>& offsets, const Rows<const float>& log_scales,
+                           const nb::list& weights, const Rows<const float>& camera) {
+  const AnchorArrays anchors = anchor_arrays(positions, features, offsets, log_scales);
+  const WeightLayout layout{anchors.k};
+  const Floats packed = pack_weights(weights, layout);
+  const Camera view = unpack_camera(camera.data());
+  const nb::gil_scoped_release unlocked;
+  return decode(anchors, layout, packed.get(), view);
+}
+
+void write_view(const DecodedView& view, const Rows<float>& means_px, const Rows<float>& conics,
+                const Rows<float>& depths, const Rows<float>& colours, const Rows<float>& opacities,
+                const Rows<float>& volumes, const Rows<int32_t>& source) {
+  const SplatArrays out = {means_px.data(), conics.data(), depths.data(), colours.data(),
+                           opacities.data(), volumes.data(), source.data()};
+  const nb::gil_scoped_release unlocked;
+  write_splats(view, out);
+}
+
+const float* data(const MaybeGradient& array) { return array ? array->data() : nullptr; }
+float* data(const MaybeRows& array) { return array ? array->data() : nullptr; }
+
+void backward(const Rows<const float>& positions, const Rows<const float>& features, const Rows<const float>& offsets,
+              const Rows<const float>& log_scales, const nb::list& weights, const Rows<const float>& camera,
+              const Rows<const int32_t>& source, const Rows<const float>& colours, const Rows<const float>& opacities,
+              const std::array<MaybeGradient, 6>& gradients, const std::array<MaybeRows, 3>& out,
+              const std::optional<nb::list>& weights_out) {
+  const AnchorArrays anchors = anchor_arrays(positions, features, offsets, log_scales);
+  const WeightLayout layout{anchors.k};
+  const Floats packed = pack_weights(weights, layout);
+  const Floats summed = weights_out ? make_floats(layout.size()) : nullptr;
+  const Camera view = unpack_camera(camera.data());
+  const SplatGradients in = {data(gradients[0]), data(gradients[1]), data(gradients[2]), data(gradients[3]),
+                             data(gradients[4]), data(gradients[5]), colours.data(), opacities.data(), source.data(),
+                             static_cast<int64_t>(source.shape(0))};
+  {
+    const nb::gil_scoped_release unlocked;
+    decode_backward(anchors, layout, packed.get(), view, in, {data(out[0]), data(out[1]), data(out[2]), summed.get()});
+  }
+  if (!weights_out) return;
+  Head<float> heads[kHeads];
+  heads_of(*weights_out, layout.k, heads);
+  for_each_weight(layout, heads, [&](float& gradient, int place) { gradient = summed[place]; });
+}
+
+}  // namespace
+}  // namespace vdgs
+
+VDGS_BIND(decode) {
+  using namespace vdgs;
+  nb::class_<DecodedView>(m, "DecodedView").def_ro("count", &DecodedView::count).def("write", &write_view);
+  m.def("decode", &decode_forward);
+  m.def("decode_backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
+        nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none());
+  m.attr("max_offsets") = kMaxOffsets;
+}

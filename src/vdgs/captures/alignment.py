@@ -1,0 +1,96 @@
+"""Similarities between two sets of matched points, least squares and robust."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+#: Points whose second principal spread is below this share of the first lie on one line.
+COLLINEAR = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """target = scale * rotation @ source + translation."""
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        return self.scale * points @ self.rotation.T + self.translation
+
+
+def is_collinear(points: np.ndarray) -> bool:
+    """Whether the points [n, 3] fix no rotation: fewer than three, or all near one line."""
+    if len(points) < 3:
+        return True
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[1] <= COLLINEAR * spread[0])
+
+
+def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
+    """Least-squares similarity of matched points [n, 3] (Umeyama 1991, eqs. 40-43)."""
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    centred_source, centred_target = source - source_mean, target - target_mean
+    left, singular, right = np.linalg.svd(centred_target.T @ centred_source)
+    sign = np.ones(3)
+    sign[2] = np.sign(np.linalg.det(left) * np.linalg.det(right)) or 1.0
+    rotation = (left * sign) @ right
+    scale = float((singular * sign).sum() / (centred_source**2).sum())
+    return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+
+def fit_similarity_robust(
+    source: np.ndarray, target: np.ndarray, rounds: int = 500
+) -> tuple[Similarity, np.ndarray]:
+    """Least median of squares over seeded triples, then least squares over the inliers.
+
+    Inliers lie within 3 robust standard deviations (1.4826 * median residual) of the best triple's fit,
+    refined twice. Returns the similarity and the inliers [n] bool. The draws are seeded by a constant, so
+    that the same capture always gets the same frame.
+    """
+    generator = np.random.default_rng(0)
+    best = fit_similarity(source, target)
+    best_median = np.median(_residuals(best, source, target))
+    for _ in range(rounds):
+        triple = generator.choice(len(source), size=3, replace=False)
+        if is_collinear(source[triple]):
+            continue
+        candidate = fit_similarity(source[triple], target[triple])
+        median = np.median(_residuals(candidate, source, target))
+        if median < best_median:
+            best, best_median = candidate, median
+    inliers = np.ones(len(source), bool)
+    for _ in range(3):
+        residuals = _residuals(best, source, target)
+        # The floor keeps exact data (median residual 0) from losing points to rounding.
+        floor = 1e-9 * (1 + np.abs(target).max())
+        inliers = residuals <= max(3 * 1.4826 * float(np.median(residuals)), floor)
+        if is_collinear(source[inliers]):
+            return fit_similarity(source, target), np.ones(len(source), bool)
+        best = fit_similarity(source[inliers], target[inliers])
+    return best, inliers
+
+
+def _residuals(similarity: Similarity, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(similarity.apply(source) - target, axis=1)
+
+
+def geometric_median(points: np.ndarray, most: int = 20_000) -> np.ndarray:
+    """The place [3] with the least summed distance to the points [n, 3] (Weiszfeld's iteration).
+
+    Unlike a median per axis it turns and scales with the points, and unlike the mean a few strays do not
+    move it. More than `most` points are thinned evenly.
+    """
+    sample = points[:: max(1, -(-len(points) // most))]
+    centre = np.median(sample, axis=0)
+    for _ in range(200):
+        distance = np.linalg.norm(sample - centre, axis=1)
+        weight = 1 / np.maximum(distance, 1e-12 * (distance.max() or 1.0))
+        moved = weight @ sample / weight.sum()
+        if np.linalg.norm(moved - centre) <= 1e-12 * (distance.max() or 1.0):
+            return moved
+        centre = moved
+    return centre

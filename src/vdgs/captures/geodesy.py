@@ -1,0 +1,72 @@
+"""WGS 84: geodetic coordinates, Earth-centred coordinates and local east-north-up frames, in float64."""
+
+from __future__ import annotations
+
+import numpy as np
+
+#: WGS 84 ellipsoid: semi-major axis in metres and flattening.
+SEMI_MAJOR_M = 6_378_137.0
+FLATTENING = 1 / 298.257223563
+ECCENTRICITY2 = FLATTENING * (2 - FLATTENING)
+
+
+def ecef_from_geodetic(geodetic: np.ndarray) -> np.ndarray:
+    """(latitude deg, longitude deg, altitude m) [n, 3] to Earth-centred, Earth-fixed metres [n, 3]."""
+    latitude, longitude = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
+    altitude = geodetic[:, 2]
+    normal = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY2 * np.sin(latitude) ** 2)
+    horizontal = (normal + altitude) * np.cos(latitude)
+    return np.stack(
+        [
+            horizontal * np.cos(longitude),
+            horizontal * np.sin(longitude),
+            (normal * (1 - ECCENTRICITY2) + altitude) * np.sin(latitude),
+        ],
+        axis=1,
+    )
+
+
+def geodetic_from_ecef(ecef: np.ndarray) -> np.ndarray:
+    """The inverse of `ecef_from_geodetic`, by fixed-point iteration (to a micrometre near the ground)."""
+    x, y, z = ecef.T
+    horizontal = np.hypot(x, y)
+    latitude = np.arctan2(z, horizontal * (1 - ECCENTRICITY2))
+    for _ in range(8):
+        sine = np.sin(latitude)
+        normal = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY2 * sine**2)
+        latitude = np.arctan2(z + ECCENTRICITY2 * normal * sine, horizontal)
+    sine = np.sin(latitude)
+    normal = SEMI_MAJOR_M / np.sqrt(1 - ECCENTRICITY2 * sine**2)
+    # This form of the altitude stays exact at the poles, where horizontal / cos(latitude) does not.
+    altitude = horizontal * np.cos(latitude) + z * sine - normal * (1 - ECCENTRICITY2 * sine**2)
+    return np.stack([np.degrees(latitude), np.degrees(np.arctan2(y, x)), altitude], axis=1)
+
+
+def enu_axes(latitude_deg: float, longitude_deg: float) -> np.ndarray:
+    """Rows: east, north, up as Earth-centred unit vectors, [3, 3]."""
+    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
+    sin_lat, cos_lat, sin_lon, cos_lon = (
+        np.sin(latitude),
+        np.cos(latitude),
+        np.sin(longitude),
+        np.cos(longitude),
+    )
+    return np.array(
+        [
+            [-sin_lon, cos_lon, 0.0],
+            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+            [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+        ]
+    )
+
+
+def enu_from_geodetic(geodetic: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
+    """(lat, lon, alt) [n, 3] to east-north-up metres [n, 3] about `origin` (lat, lon, alt)."""
+    centre = ecef_from_geodetic(np.array([origin]))
+    return (ecef_from_geodetic(geodetic) - centre) @ enu_axes(origin[0], origin[1]).T
+
+
+def geodetic_from_enu(enu: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
+    """The inverse of `enu_from_geodetic`."""
+    centre = ecef_from_geodetic(np.array([origin]))
+    return geodetic_from_ecef(enu @ enu_axes(origin[0], origin[1]) + centre)

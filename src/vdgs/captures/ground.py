@@ -1,0 +1,266 @@
+"""The ground frame: the similarity that turns a capture's own world into one with z up.
+
+Where the up axis and the scale come from, in this order:
+
+1. `--up`: the person says so (no georeference, arbitrary scale).
+2. georef.json: the world already is ENU metres; only the origin may move.
+3. GPS of the photographs: robust similarity from camera centres to ENU.
+4. What the format promises about its world (Mega-NeRF, MatrixCity).
+5. Estimate: the axis of least variance of the camera centres and the sparse points, signed against the mean
+   viewing direction (drones look down; the mean of the cameras' own up axes fails for nadir flights).
+
+All arithmetic is float64. Choice: in a frame that is not georeferenced the origin is the median sparse point,
+so z = 0 is the median height of the ground; where metres are unknown the median camera flies at
+`CAMERA_HEIGHT`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from vdgs.captures.alignment import Similarity, fit_similarity_robust, geometric_median, is_collinear
+from vdgs.captures.capture import GroundFrame
+from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
+from vdgs.captures.georeference import match_gps, read_georef, read_gps
+from vdgs.captures.options import CaptureOptions
+from vdgs.captures.source import KnownWorld, SourceCapture
+from vdgs.errors import CaptureError
+
+#: Median camera height above the ground, in units, where the capture has no metres (choice).
+CAMERA_HEIGHT = 10.0
+#: Georeferenced worlds farther than this from their origin are shifted, so that float32 stays below 0.1 mm.
+FAR_FROM_ORIGIN_M = 1000.0
+#: Below this cosine between up and the mean view the sign of up is taken from the heights instead.
+LEVEL_VIEW = 0.1
+#: A told up axis farther than this from the estimated one is worth a warning.
+SUSPICIOUS_DEG = 30.0
+AXES = {
+    sign + name: factor * np.eye(3)[index]
+    for index, name in enumerate("xyz")
+    for sign, factor in (("", 1.0), ("-", -1.0))
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """What the frame is found from: camera centres, viewing directions and finite points, source world."""
+
+    names: list[str]
+    centres: np.ndarray
+    forwards: np.ndarray
+    points: np.ndarray
+
+
+def find_ground_frame(
+    source: SourceCapture, root: Path, options: CaptureOptions
+) -> tuple[GroundFrame, list[str]]:
+    """The ground frame of a capture, and warnings for people.
+
+    Raises `CaptureError` for georeferences that cannot be used.
+    """
+    scene = _scene(source)
+    warnings: list[str] = []
+    if options.up != "auto":
+        if options.georef or options.gps:
+            raise CaptureError(
+                "--up contradicts --georef and --gps, which fix the up axis themselves; give one."
+            )
+        if (root / "georef.json").is_file():
+            warnings.append("--up is given, so georef.json is not used: the frame is not metric.")
+        rotation = rotation_to_z(AXES[options.up])
+        return _unscaled(scene, rotation, f"up = {options.up} as given", warnings), warnings
+    if options.georef and options.gps:
+        raise CaptureError("--georef and --gps both say where the world is; give one.")
+    georef = options.georef or (root / "georef.json" if (root / "georef.json").is_file() else None)
+    if georef and options.georef is None and options.gps is not None:
+        georef = None  # what was asked for wins over what lies about
+    if georef:
+        frame = _georeferenced(scene, read_georef(georef), f"world is ENU metres ({georef.name})")
+        _compare_up(scene, frame, warnings)
+        return frame, warnings
+    if options.gps:
+        frame_or_none = _from_gps(scene, options.gps, warnings)
+        if frame_or_none is not None:
+            return frame_or_none, warnings
+    if source.world is not None:
+        frame = _promised(scene, source.world, warnings)
+        _compare_up(scene, frame, warnings)
+        return frame, warnings
+    up, how = estimate_up(scene.centres, scene.forwards, scene.points, warnings)
+    return _unscaled(scene, rotation_to_z(up), how, warnings), warnings
+
+
+def _scene(source: SourceCapture) -> _Scene:
+    poses = np.stack([view.camera_from_world for view in source.views])
+    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    points = source.points[np.isfinite(source.points).all(axis=1)]
+    return _Scene([view.name for view in source.views], centres, poses[:, 2, :3], points)
+
+
+# ----------------------------------------------------------------------------------------- georeference
+
+
+def _georeferenced(scene: _Scene, origin: tuple[float, float, float], how: str) -> GroundFrame:
+    """Identity rotation in metres; the origin moves (by whole metres) only where float32 needs it."""
+    middle = np.median(scene.centres, axis=0)
+    shift = np.where(np.abs(middle) > FAR_FROM_ORIGIN_M, -np.round(middle), 0.0)
+    frame = GroundFrame(1.0, np.eye(3), np.zeros(3), True, how, origin)
+    if not shift.any():
+        return frame
+    return _shifted(frame, shift, f"{how}, origin moved by {np.abs(shift).max():.0f} m")
+
+
+def _shifted(frame: GroundFrame, shift: np.ndarray, how: str) -> GroundFrame:
+    """The frame with its origin moved; the axes stay those of the first origin."""
+    assert frame.origin_geo is not None
+    moved = geodetic_from_enu(-shift[None], frame.origin_geo)[0]
+    origin = (float(moved[0]), float(moved[1]), float(moved[2]))
+    return replace(frame, translation=frame.translation + shift, how=how, origin_geo=origin)
+
+
+def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | None:
+    """Similarity from camera centres to ENU, or None (with a warning) where the flight does not fix one."""
+    indices, geodetic = match_gps(scene.names, read_gps(file), file)
+    median = np.median(geodetic, axis=0)
+    origin = (float(median[0]), float(median[1]), float(median[2]))
+    enu = enu_from_geodetic(geodetic, origin)
+    centres = scene.centres[indices]
+    similarity, inliers = Similarity(1.0, np.eye(3), np.zeros(3)), np.ones(len(centres), bool)
+    fixed = not is_collinear(centres)
+    if fixed:
+        similarity, inliers = fit_similarity_robust(centres, enu)
+        fixed = not is_collinear(enu[inliers])
+    if not fixed:
+        warnings.append(
+            f"{file.name}: {len(indices)} photographs with GPS, all along one line (or fewer than three), "
+            "fix no up axis; the frame is estimated from the cameras instead and is not metric."
+        )
+        return None
+    residuals = similarity.apply(centres)[inliers] - enu[inliers]
+    rms = float(np.sqrt((residuals**2).sum(axis=1).mean()))
+    spread = float(np.sqrt((enu - enu.mean(axis=0)).var(axis=0).sum()))
+    if inliers.mean() < 0.5 or rms > 0.25 * spread:
+        warnings.append(
+            f"{file.name}: GPS and camera positions disagree ({inliers.sum()} of {len(indices)} agree, RMS "
+            f"{rms:.3g} m over a flight of {spread:.3g} m); it is ignored and the frame is estimated."
+        )
+        return None
+    if not inliers.all():
+        names = ", ".join(scene.names[i] for i in indices[~inliers][:5])
+        warnings.append(f"{file.name}: {(~inliers).sum()} GPS positions left out as outliers ({names}).")
+    how = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m"
+    frame = GroundFrame(similarity.scale, similarity.rotation, similarity.translation, True, how, origin)
+    frame = _shifted(frame, -_middle(frame.to_ground(scene.points)), how)
+    _compare_up(scene, frame, warnings)
+    return frame
+
+
+def _compare_up(scene: _Scene, frame: GroundFrame, warnings: list[str]) -> None:
+    """Warn where the up axis that was told and the one that the cameras suggest contradict each other."""
+    doubts: list[str] = []
+    up, _ = estimate_up(scene.centres, scene.forwards, scene.points, doubts)
+    angle = float(np.degrees(np.arccos(np.clip(frame.rotation[2] @ up, -1, 1))))
+    if angle > SUSPICIOUS_DEG and not doubts:
+        warnings.append(
+            f"up is {angle:.0f} degrees away from what cameras and points suggest (used: {frame.how}). "
+            "If the scene looks tilted, give --up."
+        )
+
+
+# ---------------------------------------------------------------------------------------------- estimate
+
+
+def estimate_up(
+    centres: np.ndarray, forwards: np.ndarray, points: np.ndarray, warnings: list[str]
+) -> tuple[np.ndarray, str]:
+    """Unit up vector [3] in the source world, and how it was found.
+
+    The axis of least variance of camera centres and sparse points: both covariances are divided by their
+    trace, so that each counts alike, and added; points beyond the 95 % quantile of distance to the median are
+    left out. All of it turns with the world (no per-axis medians). Signed against the mean viewing
+    direction, or towards the cameras where that is level.
+    """
+    covariance = _shape(centres) + _shape(points)
+    values, vectors = np.linalg.eigh(covariance)
+    up = vectors[:, 0]
+    if values[0] > 0.5 * values[1]:
+        warnings.append(
+            "the up axis is uncertain: cameras and points spread about as far up as sideways. "
+            "Look at the figures of `vdgs inspect`; --up x|y|z|-x|-y|-z says it outright."
+        )
+    looking = float(forwards.mean(axis=0) @ up)
+    if abs(looking) >= LEVEL_VIEW:
+        return (-up if looking > 0 else up), "least variance of cameras and points, against the view"
+    above = float(np.median(centres @ up) - np.median(points @ up))
+    warnings.append(
+        "the cameras look level on average; up is taken to be the side of the cameras. --up overrides."
+    )
+    return (-up if above < 0 else up), "least variance of cameras and points, cameras above"
+
+
+def _shape(points: np.ndarray) -> np.ndarray:
+    """Covariance divided by its trace, [3, 3]; zero for a single place."""
+    offset = points - geometric_median(points)
+    distance = np.linalg.norm(offset, axis=1)
+    core = points[distance <= np.quantile(distance, 0.95)]
+    covariance = np.cov(core, rowvar=False, bias=True) if len(core) > 1 else np.zeros((3, 3))
+    trace = np.trace(covariance)
+    return covariance / trace if trace > 0 else np.zeros((3, 3))
+
+
+def rotation_to_z(up: np.ndarray) -> np.ndarray:
+    """The smallest rotation [3, 3] that takes the unit vector `up` to z (half a turn about x for -z)."""
+    x, y, z = up / np.linalg.norm(up)
+    if z < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    a = 1 / (1 + z)
+    return np.array([[1 - a * x * x, -a * x * y, -x], [-a * x * y, 1 - a * y * y, -y], [x, y, z]])
+
+
+def _unscaled(scene: _Scene, rotation: np.ndarray, how: str, warnings: list[str]) -> GroundFrame:
+    """A frame without metres: the median camera flies at `CAMERA_HEIGHT` above the median point."""
+    heights = scene.centres @ rotation[2]
+    height = float(np.median(heights) - np.median(scene.points @ rotation[2]))
+    distance = float(np.median(np.linalg.norm(scene.centres - geometric_median(scene.points), axis=1)))
+    if height <= 0.02 * distance:
+        warnings.append(
+            "the cameras are not above the points; the scale is set by their distance instead. "
+            "If the scene is upside down, give --up."
+        )
+        height = distance
+    if not height > 0:
+        raise CaptureError(
+            "all cameras and points lie in one place; this is no scene. Check the sparse model."
+        )
+    return _centred(scene, rotation, CAMERA_HEIGHT / height, False, f"{how}; median camera height = 10 units")
+
+
+def _promised(scene: _Scene, world: KnownWorld, warnings: list[str]) -> GroundFrame:
+    """The frame that a format promises; its scale is chosen where the format knows no metres."""
+    if world.metric:
+        return _centred(scene, world.rotation, world.scale, True, world.how)
+    return _unscaled(scene, world.rotation, world.how, warnings)
+
+
+def _centred(scene: _Scene, rotation: np.ndarray, scale: float, metric: bool, how: str) -> GroundFrame:
+    middle = _middle(scale * scene.points @ rotation.T)
+    return GroundFrame(scale, rotation, -middle, metric, how)
+
+
+def _middle(points: np.ndarray) -> np.ndarray:
+    """The place [3] that becomes the origin: geometric median across, plain median in height."""
+    return np.array([*geometric_median(points)[:2], np.median(points[:, 2])])
+
+
+def transform_pose(camera_from_world: np.ndarray, frame: GroundFrame) -> np.ndarray:
+    """The pose [4, 4] of the same camera in the ground frame: rotation re-orthonormalised, centre scaled."""
+    rotation, translation = camera_from_world[:3, :3], camera_from_world[:3, 3]
+    left, _, right = np.linalg.svd(rotation @ frame.rotation.T)
+    centre = frame.to_ground((-rotation.T @ translation)[None])[0]
+    pose = np.eye(4)
+    pose[:3, :3] = left @ right
+    pose[:3, 3] = -pose[:3, :3] @ centre
+    return pose

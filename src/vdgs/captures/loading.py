@@ -1,0 +1,297 @@
+"""From a folder to a checked `Capture`: read, match photographs, find the ground frame, split."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from vdgs.cameras import Camera
+from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.captures.colmap import count_images, find_models, read_colmap
+from vdgs.captures.ground import find_ground_frame, transform_pose
+from vdgs.captures.matrixcity import pose_files, read_matrixcity
+from vdgs.captures.mega_nerf import is_mega_nerf, read_mega_nerf
+from vdgs.captures.options import CaptureOptions
+from vdgs.captures.photographs import Names, find_images, find_mask, read_header
+from vdgs.captures.source import SINGLE_FOCAL, Intrinsics, SourceCapture, SourceView, listing
+from vdgs.captures.splits import choose_splits, nearest_to_middle
+from vdgs.captures.transforms import read_transforms
+from vdgs.captures.undistortion import Photograph, undistort
+from vdgs.errors import CaptureError
+
+#: Points farther from the cameras than this many times their spread are strays of the matching.
+FAR_POINT = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Photograph:
+    """A view whose image was found."""
+
+    view: SourceView
+    file: Photograph
+
+
+def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
+    """Read, check and normalise the capture in the folder `path`.
+
+    Raises `CaptureError` naming the file, what is wrong and the remedy, before anything expensive happens.
+    Pixels are not decoded here; `checks.check_images` does that.
+    """
+    options = options or CaptureOptions()
+    root = Path(path)
+    if not root.is_dir():
+        raise CaptureError(f"{root}: no such folder. Give the folder that holds images/ and sparse/.")
+    _check_options(options)
+    source = _read(root, options)
+    warnings = list(source.warnings)
+    source = _without_bad_points(source, warnings)
+    photographs = _find_photographs(root, source, options, warnings)
+    photographs = _undistorted(root, photographs, options, warnings)
+    ground, ground_warnings = find_ground_frame(source, root, options)
+    views = [_view(photo, options, ground) for photo in photographs]
+    points, colours = ground.to_ground(source.points), source.colours
+    if options.max_images is not None and options.max_images < len(views):
+        warnings.append(f"using the {options.max_images} of {len(views)} photographs nearest to the middle.")
+        views = nearest_to_middle(views, options.max_images)
+        seen = np.zeros(len(points), bool)
+        for view in views:
+            seen |= view.camera.sees(points)
+        points, colours = points[seen], colours[seen]
+        if not seen.any():
+            raise CaptureError(
+                f"{root}: the chosen {options.max_images} photographs see no points; use more."
+            )
+    explicit = {photo.view.name: photo.view.split for photo in photographs}
+    views = choose_splits(root, views, explicit, options)
+    return Capture(
+        root=root, source=source.source, images=source.images, views=tuple(views), points=points,
+        point_colours=colours, ground=ground, warnings=(*warnings, *ground_warnings),
+    )  # fmt: skip
+
+
+def _check_options(options: CaptureOptions) -> None:
+    if not (np.isfinite(options.downscale) and options.downscale >= 1):
+        raise CaptureError(f"--downscale {options.downscale}: must be at least 1.")
+    for flag, folder in (("--images", options.images), ("--masks", options.masks)):
+        if folder is not None and (Path(folder).is_absolute() or ".." in Path(folder).parts or not folder):
+            raise CaptureError(f"{flag} {folder}: must be a folder inside the capture, such as images_4.")
+    if options.test_every < 2:
+        raise CaptureError(
+            f"--test-every {options.test_every}: must be at least 2 (1 would leave nothing to train on)."
+        )
+    if options.max_images is not None and options.max_images < 2:
+        raise CaptureError(f"--max-images {options.max_images}: must be at least 2.")
+
+
+# ------------------------------------------------------------------------------------------- reading
+
+
+def _read(root: Path, options: CaptureOptions) -> SourceCapture:
+    """The capture in whichever format the folder is."""
+    if is_mega_nerf(root):
+        return read_mega_nerf(root, options)
+    if pose_files(root):
+        return read_matrixcity(root, options)
+    models = find_models(root)
+    if models:
+        return _read_colmap(root, models, options)
+    if (root / "transforms.json").is_file():
+        return read_transforms(root, options)
+    raise CaptureError(
+        f"{root}: not a capture. Looked for a COLMAP model (sparse/0/cameras.bin and images.bin, or .txt), "
+        "transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json "
+        "(MatrixCity). For photographs alone, run COLMAP first (for example: colmap automatic_reconstructor)."
+    )
+
+
+def _read_colmap(root: Path, models: list[Path], options: CaptureOptions) -> SourceCapture:
+    warnings = []
+    folder = max(models, key=count_images)
+    distinct = [model for model in models if model.resolve() != folder.resolve()]
+    if distinct:
+        sizes = ", ".join(f"{model.relative_to(root)} ({count_images(model)})" for model in models)
+        warnings.append(f"several sparse models: {sizes} images; the biggest is used.")
+    images, image_warnings = image_folder(root, options)
+    model = read_colmap(folder)
+    if not model.views:
+        raise CaptureError(f"{folder}: the model holds no registered images. Run the reconstruction again.")
+    if not len(model.points):
+        raise CaptureError(
+            f"{folder}: the model holds no 3D points, from which the scene starts. Keep points3D.bin beside "
+            "images.bin, or triangulate: colmap point_triangulator."
+        )
+    return SourceCapture(
+        "colmap", images, model.views, model.points, model.colours,
+        image_folders=(root / images,), warnings=(*warnings, *image_warnings),
+    )  # fmt: skip
+
+
+def image_folder(root: Path, options: CaptureOptions) -> tuple[str, list[str]]:
+    """The image folder relative to `root`: the one asked for, else images, else the largest images_N."""
+    if options.images is not None:
+        if not (root / options.images).is_dir():
+            present = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
+            raise CaptureError(
+                f"{root / options.images}: no such folder. Present: {', '.join(present) or 'none'}."
+            )
+        return Path(options.images).as_posix(), []
+    if (root / "images").is_dir():
+        return "images", []
+    shrunk = {
+        int(entry.name.removeprefix("images_")): entry.name
+        for entry in root.glob("images_*")
+        if entry.is_dir() and entry.name.removeprefix("images_").isdigit()
+    }
+    if not shrunk:
+        raise CaptureError(
+            f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there."
+        )
+    name = shrunk[min(shrunk)]
+    return name, [f"no images/ folder; {name} is used instead (--images chooses)."]
+
+
+def _without_bad_points(source: SourceCapture, warnings: list[str]) -> SourceCapture:
+    """Drop points that are not finite or absurdly far from the cameras."""
+    poses = np.stack([view.camera_from_world for view in source.views])
+    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    finite = np.isfinite(source.points).all(axis=1) & (np.abs(source.points) < 1e12).all(axis=1)
+    if not finite.any():
+        raise CaptureError(
+            f"{source.source} model: none of its {len(source.points)} points is a finite number."
+        )
+    middle = np.median(centres, axis=0)
+    distance = np.linalg.norm(np.where(finite[:, None], source.points, middle) - middle, axis=1)
+    spread = max(
+        float(np.quantile(np.linalg.norm(centres - middle, axis=1), 0.9)), float(np.median(distance[finite]))
+    )
+    keep = finite & (distance <= FAR_POINT * spread)
+    if not keep.all():
+        warnings.append(
+            f"{(~finite).sum()} points that are not finite and {(finite & ~keep).sum()} points farther than "
+            f"{FAR_POINT:.0f}x the spread of the cameras were left out of {len(keep)}."
+        )
+    return replace(source, points=source.points[keep], colours=source.colours[keep])
+
+
+# --------------------------------------------------------------------------------------- photographs
+
+
+def _find_photographs(
+    root: Path, source: SourceCapture, options: CaptureOptions, warnings: list[str]
+) -> list[_Photograph]:
+    """Every view with its image file; images without a camera become a warning, the reverse an error."""
+    folder = root / source.images
+    available = Names(find_images(folder)) if folder.is_dir() else Names({})
+    paths: list[Path] = []
+    missing: list[str] = []
+    for view in source.views:
+        if view.image_path is not None:
+            path = view.image_path
+        else:
+            path = folder / (available.find(view.name) or view.name)
+        paths.append(path)
+        if not path.is_file():
+            missing.append(str(path))
+    if missing:
+        raise CaptureError(
+            f"{folder}: {len(missing)} of {len(source.views)} images that have a camera are missing. Copy "
+            f"them there, or choose another folder with --images.{listing(missing)}"
+        )
+    used = {path.resolve() for path in paths}
+    spare = [
+        name
+        for spare_folder in source.image_folders
+        for name, path in find_images(spare_folder).items()
+        if path.resolve() not in used
+    ]
+    if spare:
+        shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
+        warnings.append(f"{len(spare)} images have no camera and are not used ({shown}).")
+    return _fitted(root, source, paths, options)
+
+
+def _fitted(
+    root: Path, source: SourceCapture, paths: list[Path], options: CaptureOptions
+) -> list[_Photograph]:
+    """The views with their images, masks and intrinsics at the images' sizes; collects what does not fit."""
+    photographs, problems = [], []
+    for view, path in zip(source.views, paths, strict=True):
+        mask = view.mask_path or find_mask(root / options.masks, view.name)
+        try:
+            photographs.append(_Photograph(view, Photograph(view.name, path, mask, fit_to_image(view, path))))
+        except CaptureError as error:
+            problems.append(str(error))
+    if len(problems) > 1:
+        raise CaptureError(
+            f"{root / source.images}: {len(problems)} images cannot be used.{listing(problems)}"
+        )
+    if problems:
+        raise CaptureError(problems[0])
+    return photographs
+
+
+def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
+    """The view's intrinsics at the actual size of its image.
+
+    Shrunk folders hold sizes rounded up or down by at most one pixel; anything else contradicts the model.
+    """
+    header, intrinsics = read_header(path), view.intrinsics
+    if (header.width, header.height) == (intrinsics.width, intrinsics.height):
+        return intrinsics
+    low = max((header.width - 1) / intrinsics.width, (header.height - 1) / intrinsics.height)
+    high = min((header.width + 1) / intrinsics.width, (header.height + 1) / intrinsics.height)
+    if low > high:
+        turned = (header.width > header.height) != (intrinsics.width > intrinsics.height)
+        hint = "The image is turned by a quarter (EXIF orientation applied?). " if turned else ""
+        raise CaptureError(
+            f"{path}: is {header.width}x{header.height}, but its camera is "
+            f"{intrinsics.width}x{intrinsics.height}: another shape, so the two do not belong together. "
+            f"{hint}Use the images that the model was made from, or shrink them evenly."
+        )
+    return scaled(intrinsics, header.width, header.height)
+
+
+def scaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
+    """Intrinsics for the same picture at another size; lens distortion parameters do not depend on it."""
+    sx, sy = width / intrinsics.width, height / intrinsics.height
+    (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.principal_point
+    if not intrinsics.distorted:
+        return Intrinsics("PINHOLE", (fx * sx, fy * sy, cx * sx, cy * sy), width, height)
+    head = (fx * (sx + sy) / 2,) if intrinsics.model in SINGLE_FOCAL else (fx * sx, fy * sy)
+    tail = intrinsics.params[len(head) + 2 :]
+    return Intrinsics(intrinsics.model, (*head, cx * sx, cy * sy, *tail), width, height)
+
+
+def _undistorted(
+    root: Path, photographs: list[_Photograph], options: CaptureOptions, warnings: list[str]
+) -> list[_Photograph]:
+    """Pinhole photographs only: undistorts on request, else refuses lens distortion."""
+    bent = [photo for photo in photographs if photo.file.intrinsics.distorted]
+    if not bent:
+        return photographs
+    if not options.undistort:
+        models = sorted({photo.file.intrinsics.model for photo in bent})
+        raise CaptureError(
+            f"{root}: {len(bent)} photographs have a camera with lens distortion ({', '.join(models)}); "
+            "training needs a pinhole. Add --undistort, or run colmap image_undistorter."
+            f"{listing(photo.view.name for photo in bent)}"
+        )
+    folder = options.undistorted_folder or root / "undistorted" / (options.images or "images")
+    straight = undistort(folder, [photo.file for photo in photographs])
+    warnings.append(f"{len(bent)} photographs were undistorted into {folder}.")
+    return [_Photograph(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
+
+
+def _view(photo: _Photograph, options: CaptureOptions, ground: GroundFrame) -> View:
+    intrinsics = photo.file.intrinsics
+    (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.principal_point
+    width, height = intrinsics.width, intrinsics.height
+    pose = transform_pose(photo.view.camera_from_world, ground)
+    camera = Camera(pose, fx, fy, cx, cy, width, height)
+    if options.downscale != 1:
+        camera = camera.resized(
+            max(1, int(width / options.downscale)), max(1, int(height / options.downscale))
+        )
+    return View(photo.view.name, camera, photo.file.path, photo.file.mask, "train")

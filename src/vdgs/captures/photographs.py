@@ -1,0 +1,168 @@
+"""The photographs on disk: finding them, their masks and their sizes, and decoding their pixels.
+
+Pixels are taken as COLMAP takes them: RGB, 8 bits, EXIF orientation not applied.
+"""
+
+from __future__ import annotations
+
+import warnings as python_warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from vdgs.errors import CaptureError
+
+IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
+#: Headers that announce more pixels than this are refused rather than decoded.
+LARGEST_IMAGE_PX = 1_000_000_000
+#: Pillow's modes that we know how to bring to 8-bit RGB.
+KNOWN_MODES = {"RGB", "RGBA", "L", "LA", "P", "1", "I;16", "I;16B", "I;16L", "I"}
+
+
+@dataclass(frozen=True)
+class Header:
+    """What an image file says before its pixels."""
+
+    width: int
+    height: int
+    mode: str
+
+
+@contextmanager
+def pillow_quietly() -> Iterator[None]:
+    """Pillow without its warnings and its limit of 89 megapixels (aerial cameras exceed it; ours is judged
+    below).
+
+    Changes the whole process: enter it in one thread, around the work of others.
+    """
+    with python_warnings.catch_warnings():
+        python_warnings.simplefilter("ignore")
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            yield
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
+
+
+def read_header(path: Path) -> Header:
+    """Size and mode without decoding. Raises `CaptureError` for unreadable, huge or CMYK images."""
+    try:
+        with pillow_quietly(), Image.open(path) as image:
+            header = Header(image.width, image.height, image.mode)
+    except FileNotFoundError:
+        raise CaptureError(f"{path}: no such image.") from None
+    except Exception as error:  # Pillow's parsers raise many kinds on damaged headers
+        raise CaptureError(f"{path}: not an image that can be read ({error}). Copy it again.") from None
+    if header.width * header.height > LARGEST_IMAGE_PX:
+        raise CaptureError(f"{path}: announces {header.width}x{header.height} pixels; the file is damaged.")
+    if header.mode not in KNOWN_MODES:
+        raise CaptureError(f"{path}: has the colour mode {header.mode}; convert it to 8-bit RGB.")
+    return header
+
+
+def find_images(folder: Path) -> dict[str, Path]:
+    """All images under `folder` by their posix name relative to it, in name order."""
+    found = {
+        path.relative_to(folder).as_posix(): path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+    }
+    return dict(sorted(found.items()))
+
+
+def without_suffix(name: str) -> str:
+    """The key by which names match across extensions: no suffix, lower case."""
+    path = PurePosixPath(name)
+    return str(path.with_suffix("")).lower() if path.suffix else name.lower()
+
+
+class Names:
+    """Looks images up by name: exactly, else by the only one that differs in extension or case."""
+
+    def __init__(self, images: dict[str, Path]) -> None:
+        self.images = images
+        self.by_stem: dict[str, list[str]] = {}
+        for name in images:
+            self.by_stem.setdefault(without_suffix(name), []).append(name)
+
+    def find(self, name: str) -> str | None:
+        """The name on disk, or None."""
+        if name in self.images:
+            return name
+        alike = self.by_stem.get(without_suffix(name), [])
+        return alike[0] if len(alike) == 1 else None
+
+
+def find_mask(folder: Path, name: str) -> Path | None:
+    """The mask of an image: name.jpg.png (COLMAP) or name.png, or the image's own name."""
+    for candidate in (name + ".png", str(Path(name).with_suffix(".png")), name):
+        if (folder / candidate).is_file():
+            return folder / candidate
+    return None
+
+
+def decode_photograph(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Pixels [h, w, 3] uint8 RGB, and where the file has transparency its opaque part [h, w] bool.
+
+    Grey becomes RGB, 16 bits become 8; an alpha channel is a mask (choice: opaque from one half up), never
+    a blend. Raises `CaptureError` naming the file if it cannot be decoded.
+    """
+    pixels = _decode(path)
+    if pixels.dtype == np.uint16:
+        pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if pixels.dtype != np.uint8:
+        raise CaptureError(f"{path}: has {pixels.dtype} samples; convert it to 8-bit RGB.")
+    if pixels.ndim == 2:
+        return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB), None
+    if pixels.shape[2] == 3:
+        return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), None
+    opaque = pixels[:, :, 3] >= 128
+    return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB), None if opaque.all() else opaque
+
+
+def decode_mask(path: Path, width: int, height: int) -> np.ndarray:
+    """What a mask keeps (white), [height, width] bool; a mask of another size is resampled to the image's."""
+    keep = decode_photograph(path)[0].max(axis=2) >= 128
+    if keep.shape == (height, width):
+        return keep
+    return cv2.resize(keep.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _decode(path: Path) -> np.ndarray:
+    """OpenCV's decoding as stored (BGR order); Pillow where OpenCV cannot."""
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    try:
+        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
+    except cv2.error:
+        pixels = None
+    if pixels is not None and pixels.ndim in (2, 3) and (pixels.ndim == 2 or pixels.shape[2] in (3, 4)):
+        return pixels
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"))[:, :, ::-1]
+    except Exception as error:  # whatever Pillow finds wrong with it
+        raise CaptureError(f"{path}: cannot be decoded ({error}). Copy it again or remove it.") from None
+
+
+def verify(path: Path) -> str | None:
+    """What is wrong with an image file, or None. Decodes every byte of it once.
+
+    OpenCV fills the missing part of a truncated file with grey and says nothing; Pillow is strict. JPEGs are
+    decoded at 1/8 size, which still reads the whole stream, several times faster.
+    """
+    try:
+        with Image.open(path) as image:
+            if image.format == "JPEG":
+                image.draft(image.mode, (max(1, image.width // 8), max(1, image.height // 8)))
+            image.load()
+    except Exception as error:  # any complaint of a decoder is what we came for
+        return f"{path}: {error}"
+    return None

@@ -1,0 +1,112 @@
+"""Point clouds from PLY files: vertices with x, y, z and, where present, red, green, blue."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vdgs.errors import CaptureError
+
+LONGEST_HEADER = 1 << 16
+GREY = 128
+TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
+    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4",
+    "float32": "<f4", "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Header:
+    format: str
+    count: int
+    layout: np.dtype
+    size: int
+
+
+def read_point_cloud(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Points [n, 3] float64 and colours [n, 3] uint8 (mid-grey where the file has none).
+
+    Reads `ascii` and `binary_little_endian`, vertices first; floating-point colours are taken to run from
+    0 to 1. Raises `CaptureError` naming the file if it is missing, of another kind, or shorter than it
+    announces.
+    """
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
+    header = _header(data, file)
+    vertices = (_ascii if header.format == "ascii" else _binary)(data, header, file)
+    points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    return points, _colours(vertices)
+
+
+def _header(data: bytes, file: Path) -> _Header:
+    def fail(what: str) -> CaptureError:
+        return CaptureError(
+            f"{file}: {what}. A PLY point cloud with x, y, z (ascii or little-endian) is needed."
+        )
+
+    end = data.find(b"end_header", 0, LONGEST_HEADER)
+    start = data.find(b"\n", end) + 1
+    if not data.startswith(b"ply") or end < 0 or start == 0:
+        raise fail("has no PLY header")
+    form, element, count = "", "", -1
+    fields: list[tuple[str, str]] = []
+    for line in data[:end].decode("latin-1").splitlines():
+        words = line.split()
+        if len(words) >= 2 and words[0] == "format":
+            form = words[1]
+        elif len(words) == 3 and words[0] == "element":
+            if words[1] != "vertex" and count < 0:
+                raise fail(f"starts with the element {words[1]!r} instead of vertices")
+            element = words[1]
+            if element == "vertex":
+                count = int(words[2]) if words[2].isdecimal() and len(words[2]) < 12 else -2
+        elif words and words[0] == "property" and element == "vertex":
+            if len(words) != 3 or words[1] not in TYPES or words[2] in dict(fields):
+                raise fail(f"has a vertex property that is not understood ({line.strip()!r})")
+            fields.append((words[2], TYPES[words[1]]))
+    if form not in ("ascii", "binary_little_endian"):
+        raise fail(f"is of format {form!r}")
+    if count < 0 or not {"x", "y", "z"} <= set(dict(fields)):
+        raise fail("announces no vertices with x, y, z")
+    return _Header(form, count, np.dtype(fields), start)
+
+
+def _binary(data: bytes, header: _Header, file: Path) -> np.ndarray:
+    if header.size + header.count * header.layout.itemsize > len(data):
+        raise _too_short(header, file)
+    return np.frombuffer(data, header.layout, header.count, header.size)
+
+
+def _ascii(data: bytes, header: _Header, file: Path) -> np.ndarray:
+    lines = data[header.size :].split(b"\n", header.count)[: header.count]
+    columns = len(header.layout.names or ())
+    try:
+        rows = [tuple(float(word) for word in line.split()[:columns]) for line in lines]
+    except ValueError as error:
+        raise CaptureError(f"{file}: holds something that is no number ({error}). Export it again.") from None
+    if len(rows) < header.count or any(len(row) < columns for row in rows):
+        raise _too_short(header, file)
+    # float64 throughout: a number out of an integer's range must not wrap around silently
+    wide = np.dtype([(name, "<f8") for name in header.layout.names or ()])
+    return np.array(rows, wide)
+
+
+def _too_short(header: _Header, file: Path) -> CaptureError:
+    return CaptureError(
+        f"{file}: announces {header.count} vertices but holds fewer. The file is truncated; copy it again."
+    )
+
+
+def _colours(vertices: np.ndarray) -> np.ndarray:
+    names = vertices.dtype.names or ()
+    if not {"red", "green", "blue"} <= set(names):
+        return np.full((len(vertices), 3), GREY, np.uint8)
+    colours = np.stack([vertices[name].astype(np.float64) for name in ("red", "green", "blue")], axis=1)
+    colours = np.nan_to_num(colours, nan=GREY, posinf=255, neginf=0)
+    unit = vertices["red"].dtype.kind == "f" and len(colours) and 0 < colours.max() <= 1
+    return np.clip(np.round(colours * 255 if unit else colours), 0, 255).astype(np.uint8)

@@ -1,0 +1,180 @@
+"""What a reader hands over: cameras and points as the files have them, before any choice of ours.
+
+Every reader (COLMAP, transforms.json, Mega-NeRF, MatrixCity) yields a `SourceCapture` in its own world,
+already in OpenCV camera axes. `loading` turns it into a checked `Capture` in the ground frame.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+import numpy as np
+
+from vdgs.captures.capture import Split
+from vdgs.errors import CaptureError
+
+#: COLMAP's camera models: identifier -> (name, number of parameters).
+CAMERA_MODELS: dict[int, tuple[str, int]] = {
+    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4), 13: ("DIVISION", 5), 14: ("SIMPLE_FISHEYE", 3), 15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
+}  # fmt: skip
+MODEL_PARAMETERS = dict(CAMERA_MODELS.values())
+
+#: Models with one focal length; all others start fx, fy, cx, cy.
+SINGLE_FOCAL = {
+    "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE",
+    "SIMPLE_DIVISION", "SIMPLE_FISHEYE",
+}  # fmt: skip
+#: Models that are a pinhole once all further parameters are zero.
+PINHOLE_WHEN_ZERO = {
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION",
+    "DIVISION",
+}  # fmt: skip
+LARGEST_SIDE_PX = 100_000
+OFFENDERS_SHOWN = 10
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A COLMAP camera: model name, parameters in COLMAP's order (pixels), image size in pixels."""
+
+    model: str
+    params: tuple[float, ...]
+    width: int
+    height: int
+
+    @property
+    def focal(self) -> tuple[float, float]:
+        """(fx, fy) in pixels."""
+        return (self.params[0], self.params[0]) if self.model in SINGLE_FOCAL else self.params[:2]  # type: ignore[return-value]
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """(cx, cy) in pixels from the corner of the image."""
+        start = 1 if self.model in SINGLE_FOCAL else 2
+        return self.params[start], self.params[start + 1]
+
+    @property
+    def distorted(self) -> bool:
+        """True unless straight lines stay straight."""
+        extra = self.params[3 if self.model in SINGLE_FOCAL else 4 :]
+        return self.model not in PINHOLE_WHEN_ZERO or any(value != 0.0 for value in extra)
+
+
+@dataclass(frozen=True, eq=False)
+class SourceView:
+    """One photograph: name relative to the image folder (posix), pose, intrinsics, split where it has one."""
+
+    name: str
+    camera_from_world: np.ndarray
+    intrinsics: Intrinsics
+    split: Split | None = None
+    #: Where image and mask are, if the format says so itself; else they are looked up by name.
+    image_path: Path | None = None
+    mask_path: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class KnownWorld:
+    """What a format promises about its world: the similarity to a z-up frame.
+
+    x_ground = scale * rotation @ x_source (the origin is chosen later).
+    """
+
+    rotation: np.ndarray
+    scale: float
+    metric: bool
+    how: str
+
+
+@dataclass(frozen=True, eq=False)
+class SourceCapture:
+    """A capture as the files have it; points [n, 3] float64, colours [n, 3] uint8."""
+
+    source: str
+    images: str
+    views: tuple[SourceView, ...]
+    points: np.ndarray
+    colours: np.ndarray
+    world: KnownWorld | None = None
+    #: Folders in which every image should have a camera.
+    image_folders: tuple[Path, ...] = ()
+    warnings: tuple[str, ...] = field(default=())
+
+
+def listing(names: Iterable[str]) -> str:
+    """Up to ten names, one a line, and how many more there are."""
+    names = list(names)
+    shown = "".join(f"\n  {name}" for name in names[:OFFENDERS_SHOWN])
+    more = len(names) - OFFENDERS_SHOWN
+    return shown + (f"\n  ... and {more} more" if more > 0 else "")
+
+
+def duplicates(names: Iterable[str]) -> list[str]:
+    """Names that occur more than once, sorted."""
+    return sorted(name for name, count in Counter(names).items() if count > 1)
+
+
+def safe_name(name: str, file: Path) -> str:
+    """The image name in posix form. Raises `CaptureError` if it leaves the image folder."""
+    posix = name.replace("\\", "/")
+    parts = PurePosixPath(posix).parts
+    climbs = ".." in parts or posix.startswith("/") or bool(PureWindowsPath(name).drive)
+    if not parts or climbs or any(ord(letter) < 32 for letter in name):
+        raise CaptureError(
+            f"{file}: the image name {name!r} is not a path inside the image folder. "
+            "Names must be relative, without '..'; mend the file or export the model again."
+        )
+    return str(PurePosixPath(posix))
+
+
+def check_intrinsics(intrinsics: Intrinsics, file: Path, label: str) -> Intrinsics:
+    """The intrinsics, if they can belong to a real camera; else `CaptureError`."""
+    width, height = intrinsics.width, intrinsics.height
+    problem = None
+    if not (0 < width <= LARGEST_SIDE_PX and 0 < height <= LARGEST_SIDE_PX):
+        problem = f"an image size of {width}x{height}"
+    elif not np.isfinite(intrinsics.params).all():
+        problem = f"parameters that are not numbers: {intrinsics.params}"
+    else:
+        longest = max(width, height)
+        if not all(0.01 * longest < f < 1000 * longest for f in intrinsics.focal):
+            problem = f"a focal length of {intrinsics.focal} px for an image of {width}x{height}"
+        elif not all(
+            -s <= c <= 2 * s for c, s in zip(intrinsics.principal_point, (width, height), strict=True)
+        ):
+            problem = f"a principal point of {intrinsics.principal_point} for an image of {width}x{height}"
+    if problem:
+        raise CaptureError(f"{file}: {label} has {problem}. The file is damaged; copy or export it again.")
+    return intrinsics
+
+
+def rigid(matrix: np.ndarray, file: Path, label: str, tolerance: float = 5e-3) -> np.ndarray:
+    """A rigid motion [4, 4] float64 from one that is rigid up to rounding.
+
+    The rotation is replaced by the nearest orthonormal one (SVD). Raises `CaptureError` if an entry is not
+    finite, or if R R^T is further than `tolerance` from the identity, or if R is a reflection.
+    """
+    matrix = np.asarray(matrix, dtype=np.float64)
+    problem = None
+    if matrix.shape not in ((3, 4), (4, 4)):
+        problem = f"a pose of shape {matrix.shape} instead of 4x4"
+    elif not np.isfinite(matrix).all() or np.abs(matrix).max() > 1e12:
+        problem = "a pose that is not a finite number everywhere"
+    elif np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > tolerance:
+        problem = "a pose whose rotation is not orthonormal (scaled or sheared)"
+    elif np.linalg.det(matrix[:3, :3]) < 0:
+        problem = "a pose that mirrors the world"
+    if problem:
+        raise CaptureError(f"{file}: {label} has {problem}. The file is damaged or of another convention.")
+    left, _, right = np.linalg.svd(matrix[:3, :3])
+    result = np.eye(4)
+    result[:3, :3] = left @ right
+    result[:3, 3] = matrix[:3, 3]
+    return result

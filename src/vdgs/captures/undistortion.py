@@ -1,0 +1,144 @@
+"""Lens distortion removed: photographs resampled to pinhole cameras, written once and reused."""
+
+from __future__ import annotations
+
+import json
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+
+from vdgs.captures.photographs import decode_mask, decode_photograph
+from vdgs.captures.source import Intrinsics
+from vdgs.errors import CaptureError
+
+JPEG_QUALITY = 95
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph on disk: name, image, mask where there is one, intrinsics at the image's size."""
+
+    name: str
+    path: Path
+    mask: Path | None
+    intrinsics: Intrinsics
+
+
+def undistort(folder: Path, photographs: list[Photograph]) -> list[Photograph]:
+    """Pinhole versions of the photographs and their masks.
+
+    Files are written under `folder`, each image beside a small JSON that says from which files, of which
+    size and date, and with which camera it was made; what matches is reused. Photographs without
+    distortion pass through. Raises `CaptureError` if the folder cannot be written or an image cannot be
+    decoded.
+    """
+    targets = {
+        photo.intrinsics: pinhole_for(photo.intrinsics) for photo in photographs if photo.intrinsics.distorted
+    }
+
+    def one(photo: Photograph) -> Photograph:
+        target = targets.get(photo.intrinsics)
+        return photo if target is None else _undistort_one(folder, photo, target)
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with ThreadPoolExecutor(2) as pool:
+            return list(pool.map(one, photographs))
+    except OSError as error:
+        raise CaptureError(
+            f"{folder}: cannot be written ({error.strerror or error}). "
+            "Choose a folder for the undistorted photographs with --undistorted-folder."
+        ) from error
+
+
+def pinhole_for(intrinsics: Intrinsics) -> Intrinsics:
+    """The pinhole camera whose picture holds no blank pixels (COLMAP's own choice of size and centre)."""
+    try:
+        camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), _colmap(intrinsics))
+    except Exception as error:  # pycolmap raises plain ValueError and RuntimeError kinds
+        raise CaptureError(
+            f"the camera {intrinsics.model} {intrinsics.params} cannot be undistorted ({error}). "
+            "Undistort with colmap image_undistorter and use its output folder."
+        ) from error
+    centre = (camera.principal_point_x, camera.principal_point_y)
+    focal = (camera.focal_length_x, camera.focal_length_y)
+    return Intrinsics("PINHOLE", (*focal, *centre), camera.width, camera.height)
+
+
+def sampling_map(distorted: Intrinsics, pinhole: Intrinsics) -> np.ndarray:
+    """Where each pixel of the pinhole picture lies in the distorted one, [h, w, 2] float32.
+
+    In OpenCV's convention: pixel centres are at 0.5 here and at 0 in `cv2.remap`.
+    """
+    (fx, fy), (cx, cy) = pinhole.focal, pinhole.principal_point
+    x = (np.arange(pinhole.width) + 0.5 - cx) / fx
+    y = (np.arange(pinhole.height) + 0.5 - cy) / fy
+    rays = np.stack([*np.broadcast_arrays(x[None], y[:, None]), np.ones((len(y), len(x)))], axis=-1)
+    pixels = np.asarray(_colmap(distorted).img_from_cam(rays.reshape(-1, 3)), dtype=np.float64)
+    pixels = np.where(np.isfinite(pixels), pixels, -1e6)  # behind a fisheye's rim: outside
+    return (pixels - 0.5).reshape(pinhole.height, pinhole.width, 2).astype(np.float32)
+
+
+def _undistort_one(folder: Path, photo: Photograph, pinhole: Intrinsics) -> Photograph:
+    plain = photo.name if photo.name.lower().endswith((".jpg", ".jpeg")) else photo.name + ".jpg"
+    target = folder / plain
+    mask_target, stamp_file = (target.with_name(target.name + suffix) for suffix in (".mask.png", ".json"))
+    lens = photo.intrinsics
+    stamp: dict[str, object] = {"camera": [lens.model, *lens.params, lens.width, lens.height]}
+    for kind, file in (("image", photo.path), ("mask", photo.mask)):
+        status = file.stat() if file else None
+        stamp[kind] = status and [str(file), status.st_size, status.st_mtime_ns]
+    known = _read_json(stamp_file)
+    if not (target.is_file() and isinstance(known, dict) and known.get("made_from") == stamp):
+        keep = _write_straight(photo, pinhole, target, mask_target)
+        _write(stamp_file, json.dumps({"made_from": stamp, "mask": keep}).encode())
+        known = {"mask": keep}
+    mask = mask_target if known.get("mask") and mask_target.is_file() else None
+    return Photograph(photo.name, target, mask, pinhole)
+
+
+def _write_straight(photo: Photograph, pinhole: Intrinsics, target: Path, mask_target: Path) -> bool:
+    """Write the straightened image, and its mask if there is one (from a file or from transparency)."""
+    pixels, keep = decode_photograph(photo.path)
+    if photo.mask is not None:
+        masked = decode_mask(photo.mask, pixels.shape[1], pixels.shape[0])
+        keep = masked if keep is None else masked & keep
+    grid = sampling_map(photo.intrinsics, pinhole)
+    x, y = grid[..., 0], grid[..., 1]
+    straight = cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
+    target.parent.mkdir(parents=True, exist_ok=True)
+    _write(target, cv2.imencode(".jpg", cv2.cvtColor(straight, cv2.COLOR_RGB2BGR), settings)[1].tobytes())
+    if keep is None:
+        return False
+    mask = cv2.remap(keep.astype(np.uint8) * 255, x, y, cv2.INTER_NEAREST, borderValue=(0.0,))
+    _write(mask_target, cv2.imencode(".png", mask)[1].tobytes())
+    return True
+
+
+def _read_json(file: Path) -> object:
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def _write(file: Path, data: bytes) -> None:
+    """Write under a temporary name, then rename: a run that is cut off leaves no half image."""
+    part = file.with_name(file.name + ".part")
+    part.write_bytes(data)
+    os.replace(part, file)
+
+
+def _colmap(intrinsics: Intrinsics) -> pycolmap.Camera:
+    return pycolmap.Camera(
+        model=intrinsics.model,
+        width=intrinsics.width,
+        height=intrinsics.height,
+        params=list(intrinsics.params),
+    )

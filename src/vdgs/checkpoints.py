@@ -1,0 +1,85 @@
+"""Saved states of a stage: whole or absent, checked when read, the last two kept.
+
+A state is `NNNNNNNN.safetensors` (tensors) and, written after it, `NNNNNNNN.json` (iteration, facts, size and
+CRC-32 of the tensors' file). A state counts only if its JSON is there and the CRC agrees, so that a cut-off or
+damaged write is noticed and the state before it is used.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors.torch import load as load_bytes
+from safetensors.torch import save_file
+from torch import Tensor
+
+from vdgs.files import write_atomically, write_json
+
+KEPT = 2
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """What a state holds: the iteration after which it was taken, small facts, tensors."""
+
+    iteration: int
+    facts: Mapping[str, Any]
+    tensors: Mapping[str, Tensor]
+
+
+def save_state(folder: Path, state: SavedState) -> None:
+    """Write a state and remove all but the newest two. Raises VdgsError if the disk refuses."""
+    path = folder / f"{state.iteration:08d}.safetensors"
+    write_atomically(
+        path, lambda temporary: save_file({k: v.contiguous() for k, v in state.tensors.items()}, temporary)
+    )
+    data = path.read_bytes()
+    sidecar = {
+        "iteration": state.iteration,
+        "bytes": len(data),
+        "crc32": zlib.crc32(data),
+        "facts": dict(state.facts),
+    }
+    write_json(path.with_suffix(".json"), sidecar)
+    for old in sorted(folder.glob("*.json"))[:-KEPT]:
+        old.unlink()
+        old.with_suffix(".safetensors").unlink(missing_ok=True)
+    remove_leftovers(folder)
+
+
+def load_newest(folder: Path) -> tuple[SavedState | None, list[str]]:
+    """The newest state that is whole, and one sentence for each newer one that is not."""
+    complaints: list[str] = []
+    for sidecar in sorted(folder.glob("*.json"), reverse=True):
+        try:
+            return _read(sidecar), complaints
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            complaints.append(
+                f"{sidecar.with_suffix('.safetensors')}: is damaged ({error}); using the state before it"
+            )
+    return None, complaints
+
+
+def _read(sidecar: Path) -> SavedState:
+    facts = json.loads(sidecar.read_text(encoding="utf-8"))
+    path = sidecar.with_suffix(".safetensors")
+    data = path.read_bytes()
+    if len(data) != facts["bytes"]:
+        raise ValueError(f"{len(data)} bytes instead of {facts['bytes']}")
+    if zlib.crc32(data) != facts["crc32"]:
+        raise ValueError("its checksum does not agree")
+    return SavedState(int(facts["iteration"]), facts["facts"], load_bytes(data))
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what interrupted writes left behind: temporary files, tensors without their JSON."""
+    for temporary in folder.glob(".*.tmp"):
+        temporary.unlink(missing_ok=True)
+    for tensors in folder.glob("*.safetensors"):
+        if not tensors.with_suffix(".json").exists():
+            tensors.unlink()

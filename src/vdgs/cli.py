@@ -1,0 +1,63 @@
+"""The command line: one verb per stage. No logic here; heavy imports wait until a verb runs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+HELP = """\
+usage: vdgs VERB [options]
+
+vdgs turns a folder of drone photographs into one 3D Gaussian splatting scene.
+
+  inspect CAPTURE --output FOLDER   what a capture holds and how well it covers the place
+  coarse CAPTURE --output RUN       train the global model; the same command continues it
+  eval RUN                          metrics and pictures of the test views
+  render RUN                        views or a camera path, as PNG or video
+  synth OUTPUT                      generate a small aerial town with known truth
+  doctor                            what this machine can use, and what to install for the rest
+
+vdgs VERB --help explains the options of a verb. A capture is a folder with images/ and sparse/0 (COLMAP),
+transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of MatrixCity.
+"""
+
+VERBS = ("inspect", "coarse", "eval", "render", "synth", "doctor")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of `vdgs`. Exit codes: 0 done, 1 an error that the message explains, 2 usage, 130 stopped."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(HELP, end="")
+        sys.exit(0 if arguments else 2)
+    if arguments[0] == "--version":
+        from vdgs import __version__
+
+        print(f"vdgs {__version__}")
+        return
+    if arguments[0] not in VERBS:
+        print(f"vdgs: there is no verb {arguments[0]!r}\n\n{HELP}", end="", file=sys.stderr)
+        sys.exit(2)
+    sys.exit(_run(arguments[0], arguments[1:]))
+
+
+def _run(verb: str, arguments: list[str]) -> int:
+    from vdgs import verbs
+    from vdgs.errors import VdgsError
+
+    action: Callable[[list[str]], Any] = getattr(verbs, verb)
+    try:
+        return int(action(arguments) or 0)
+    except VdgsError as error:
+        print(f"vdgs {verb}: {error}", file=sys.stderr)
+        return 130 if getattr(error, "stopped", False) else 1
+    except KeyboardInterrupt:
+        print(f"vdgs {verb}: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        return 1
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,102 @@
+"""Anchors to splats (Scaffold-GS, section 3.2), in plain torch: the oracle of the native kernel."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from vdgs.cameras import Camera
+from vdgs.kernels.constants import ALPHA_MIN
+from vdgs.kernels.decode_types import FEATURE_SIZE, DecoderWeights, HeadWeights, Splats
+from vdgs.kernels.reference.project import project_with_variances
+
+
+def decode(
+    positions: Float[Tensor, "v 3"],
+    features: Float[Tensor, "v 32"],
+    offsets: Float[Tensor, "v k 3"],
+    log_scales: Float[Tensor, "v 6"],
+    weights: DecoderWeights,
+    camera: Camera,
+) -> Splats:
+    """Decode visible anchors for one camera and project what they spawn.
+
+    With d = (x - c)/|x - c| (orthographic: the viewing direction), each head sees [f, d], or
+    [f, d, |x - c|] where its first layer is 36 wide: opacity = tanh(·), covariance, colour =
+    sigmoid(·). μ = x + O·exp(s[0:3]), scales exp(s[3:6])·sigmoid(cov[0:3]), rotation cov[3:7].
+
+    Kept are splats that are opaque (> 0), valid in `project`, finite, and whose alpha reaches 1/255
+    within a box that touches the image: what is dropped could not change a pixel. Differentiable in
+    everything but the positions. Works in the precision of its arguments.
+    """
+    k = offsets.shape[1]
+    positions = positions.detach()
+    viewing = _viewing(positions, camera)
+    finite = _finite_rows(positions, viewing, features, log_scales.exp())
+    # Replaced before the arithmetic: 0 · NaN would enter the gradients of the weights.
+    positions, viewing, features, log_scales = (
+        torch.where(finite[:, None], t, torch.zeros_like(t))
+        for t in (positions, viewing, features, log_scales)
+    )
+    inputs = torch.cat([features, viewing], -1)
+
+    opacities = torch.tanh(_head(weights.opacity, inputs))
+    usable = (opacities > 0) & finite[:, None] & torch.isfinite(offsets).all(-1)
+    anchor, offset = usable.nonzero(as_tuple=True)
+    opacity = opacities[anchor, offset]
+    covariance = _head(weights.covariance, inputs).unflatten(1, (k, 7))[anchor, offset]
+    colour = torch.sigmoid(_head(weights.colour, inputs).unflatten(1, (k, 3))[anchor, offset])
+
+    extent = torch.exp(log_scales)[anchor]
+    means = positions[anchor] + offsets[anchor, offset] * extent[:, :3]
+    scales = extent[:, 3:] * torch.sigmoid(covariance[:, :3])
+    projected, variances = project_with_variances(means, scales, covariance[:, 3:], camera)
+    kept = (projected.valid & _on_image(projected.means_px, variances, opacity, camera)).nonzero()[:, 0]
+    return Splats(
+        means_px=projected.means_px[kept],
+        conics=projected.conics[kept],
+        depths=projected.depths[kept],
+        colours=colour[kept],
+        opacities=opacity[kept],
+        volumes=scales[kept].prod(-1),
+        source=(anchor * k + offset)[kept].to(torch.int32),
+    )
+
+
+def _viewing(positions: Tensor, camera: Camera) -> Float[Tensor, "v 4"]:
+    """Viewing direction and distance of every anchor."""
+    ray = positions - torch.as_tensor(camera.position).to(positions)
+    distance = ray.norm(dim=-1, keepdim=True)
+    if camera.model == "orthographic":
+        direction = torch.as_tensor(camera.forward).to(positions).expand_as(ray)
+    else:
+        direction = ray / distance
+    return torch.cat([direction, distance], -1)
+
+
+def _head(head: HeadWeights, inputs: Float[Tensor, "v 36"]) -> Tensor:
+    width = head.w1.shape[1]
+    if width not in (FEATURE_SIZE + 3, FEATURE_SIZE + 4):
+        raise ValueError(f"a head's first layer must be 35 or 36 wide, not {width}")
+    hidden = torch.relu(torch.nn.functional.linear(inputs[:, :width], head.w1, head.b1))
+    return torch.nn.functional.linear(hidden, head.w2, head.b2)
+
+
+@torch.no_grad()
+def _finite_rows(*tensors: Float[Tensor, "v _"]) -> Bool[Tensor, "v"]:
+    return torch.isfinite(torch.cat(tensors, -1)).all(-1)
+
+
+@torch.no_grad()
+def _on_image(means_px: Tensor, variances: Tensor, opacity: Tensor, camera: Camera) -> Bool[Tensor, "m"]:
+    """Whether the box around {alpha >= 1/255} reaches the centre of any pixel.
+
+    alpha = opacity·exp(-q/2) is 1/255 on the ellipse q = 2·ln(255·opacity), which reaches
+    sqrt(q·Σ'xx) to either side of the mean.
+    """
+    level = 2 * torch.log(opacity / ALPHA_MIN)
+    reach = torch.sqrt(level.clamp(min=0)[:, None] * variances)
+    size = means_px.new_tensor([camera.width, camera.height])
+    touches = (means_px + reach >= 0.5) & (means_px - reach <= size - 0.5)
+    return touches.all(-1) & (level >= 0)

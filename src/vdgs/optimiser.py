@@ -1,0 +1,88 @@
+"""Adam over anchors and decoder: visible rows only for anchors, everything for the decoder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from vdgs.anchors import TRAINED, Anchors
+from vdgs.config import RateConfig
+from vdgs.decoder import Decoder
+from vdgs.kernels import native as kernels
+
+
+@dataclass
+class Moments:
+    """First and second moments of each named parameter, shaped like it."""
+
+    first: dict[str, Tensor]
+    second: dict[str, Tensor]
+
+    @staticmethod
+    def zeros(parameters: dict[str, Tensor]) -> Moments:
+        return Moments(
+            {name: torch.zeros_like(p) for name, p in parameters.items()},
+            {name: torch.zeros_like(p) for name, p in parameters.items()},
+        )
+
+    def rebuilt(self, added: int, kept: Tensor) -> Moments:
+        """For anchors: `added` rows without history appended, then only the `kept` rows."""
+
+        def change(t: Tensor) -> Tensor:
+            return torch.cat([t, t.new_zeros(added, *t.shape[1:])])[kept]
+
+        return Moments(
+            {name: change(t) for name, t in self.first.items()},
+            {name: change(t) for name, t in self.second.items()},
+        )
+
+
+@dataclass
+class Optimiser:
+    """Moments of all parameters; `step` counts updates from 1 (for the bias correction)."""
+
+    anchors: Moments
+    decoder: Moments
+
+    @staticmethod
+    def start(anchors: Anchors, decoder: Decoder) -> Optimiser:
+        trained = {name: tensor for name, tensor in anchors.tensors().items() if name in TRAINED}
+        return Optimiser(Moments.zeros(trained), Moments.zeros(decoder.tensors()))
+
+    def update_anchors(
+        self,
+        anchors: Anchors,
+        rows: Tensor,
+        gradients: dict[str, Tensor | None],
+        rates: dict[str, float],
+        step: int,
+    ) -> bool:
+        """Move the given rows of features, offsets and log-scales, in place. False: a gradient is not finite."""
+        finite = True
+        for name, gradient in gradients.items():
+            if gradient is not None:
+                finite &= kernels.adam_rows(
+                    getattr(anchors, name), rows, gradient, self.anchors.first[name], self.anchors.second[name],
+                    learning_rate=rates[name], step=step,
+                )  # fmt: skip
+        return finite
+
+    def update_decoder(self, decoder: Decoder, rates: dict[str, float], step: int) -> bool:
+        """Move the decoder's tensors by their `.grad`, in place. False: a gradient is not finite."""
+        finite = True
+        for name, tensor in decoder.tensors().items():
+            if tensor.grad is not None:
+                finite &= kernels.adam_rows(
+                    tensor.detach(), None, tensor.grad, self.decoder.first[name], self.decoder.second[name],
+                    learning_rate=rates[name.split("_")[0]], step=step,
+                )  # fmt: skip
+                tensor.grad = None
+        return finite
+
+
+def rates_at(config: RateConfig, progress: float) -> dict[str, float]:
+    """Learning rates at a share of the stage in [0, 1]: exponential from the first to the second value."""
+    pairs = {name: getattr(config, name) for name in RateConfig.__dataclass_fields__}
+    return {name: first * (last / first) ** progress for name, (first, last) in pairs.items()}

@@ -1,0 +1,164 @@
+"""The run folder: settings, states and results of one run, as files (docs/architecture.md)."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from vdgs import __version__
+from vdgs.config import differences
+from vdgs.errors import RunError
+from vdgs.files import read_json, write_json, write_text
+
+
+@dataclass(frozen=True)
+class StageFolder:
+    """Where one stage (coarse, a block) keeps its states, log and model."""
+
+    path: Path
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def log(self) -> Path:
+        return self.path / "log.jsonl"
+
+    @property
+    def model(self) -> Path:
+        return self.path / "model.safetensors"
+
+    @property
+    def status_file(self) -> Path:
+        return self.path / "status.json"
+
+    def status(self) -> dict[str, Any]:
+        """What `set_status` wrote last; state "new" if nothing did."""
+        if not self.status_file.exists():
+            return {"state": "new"}
+        status = read_json(self.status_file)
+        if not isinstance(status, dict) or not isinstance(status.get("state"), str):
+            raise RunError(
+                f"{self.status_file}: is damaged. Delete this file and run the same command again."
+            )
+        return status
+
+    def set_status(self, state: str, **facts: Any) -> None:
+        """`state` is running, stopped, done or failed."""
+        write_json(self.status_file, {"state": state, **facts})
+
+    def is_done(self) -> bool:
+        return self.status()["state"] == "done" and self.model.exists()
+
+    def cut_log(self, iteration: int) -> None:
+        """Drop log lines after `iteration` (and a half-written last one), so that a continued run repeats none."""
+        if not self.log.exists():
+            return
+        kept = []
+        for line in self.log.read_text(encoding="utf-8", errors="replace").splitlines():
+            try:
+                if json.loads(line)["iteration"] <= iteration:
+                    kept.append(line)
+            except (ValueError, KeyError, TypeError):
+                break
+        write_text(self.log, "".join(line + "\n" for line in kept))
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run on disk."""
+
+    path: Path
+
+    @property
+    def config_file(self) -> Path:
+        return self.path / "config.yaml"
+
+    @property
+    def coarse(self) -> StageFolder:
+        return StageFolder(self.path / "coarse")
+
+    @property
+    def evaluation(self) -> Path:
+        return self.path / "evaluation"
+
+    def begin(self, settings: dict[str, Any]) -> None:
+        """Write the settings of a new run, or check that they are those of the run that is there.
+
+        Raises RunError with the differences if they are not, and if the folder holds something else.
+        """
+        if self.config_file.exists():
+            changed = differences(self.settings(), settings)
+            if changed:
+                raise RunError(
+                    f"{self.config_file}: this run was started with other settings:\n  "
+                    + "\n  ".join(changed)
+                    + "\nGive the old settings to continue it, or another --output to start a new run."
+                )
+            return
+        if self.path.exists() and not self.path.is_dir():
+            raise RunError(f"{self.path}: is a file. Choose a folder for --output.")
+        strangers = [p.name for p in self.path.iterdir() if p.name != ".lock"] if self.path.exists() else []
+        if strangers:
+            raise RunError(
+                f"{self.path}: holds other files ({', '.join(sorted(strangers)[:3])}) and no config.yaml. "
+                "Choose an empty or a new folder for --output."
+            )
+        header = {"vdgs": {"version": __version__, "commit": _commit()}}
+        write_text(self.config_file, yaml.safe_dump(header | settings, sort_keys=False, allow_unicode=True))
+
+    def settings(self) -> dict[str, Any]:
+        """The settings of the run, without the header that says which version wrote them."""
+        if not self.config_file.exists():
+            raise RunError(
+                f"{self.path}: is not a run folder (no config.yaml). Train first: vdgs coarse CAPTURE --output RUN"
+            )
+        try:
+            settings = yaml.safe_load(self.config_file.read_text(encoding="utf-8"))
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise RunError(f"{self.config_file}: is damaged, not valid YAML ({error})") from error
+        if not isinstance(settings, dict) or not {"capture", "training"} <= settings.keys():
+            raise RunError(
+                f"{self.config_file}: is damaged or not of a vdgs run (no `capture` and `training`)"
+            )
+        settings.pop("vdgs", None)
+        return settings
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the run for this process; RunError if another one works on it."""
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            handle = (self.path / ".lock").open("w")
+        except OSError as error:
+            raise RunError(
+                f"{self.path}: cannot be written ({error.strerror}). Choose another --output."
+            ) from error
+        with handle:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                raise RunError(
+                    f"{self.path}: another vdgs process works on this run. Wait for it or stop it."
+                ) from error
+            yield
+
+
+def _commit() -> str | None:
+    """The commit of the checkout that this package runs from; None outside a checkout of vdgs."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists() or not (root / "native").exists():
+        return None
+    found = subprocess.run(
+        ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
+    )
+    return found.stdout.strip() or None

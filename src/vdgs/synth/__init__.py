@@ -1,0 +1,29 @@
+"""A generated aerial capture of a small town: something to try every stage on, with known truth.
+
+Only `vdgs.synth.options` is imported here, so that the command line stays quick to start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from vdgs.synth.options import SynthOptions
+
+__all__ = ["SynthOptions", "generate"]
+
+
+def generate(
+    output: Path,
+    options: SynthOptions | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> None:
+    """Build a town, fly over it and write a COLMAP capture to `output` (which must not hold anything yet).
+
+    `progress(stage, done, total)` is called as the work goes on. The same options give the same bytes.
+    Raises VdgsError where the extra `synth` is not installed, an option makes no capture, or `output`
+    holds something already.
+    """
+    from vdgs.synth.generation import generate as run
+
+    run(Path(output), options or SynthOptions(), progress)

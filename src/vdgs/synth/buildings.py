@@ -1,0 +1,281 @@
+"""Buildings: houses with pitched roofs, flat-roofed blocks, a church, a barn.
+
+Every building stands in its own `Frame`: front at negative y, floor at z = 0, foundations below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vdgs.synth import palette
+from vdgs.synth.mesh import Material, MeshBuilder
+from vdgs.synth.shapes import Box, Frame, Skin, box, face, frustum
+
+STOREY = 2.7
+_FOUNDATION = 2.0
+
+
+@dataclass(frozen=True)
+class House:
+    """What makes one house unlike the next (metres; `pitch` is rise over run)."""
+
+    width: float
+    depth: float
+    storeys: int
+    pitch: float
+    hipped: bool
+    walls: np.ndarray
+    roof: Skin
+    seed: float
+
+    @property
+    def eaves(self) -> float:
+        return self.storeys * STOREY + 0.3
+
+
+def foundation(builder: MeshBuilder, frame: Frame, shape: Box) -> None:
+    """A stone plinth that carries a building down into sloping ground."""
+    plinth = Box(shape.x0 - 0.06, shape.x1 + 0.06, shape.y0 - 0.06, shape.y1 + 0.06, -_FOUNDATION, 0.12)
+    stone = Skin(Material.STONE, palette.STONE * 0.75)
+    box(builder, frame, plinth, stone, stone)
+
+
+def pitched_roof(
+    builder: MeshBuilder, frame: Frame, shape: Box, pitch: float, roof: Skin, hip: float = 0.0
+) -> float:
+    """A roof whose ridge runs along x over a box, with eaves, fascias and a ridge cap; returns its rise.
+
+    `hip` shortens the ridge at both ends by that part of half the depth: 0 gives gables, 1 a hipped roof.
+    """
+    out, z = 0.45, shape.z1
+    half = (shape.y1 - shape.y0) / 2
+    middle, rise = (shape.y0 + shape.y1) / 2, half * pitch
+    x0, x1, y0, y1 = shape.x0 - out, shape.x1 + out, shape.y0 - out, shape.y1 + out
+    low, top = z - out * pitch, z + rise
+    r0, r1 = x0 + hip * (half + out), x1 - hip * (half + out)
+    ridge = [(r0, middle, top), (r1, middle, top)]
+    eaves = [(x0, y0, low), (x1, y0, low), (x1, y1, low), (x0, y1, low)]
+    face(builder, frame, np.array([eaves[0], eaves[1], ridge[1], ridge[0]]), roof)
+    face(builder, frame, np.array([eaves[2], eaves[3], ridge[0], ridge[1]]), roof)
+    if hip > 0:
+        face(builder, frame, np.array([eaves[1], eaves[2], ridge[1]]), roof)
+        face(builder, frame, np.array([eaves[3], eaves[0], ridge[0]]), roof)
+    trim = Skin(Material.PAINT, palette.TRIM * 0.8)
+    for k in range(4):
+        a, b = np.array(eaves[k]), np.array(eaves[(k + 1) % 4])
+        if hip == 0 and k % 2:  # the verge climbs to the ridge and down again
+            peak = np.array([a[0], middle, top])
+            edges = [(a, peak), (peak, b)]
+        else:
+            edges = [(a, b)]
+        for start, end in edges:
+            down = np.array([0, 0, -0.22])
+            face(builder, frame, np.array([start + down, end + down, end, start]), trim)
+    cap = Box(r0, r1, middle - 0.16, middle + 0.16, top - 0.12, top + 0.09)
+    box(builder, frame, cap, *(Skin(Material.PAINT, roof.colour * 0.8),) * 2)
+    return rise
+
+
+def gables(builder: MeshBuilder, frame: Frame, shape: Box, pitch: float, skin: Skin) -> None:
+    """The triangles that close a gabled roof over a box."""
+    middle, top = (shape.y0 + shape.y1) / 2, shape.z1 + (shape.y1 - shape.y0) / 2 * pitch
+    for x, (a, b) in ((shape.x0, (shape.y1, shape.y0)), (shape.x1, (shape.y0, shape.y1))):
+        corners = np.array([(x, a, shape.z1), (x, b, shape.z1), (x, middle, top)])
+        face(builder, frame, corners, skin)
+
+
+def house(builder: MeshBuilder, frame: Frame, style: House, rng: np.random.Generator) -> None:
+    """A house with windows and a door, its roof, a chimney, and now and then a wing or dormers."""
+    w, d = style.width / 2, style.depth / 2
+    body = Box(-w, w, -d, d, 0, style.eaves)
+    windows = Skin(Material.WINDOWS, style.walls, style.seed)
+    plaster = Skin(Material.PLASTER, style.walls, style.seed)
+    front = Skin(Material.DOOR, style.walls, style.seed)
+    foundation(builder, frame, body)
+    box(builder, frame, body, (front, windows, windows, windows))
+    if not style.hipped:
+        gables(builder, frame, body, style.pitch, plaster)
+    rise = pitched_roof(builder, frame, body, style.pitch, style.roof, hip=0.9 if style.hipped else 0.0)
+    _chimney(builder, frame, rng.uniform(-0.55, 0.55) * w, rng.choice([-1, 1]) * 0.3 * d, style.eaves, rise)
+    if style.hipped:
+        return
+    if style.width > 9 and rng.random() < 0.75:
+        _wing(builder, frame, style, rng)
+    elif rng.random() < 0.6:
+        _dormers(builder, frame, style, plaster)
+
+
+def _chimney(builder: MeshBuilder, frame: Frame, x: float, y: float, eaves: float, rise: float) -> None:
+    brick = Skin(Material.BRICK, palette.BRICK)
+    top = eaves + rise + 0.8
+    box(builder, frame, Box(x - 0.4, x + 0.4, y - 0.3, y + 0.3, eaves, top), brick, brick)
+    pot = Skin(Material.PAINT, palette.BRICK * 0.7)
+    dark = Skin(Material.DARK, palette.DARK)
+    for dx in (-0.18, 0.18):
+        pots = Box(x + dx - 0.12, x + dx + 0.12, y - 0.12, y + 0.12, top, top + 0.35)
+        box(builder, frame, pots, pot, dark)
+
+
+def _wing(builder: MeshBuilder, frame: Frame, style: House, rng: np.random.Generator) -> None:
+    """A wing that comes forward from one half of the house, under a roof of its own."""
+    side = rng.choice([-1.0, 1.0])
+    span, reach = 0.4 * style.width, 1.7
+    turned = frame.moved(side * (style.width / 2 - span / 2 - 0.3), -style.depth / 4, turn=-np.pi / 2)
+    body = Box(-style.depth / 4, style.depth / 4 + reach, -span / 2, span / 2, 0, style.eaves - 0.35)
+    skin = Skin(Material.WINDOWS, style.walls, style.seed)
+    foundation(builder, turned, body)
+    box(builder, turned, body, skin)
+    gables(builder, turned, body, style.pitch, Skin(Material.PLASTER, style.walls, style.seed))
+    pitched_roof(builder, turned, body, style.pitch, style.roof)
+
+
+def _dormers(builder: MeshBuilder, frame: Frame, style: House, plaster: Skin) -> None:
+    """Two small gabled windows on the front slope."""
+    run = 0.55 * style.depth / 2
+    z = style.eaves + (style.depth / 2 - run) * style.pitch - 0.1
+    for x in (-0.24 * style.width, 0.24 * style.width):
+        turned = frame.moved(x, -run, z, turn=-np.pi / 2)
+        body = Box(-1.6, 0.15, -0.7, 0.7, 0, 1.05)
+        glass = Skin(Material.GLASS, palette.DARK, style.seed)
+        box(builder, turned, body, (plaster, glass, plaster, plaster))
+        gables(builder, turned, body, 0.7, plaster)
+        pitched_roof(builder, turned, body, 0.7, style.roof)
+
+
+def flat_block(
+    builder: MeshBuilder,
+    frame: Frame,
+    size: tuple[float, float],
+    storeys: int,
+    skins: tuple[Skin, Skin],
+    rng: np.random.Generator,
+) -> None:
+    """A town block with shops below and a flat roof with parapet, stair hut, plant and skylights."""
+    wall, roof = skins
+    w, d, height = size[0] / 2, size[1] / 2, storeys * 3.1 + 0.6
+    body = Box(-w, w, -d, d, 0, height)
+    foundation(builder, frame, body)
+    box(builder, frame, body, wall, roof)
+    parapet(builder, frame, body, Skin(Material.PAINT, wall.colour * 0.85))
+    metal, dark = Skin(Material.PAINT, palette.METAL), Skin(Material.DARK, palette.DARK)
+    hx, hy = rng.uniform(-0.5, 0.5) * w, rng.uniform(-0.1, 0.5) * d
+    hut = Box(hx - 1.5, hx + 1.5, hy - 1.3, hy + 1.3, height, height + 2.4)
+    box(builder, frame, hut, Skin(Material.PLASTER, wall.colour, wall.seed), metal)
+    sunny = rng.random() < 0.45
+    if sunny:
+        solar_row(builder, frame, -0.8 * w, 0.8 * w, -0.7 * d, height)
+    for _ in range(max(2, int(size[0] * size[1] / 45))):
+        x, y = rng.uniform(-0.8, 0.8) * w, rng.uniform(-0.8, 0.8) * d
+        if (abs(x - hx) < 2.6 and abs(y - hy) < 2.4) or (sunny and abs(y + 0.7 * d) < 1.9):
+            continue
+        if rng.random() < 0.5:
+            unit = Box(x - 0.8, x + 0.8, y - 0.6, y + 0.6, height, height + 1.0)
+            box(builder, frame, unit, metal, Skin(Material.PAINT, palette.METAL * 0.8))
+            frustum(builder, frame.moved(x, y), (0.45, 0.45), (height + 1.0, height + 1.08), dark, dark, 10)
+        else:
+            light = Box(x - 0.7, x + 0.7, y - 0.7, y + 0.7, height, height + 0.45)
+            skin = Skin(Material.PAINT, palette.TRIM)
+            box(builder, frame, light, skin, Skin(Material.GLASS, palette.DARK), inset=(0.15, 0.15))
+
+
+def parapet(builder: MeshBuilder, frame: Frame, shape: Box, skin: Skin) -> None:
+    """A low wall around a flat roof."""
+    t, z0, z1 = 0.3, shape.z1 - 0.1, shape.z1 + 0.7
+    for part in (
+        Box(shape.x0, shape.x1, shape.y0, shape.y0 + t, z0, z1),
+        Box(shape.x0, shape.x1, shape.y1 - t, shape.y1, z0, z1),
+        Box(shape.x0, shape.x0 + t, shape.y0 + t, shape.y1 - t, z0, z1),
+        Box(shape.x1 - t, shape.x1, shape.y0 + t, shape.y1 - t, z0, z1),
+    ):
+        box(builder, frame, part, skin, skin)
+
+
+def solar_row(builder: MeshBuilder, frame: Frame, x0: float, x1: float, y: float, z: float) -> None:
+    """A row of tilted solar panels."""
+    skin = Skin(Material.SOLAR, palette.DARK)
+    panel = np.array(
+        [(x0, y - 0.9, z + 0.25), (x1, y - 0.9, z + 0.25), (x1, y + 0.9, z + 0.95), (x0, y + 0.9, z + 0.95)]
+    )
+    face(builder, frame, panel, skin)
+    back = np.array([(x1, y + 0.9, z), (x0, y + 0.9, z), (x0, y + 0.9, z + 0.95), (x1, y + 0.9, z + 0.95)])
+    face(builder, frame, back, Skin(Material.PAINT, palette.METAL))
+
+
+def church(builder: MeshBuilder, frame: Frame, scale: float) -> None:
+    """A nave with apse and a square tower with a copper spire, its long side along x."""
+    s = scale
+    stone = Skin(Material.STONE, palette.PALE_STONE, 0.3)
+    slate = Skin(Material.SLATE, palette.SLATE[0], 0.3)
+    nave = Box(-7 * s, 8 * s, -4 * s, 4 * s, 0, 7 * s)
+    foundation(builder, frame, nave)
+    walls = Skin(Material.OFFICE, palette.PALE_STONE, 0.97)
+    box(builder, frame, nave, walls)
+    gables(builder, frame, nave, 1.05, stone)
+    pitched_roof(builder, frame, nave, 1.05, slate)
+    frustum(builder, frame.moved(8 * s, 0), (3.2 * s, 3.2 * s), (-2, 5 * s), stone, None, 14)
+    frustum(builder, frame.moved(8 * s, 0), (3.5 * s, 0), (5 * s, 7.4 * s), slate, None, 14)
+    for y in (-5.6 * s, 5.6 * s):  # side aisles under lean-to roofs
+        aisle = Box(-5 * s, 6 * s, min(y, 0.6 * y), max(y, 0.6 * y), 0, 3.4 * s)
+        foundation(builder, frame, aisle)
+        box(builder, frame, aisle, stone)
+        edge = [(-5.3 * s, y * 1.05, 3.3 * s), (6.3 * s, y * 1.05, 3.3 * s)]
+        wall = [(6.3 * s, 0.7 * y, 5.2 * s), (-5.3 * s, 0.7 * y, 5.2 * s)]
+        face(builder, frame, np.array(edge + wall if y < 0 else edge[::-1] + wall[::-1]), slate)
+    _tower(builder, frame.moved(-9 * s, 0), s, stone)
+
+
+def _tower(builder: MeshBuilder, frame: Frame, s: float, stone: Skin) -> None:
+    r, height = 2.7 * s, 15 * s
+    shaft = Box(-r, r, -r, r, 0, height)
+    foundation(builder, frame, shaft)
+    box(builder, frame, shaft, Skin(Material.OFFICE, palette.PALE_STONE * 0.95, 0.97), stone)
+    for z in (0.5 * height, height - 0.2):
+        band = Box(-r - 0.25, r + 0.25, -r - 0.25, r + 0.25, z, z + 0.5)
+        box(builder, frame, band, stone, stone)
+    spire = Box(-r, r, -r, r, height + 0.3, height + 9.5 * s)
+    box(builder, frame, spire, Skin(Material.TILES, palette.COPPER, 0.2), None, inset=(r - 0.02, r - 0.02))
+    gold = Skin(Material.PAINT, palette.GOLD)
+    top = height + 9.5 * s
+    box(builder, frame, Box(-0.12, 0.12, -0.12, 0.12, top, top + 1.8), gold, gold)
+    box(builder, frame, Box(-0.6, 0.6, -0.12, 0.12, top + 0.9, top + 1.2), gold, gold)
+
+
+def barn(builder: MeshBuilder, frame: Frame) -> None:
+    """A red barn with white trim and a silo."""
+    body = Box(-8, 8, -4.5, 4.5, 0, 4.6)
+    red = Skin(Material.TIMBER, palette.BARN_RED)
+    foundation(builder, frame, body)
+    box(builder, frame, body, red)
+    gables(builder, frame, body, 0.75, red)
+    pitched_roof(builder, frame, body, 0.75, Skin(Material.SLATE, palette.METAL * 0.7))
+    for x in (-3.0, 3.0):
+        door = np.array(
+            [(x - 1.6, -4.56, 0), (x + 1.6, -4.56, 0), (x + 1.6, -4.56, 3.2), (x - 1.6, -4.56, 3.2)]
+        )
+        face(builder, frame, door, Skin(Material.PAINT, palette.TRIM))
+    silo = frame.moved(11.5, 1.5)
+    steel = Skin(Material.PAINT, palette.METAL)
+    frustum(builder, silo, (2.1, 2.1), (-2, 9), steel, None, 18)
+    frustum(builder, silo, (2.1, 0), (9, 10.4), Skin(Material.PAINT, palette.METAL * 0.8), None, 18)
+
+
+def saw_tooth_hall(builder: MeshBuilder, frame: Frame, size: tuple[float, float], colour: np.ndarray) -> None:
+    """A workshop with a saw-tooth roof: glazed steps to the back, sheets to the front."""
+    w, d, height = size[0] / 2, size[1] / 2, 5.0
+    body = Box(-w, w, -d, d, 0, height)
+    wall = Skin(Material.BRICK, colour)
+    foundation(builder, frame, body)
+    box(builder, frame, body, wall)
+    teeth = max(2, round(size[1] / 4.5))
+    step = size[1] / teeth
+    for k in range(teeth):
+        y0, y1, top = -d + k * step, -d + (k + 1) * step, height + 1.9
+        sheet = np.array([(-w, y0, height), (w, y0, height), (w, y1, top), (-w, y1, top)])
+        face(builder, frame, sheet, Skin(Material.SLATE, palette.METAL * 0.8))
+        glazing = np.array([(w, y1, height), (-w, y1, height), (-w, y1, top), (w, y1, top)])
+        face(builder, frame, glazing, Skin(Material.GLASS, palette.DARK))
+        for x, ends in ((-w, (y1, y0)), (w, (y0, y1))):
+            side = [(x, ends[0], height), (x, ends[1], height), (x, y1, top)]
+            face(builder, frame, np.array(side), wall)

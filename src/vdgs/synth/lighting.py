@@ -1,0 +1,88 @@
+"""Sun, sky, and how much of the sky every bit of ground can see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from vdgs.synth.terrain import Terrain
+from vdgs.synth.tracing import Tracer
+from vdgs.synth.zones import Zone, ZoneMap
+
+SUN = np.array([-0.52, -0.44, 0.78], np.float32)
+SUN = SUN / np.linalg.norm(SUN)
+SUN_COLOUR = np.array([2.75, 2.45, 1.98], np.float32)
+SKY_COLOUR = np.array([0.46, 0.62, 0.92], np.float32)
+BOUNCE_COLOUR = np.array([0.26, 0.24, 0.17], np.float32)
+HORIZON_COLOUR = np.array([0.80, 0.88, 0.98], np.float32)
+
+_CELL = 0.5
+_RAYS = 32
+
+
+@dataclass(frozen=True, eq=False)
+class SkyMap:
+    """Share of the sky that the ground sees, on a raster around the origin; 1 outside it."""
+
+    openness: np.ndarray
+    half_size: float
+
+    def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Openness at world places by bilinear interpolation, [n] float32."""
+        u = ((x + self.half_size) / _CELL - 0.5).astype(np.float32)
+        v = ((y + self.half_size) / _CELL - 0.5).astype(np.float32)
+        mapped = cv2.remap(
+            self.openness, u[:, None], v[:, None], cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT, borderValue=1.0,
+        ) if len(u) < 32000 else _remap_long(self.openness, u, v)  # fmt: skip
+        return mapped.ravel()
+
+
+def _remap_long(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """cv2.remap takes no side over 32767: fold a long list into rows."""
+    width = 16384
+    padded = -len(u) % width
+    u, v = (np.pad(c, (0, padded)).reshape(-1, width) for c in (u, v))
+    mapped = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0)
+    return mapped.ravel()[: mapped.size - padded]
+
+
+def sky_map(tracer: Tracer, terrain: Terrain, zones: ZoneMap, half_size: float) -> SkyMap:
+    """Cast cosine-distributed rays from the ground; what lies inside buildings is filled from around."""
+    side = int(np.ceil(2 * half_size / _CELL))
+    axis = (np.arange(side) + 0.5) * _CELL - half_size
+    x, y = (a.ravel() for a in np.meshgrid(axis, axis))
+    z = terrain.height(x, y)
+    origins = np.stack([x, y, z + 0.15], 1).astype(np.float32)
+    free = np.zeros(len(x), np.float32)
+    golden = np.pi * (3 - 5**0.5)
+    turn = 2 * np.pi * ((np.arange(len(x)) * 0.7548776662) % 1)
+    for k in range(_RAYS):
+        radius, angle = np.sqrt((k + 0.5) / _RAYS), k * golden + turn
+        directions = np.stack(
+            [radius * np.cos(angle), radius * np.sin(angle), np.full(len(x), np.sqrt(1 - radius**2))], 1
+        )
+        free += ~tracer.occluded(origins, directions.astype(np.float32), np.full(len(x), 30.0))
+    openness = (free / _RAYS).reshape(side, side)
+    open_air = (zones.at(x, y) != Zone.BUILDING).reshape(side, side).astype(np.float32)
+    blurred = cv2.GaussianBlur(openness * open_air, (0, 0), 1.1)
+    weight = cv2.GaussianBlur(open_air, (0, 0), 1.1)
+    return SkyMap(
+        np.where(weight > 0.02, blurred / np.maximum(weight, 0.02), 0.6).astype(np.float32), half_size
+    )
+
+
+def sky_colour(directions: np.ndarray) -> np.ndarray:
+    """Radiance of the clear sky along unit directions, [n, 3]."""
+    up = np.clip(directions[:, 2:3], 0, 1) ** np.float32(0.6)
+    return HORIZON_COLOUR + (SKY_COLOUR * 0.75 - HORIZON_COLOUR) * up
+
+
+def tone_map(radiance: np.ndarray) -> np.ndarray:
+    """Linear radiance to display values in [0, 1]: a soft shoulder, then the sRGB curve (choice)."""
+    x = np.maximum(radiance, 0) * np.float32(0.58)
+    x = x * (x * 0.32 + 1) / (1 + x * 0.86)
+    x = np.clip(x, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-6), 1 / 2.4) - 0.055)

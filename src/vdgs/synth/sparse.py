@@ -1,0 +1,163 @@
+"""Sparse points as structure from motion would find them, but with true tracks.
+
+Places on true surfaces are drawn from every picture, more where it has texture, and followed into
+every other picture in which they are seen: inside the frame and not occluded. Observations carry pixel
+noise; each point is where bundle adjustment with known poses would put it, given that noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from vdgs.cameras import Camera
+from vdgs.synth.photography import pixel_rays
+from vdgs.synth.tracing import Tracer
+
+#: An occluder this near to a point (m) is its own surface.
+_OWN_SURFACE = 0.03
+#: Pictures that look at a place from directions further apart than this are never matched (degrees).
+_WIDEST = 65.0
+
+
+@dataclass(frozen=True, eq=False)
+class Seeds:
+    """Places [n, 3] (m, float64) picked in one image, and their colours [n, 3] uint8."""
+
+    points: np.ndarray
+    colours: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class SparseCloud:
+    """True places and noisy points [n, 3] (m), colours [n, 3] uint8, mean reprojection errors [n] (px);
+    observations: point index [m], image index [m], pixels [m, 2], sorted by point, then by image;
+    visibility [n, images]: in the frame and not occluded (a superset of the observations)."""
+
+    places: np.ndarray
+    points: np.ndarray
+    colours: np.ndarray
+    errors: np.ndarray
+    observed_point: np.ndarray
+    observed_image: np.ndarray
+    observed_px: np.ndarray
+    visibility: np.ndarray
+
+
+def pick_seeds(
+    tracer: Tracer, camera: Camera, image: np.ndarray, count: int, rng: np.random.Generator
+) -> Seeds:
+    """About `count` surface places seen in an image [height, width, 3] uint8, denser where it has texture."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    slope = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
+    weight = (np.minimum(cv2.GaussianBlur(slope, (0, 0), 1.0), 150) + 4).astype(np.float64).ravel()
+    chosen = rng.choice(len(weight), min(count, len(weight)), replace=False, p=weight / weight.sum())
+    row, column = np.divmod(chosen, camera.width)
+    pixels = np.stack([column, row], 1) + rng.uniform(0.02, 0.98, (len(chosen), 2))
+    origins, directions = pixel_rays(camera, pixels)
+    hits = tracer.cast(origins, directions)
+    met = (hits.triangle >= 0) & (hits.distance < 600)
+    places = origins + directions.astype(np.float64) * hits.distance[:, None]
+    return Seeds(places[met], image[row, column][met])
+
+
+def true_visibility(tracer: Tracer, cameras: list[Camera], places: np.ndarray) -> np.ndarray:
+    """Which places [n, 3] each camera sees: inside its frame and with nothing in between, [n, cameras]."""
+    visible = np.zeros((len(places), len(cameras)), bool)
+    for k, camera in enumerate(cameras):
+        inside = np.flatnonzero(camera.sees(places))
+        ray = places[inside] - camera.position
+        length = np.linalg.norm(ray, axis=1)
+        origins = np.broadcast_to(camera.position, ray.shape)
+        hidden = tracer.occluded(origins, ray / length[:, None], length - _OWN_SURFACE)
+        visible[inside[~hidden], k] = True
+    return visible
+
+
+def _matched(
+    cameras: list[Camera],
+    places: np.ndarray,
+    home: np.ndarray,
+    visible: np.ndarray,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """In which of the pictures that see it a place is also recognised: the likelier, the nearer to the
+    direction of the picture it was found in (`home`), [n, cameras] bool."""
+    positions = np.stack([camera.position for camera in cameras])
+    ray = places[:, None] - positions
+    ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+    own = ray[np.arange(len(places)), home]
+    apart = np.degrees(np.arccos(np.clip(np.einsum("nkc,nc->nk", ray, own), -1, 1)))
+    chance = 0.9 * np.clip(1 - apart / _WIDEST, 0, 1)
+    matched = visible & (rng.random(visible.shape) < chance)
+    matched[np.arange(len(places)), home] = visible[np.arange(len(places)), home]
+    return matched
+
+
+def _adjusted(
+    cameras: list[Camera], places: np.ndarray, point: np.ndarray, image: np.ndarray, noise: np.ndarray
+) -> np.ndarray:
+    """One Gauss-Newton step from the true places under noisy observations: points [n, 3].
+
+    Solves sum_i J_i^T J_i dx = sum_i J_i^T noise_i with J_i the derivative of the projection.
+    """
+    normal = np.zeros((len(places), 3, 3))
+    right = np.zeros((len(places), 3))
+    for k, camera in enumerate(cameras):
+        at = np.flatnonzero(image == k)
+        rotation = camera.camera_from_world[:3, :3]
+        local = places[point[at]] @ rotation.T + camera.camera_from_world[:3, 3]
+        x, y, z = local.T
+        zero = np.zeros_like(z)
+        jacobian = (
+            np.stack(
+                [
+                    np.stack([camera.fx / z, zero, -camera.fx * x / z**2], 1),
+                    np.stack([zero, camera.fy / z, -camera.fy * y / z**2], 1),
+                ],
+                1,
+            )
+            @ rotation
+        )
+        np.add.at(normal, point[at], np.einsum("nij,nik->njk", jacobian, jacobian))
+        np.add.at(right, point[at], np.einsum("nij,ni->nj", jacobian, noise[at]))
+    damping = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    return places + np.linalg.solve(normal + damping, right[..., None])[..., 0]
+
+
+def sparse_cloud(
+    tracer: Tracer,
+    cameras: list[Camera],
+    seeds: list[Seeds],
+    count: int,
+    noise_px: float,
+    rng: np.random.Generator,
+) -> SparseCloud:
+    """At most `count` points out of the seeds of all images (`seeds[k]` from `cameras[k]`), all seen in
+    at least two pictures. O(points x images)."""
+    places = np.concatenate([seed.points for seed in seeds])
+    colours = np.concatenate([seed.colours for seed in seeds])
+    home = np.repeat(np.arange(len(seeds)), [len(seed.points) for seed in seeds])
+    visible = true_visibility(tracer, cameras, places)
+    matched = _matched(cameras, places, home, visible, rng)
+    good = np.flatnonzero(matched.sum(1) >= 2)
+    kept = np.sort(rng.permutation(good)[:count])
+    places, colours, visible, matched = places[kept], colours[kept], visible[kept], matched[kept]
+    point, image = np.nonzero(matched)
+    truth = np.empty((len(point), 2))
+    for k, camera in enumerate(cameras):
+        at = image == k
+        truth[at] = camera.project(places[point[at]])[0]
+    noise = rng.normal(0, noise_px, truth.shape) if noise_px > 0 else np.zeros_like(truth)
+    points = _adjusted(cameras, places, point, image, noise)
+    observed = truth + noise
+    residual = np.empty(len(point))
+    for k, camera in enumerate(cameras):
+        at = image == k
+        residual[at] = np.linalg.norm(camera.project(points[point[at]])[0] - observed[at], axis=1)
+    errors = np.bincount(point, residual, len(places)) / np.maximum(
+        np.bincount(point, minlength=len(places)), 1
+    )
+    return SparseCloud(places, points, colours, errors, point, image, observed, visible)

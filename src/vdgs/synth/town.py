@@ -1,0 +1,115 @@
+"""The town as a whole: which block is what, what drives on the streets, all joined into one scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from vdgs.synth import centre, props
+from vdgs.synth.mesh import Mesh, MeshBuilder
+from vdgs.synth.outskirts import build_outskirts, edge_plots, scatter_trees
+from vdgs.synth.residential import residential_block
+from vdgs.synth.site import Plot, Site
+from vdgs.synth.streets import PAVEMENT, StreetPlan, street_plan
+from vdgs.synth.terrain import Pond, Terrain
+from vdgs.synth.trees import tree
+from vdgs.synth.zones import ZoneMap
+
+
+@dataclass(frozen=True, eq=False)
+class Town:
+    """A finished town: its triangles, and what the ground's shader has to know."""
+
+    mesh: Mesh
+    plan: StreetPlan
+    terrain: Terrain
+    zones: ZoneMap
+    half_extent: float
+
+
+def build_town(seed: int, extent: float) -> Town:
+    """A town of about `extent` metres a side around the origin; the same arguments give the same town."""
+    rng = np.random.default_rng([seed, 1])
+    plan = street_plan(rng, extent)
+    land = Terrain(extent / 2, tuple(float(v) for v in rng.uniform(0, 6, 4)))
+    zones = ZoneMap(half_size=float(np.abs(plan.p).max() * 1.3 + 85))
+    site = Site(plan, land, zones, MeshBuilder(), rng)
+    plots = edge_plots(site)
+    pond_plot = int(rng.integers(len(plots)))
+    site = replace(site, terrain=replace(land, ponds=(_pond(site, plots[pond_plot]),)))
+    _blocks(site)
+    build_outskirts(site, pond_plot)
+    _traffic(site)
+    scatter_trees(site, extent / 2 + 20, count=int(60 + extent / 2))
+    site.terrain.add_to(site.builder)
+    return Town(site.builder.build(), plan, site.terrain, zones, extent / 2)
+
+
+def _pond(site: Site, plot: Plot) -> Pond:
+    """The pond behind an edge of the town, level with the lowest ground of its shore."""
+    p, q = plot.plan(np.array(0.0), np.array(14.0))
+    x, y = (float(v) for v in site.plan.to_world(p, q))
+    rx, ry = 15.0, 13.0
+    angle = np.linspace(0, 2 * np.pi, 32)
+    shore = site.terrain.height(x + 1.25 * rx * np.cos(angle), y + 1.25 * ry * np.sin(angle))
+    return Pond(x, y, rx, ry, float(shore.min()) - 0.35)
+
+
+def _blocks(site: Site) -> None:
+    """The square in the middle, shops around it, houses further out, a park and works among them."""
+    rows, columns = len(site.plan.q) - 1, len(site.plan.p) - 1
+    i0, j0 = site.plan.p_main - 1, site.plan.q_main
+    cells = [(i, j) for i in range(columns) for j in range(rows) if (i, j) != (i0, j0)]
+    away = {cell: max(abs(cell[0] - i0), abs(cell[1] - j0)) for cell in cells}
+    site.rng.shuffle(cells)
+    cells.sort(key=lambda cell: away[cell])
+    centre.square(site, site.block(i0, j0))
+    special = [centre.shops, centre.park, centre.shops, centre.works, centre.lawn_flats]
+    for k, (i, j) in enumerate(cells):
+        block = site.block(i, j)
+        near = away[(i, j)] <= max(1, columns // 4)
+        chance = site.rng.random()
+        if near and k % 2 == 0:
+            special[(k // 2) % len(special)](site, block)
+        elif not near and chance < 0.22:
+            (centre.park, centre.works, centre.lawn_flats)[int(chance / 0.22 * 3)](site, block)
+        else:
+            residential_block(site, block)
+
+
+def _traffic(site: Site) -> None:
+    """Cars that drive on the right and cars parked at the kerb, street trees and lamps on the pavements."""
+    plan = site.plan
+    for streets, halves, others, along_q in (
+        (plan.p, plan.p_half, plan.q, True),
+        (plan.q, plan.q_half, plan.p, False),
+    ):
+        for position, half in zip(streets, halves, strict=True):
+            for start, end in pairwise(others):
+                _stretch(site, position, half, (start + 13, end - 13), along_q)
+
+
+def _stretch(site: Site, position: float, half: float, span: tuple[float, float], along_q: bool) -> None:
+    """One street between two crossings."""
+    rng = site.rng
+
+    def at(across: float, along: float, turn: float) -> Plot:
+        p, q = (position + across, along) if along_q else (along, position - across)
+        return Plot(p, q, 1, 1, (1 if along_q else 0) + (2 if turn else 0))
+
+    for direction in (-1, 1):
+        if rng.random() < (0.75 if half > 4 else 0.4):
+            lane = at(direction * 0.3 * half, rng.uniform(*span), direction < 0)
+            (props.bus if rng.random() < 0.12 else props.car)(site.builder, site.frame(lane), rng)
+        for along in np.arange(span[0], span[1], 5.6):
+            if rng.random() < (0.32 if half > 4 else 0.25):
+                kerb = at(direction * (half - 1.02), along, direction < 0)
+                props.car(site.builder, site.frame(kerb, turn=rng.normal(0, 0.02)), rng)
+        for along in np.arange(span[0] + 1, span[1], 8.5):
+            verge = at(direction * (half + 0.55 * PAVEMENT), along, direction > 0)
+            if half > 4 and rng.random() < 0.75:
+                tree(site.builder, site.frame(verge), rng, "round", rng.uniform(4.4, 5.6))
+        lamp = at(direction * (half + 0.3), rng.uniform(*span), direction < 0)
+        props.lamp(site.builder, site.frame(lamp))

@@ -1,0 +1,282 @@
+"""The training loop: one for the coarse stage and for blocks; what differs is data.
+
+State is explicit (`TrainingState`), each step is a function of the state and the iteration number, and everything
+random is drawn from (seed, iteration). A run that is stopped and continued is therefore the run that was not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vdgs.anchors import TRAINED, Anchors
+from vdgs.cameras import Camera
+from vdgs.checkpoints import SavedState
+from vdgs.config import TrainConfig
+from vdgs.decoder import Decoder
+from vdgs.errors import TrainingDiverged
+from vdgs.growth import Statistics, decide
+from vdgs.kernels import native as kernels
+from vdgs.optimiser import Moments, Optimiser, rates_at
+from vdgs.render import decode_visible, draw, gather_visible
+
+#: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
+REFERENCE_HEIGHT = 10.0
+#: Every so many iterations anchors are put into Morton order, so that neighbours in space are neighbours in memory.
+REORDER_INTERVAL = 1000
+#: Every so many iterations the PSNR of the training view is taken, for people.
+PSNR_INTERVAL = 10
+
+
+@runtime_checkable
+class TrainingImages(Protocol):
+    """Photographs on demand. Index i is the i-th training view."""
+
+    def get(self, index: int, downscale: int = 1) -> tuple[Tensor, Tensor | None]: ...
+    def camera(self, index: int, downscale: int = 1) -> Camera: ...
+    def prefetch(self, indices: Sequence[int], downscale: int = 1) -> None: ...
+
+
+@dataclass
+class TrainingState:
+    """All that changes during training. `iteration` steps have been made."""
+
+    iteration: int
+    anchors: Anchors
+    decoder: Decoder
+    statistics: Statistics
+    optimiser: Optimiser
+    #: Smoothed loss, the smallest it has been, smoothed PSNR of training views.
+    loss: float = math.nan
+    best_loss: float = math.inf
+    psnr: float = math.nan
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What training works on: the same for all iterations."""
+
+    config: TrainConfig
+    images: TrainingImages
+    image_count: int
+    voxel: float
+    #: Median height of the cameras above the ground, in units of the ground frame.
+    camera_height: float
+    #: Colour behind the scene.
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """What one step did, for the log."""
+
+    loss: float
+    l1: float
+    ssim: float
+    visible: int
+    splats: int
+    grown: int | None = None
+    pruned: int | None = None
+
+
+def start_state(anchors: Anchors, decoder: Decoder) -> TrainingState:
+    n, k = len(anchors), anchors.offsets.shape[1]
+    for tensor in decoder.tensors().values():
+        tensor.requires_grad_(True)
+    return TrainingState(0, anchors, decoder, Statistics.zeros(n, k), Optimiser.start(anchors, decoder))
+
+
+def view_at(iteration: int, count: int, seed: int) -> int:
+    """Which training view iteration (from 0) uses: a fresh permutation of all views every `count` iterations."""
+    epoch, place = divmod(iteration, count)
+    return int(_permutation(epoch, count, seed)[place])
+
+
+@lru_cache(maxsize=4)
+def _permutation(epoch: int, count: int, seed: int) -> np.ndarray:
+    return np.random.default_rng((seed, epoch)).permutation(count)
+
+
+def downscale_at(iteration: int, config: TrainConfig) -> int:
+    """Factor by which images are shrunk at this iteration (from 0)."""
+    share = iteration / config.iterations
+    return [factor for start, factor in config.resolutions if share >= start][-1]
+
+
+def train_step(state: TrainingState, stage: Stage) -> StepReport:
+    """One step: render a training view, compare, move what was visible, count, perhaps grow.
+
+    Changes `state` in place. Raises TrainingDiverged if the loss or a gradient is not finite.
+    """
+    config, iteration = stage.config, state.iteration
+    downscale = downscale_at(iteration, config)
+    view = view_at(iteration, stage.image_count, config.seed)
+    target, mask = stage.images.get(view, downscale)
+    camera = stage.images.camera(view, downscale)
+
+    visible = gather_visible(state.anchors, camera)
+    leaves = {name: getattr(visible.anchors, name).requires_grad_(True) for name in TRAINED}
+    splats = decode_visible(visible.anchors, state.decoder.for_image(view), camera)
+    splats.means_px.retain_grad()
+    raster = draw(splats, camera, _background(stage, iteration))
+    photometric = kernels.photometric_loss(raster.image, target, mask, ssim_weight=config.loss.ssim_weight)
+    loss = photometric.loss
+    if config.loss.volume_weight and len(splats.volumes):
+        unit = (stage.camera_height / REFERENCE_HEIGHT) ** 3
+        loss = loss + config.loss.volume_weight / unit * splats.volumes.mean()
+    value = float(loss.detach())
+    if not math.isfinite(value):
+        raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
+    if loss.requires_grad:
+        loss.backward()
+
+    rates = rates_at(config.rates, iteration / config.iterations)
+    gradients = {name: leaf.grad for name, leaf in leaves.items()}
+    finite = state.optimiser.update_anchors(state.anchors, visible.rows, gradients, rates, iteration + 1)
+    finite &= state.optimiser.update_decoder(state.decoder, rates, iteration + 1)
+    if not finite:
+        raise TrainingDiverged(f"A gradient is not a finite number at iteration {iteration + 1}.")
+
+    growing = iteration + 1 <= config.growth.until * config.iterations
+    if growing and iteration + 1 > config.growth.statistics_from and splats.means_px.grad is not None:
+        state.statistics.add_view(
+            visible.rows,
+            splats.source,
+            splats.opacities.detach(),
+            splats.means_px.grad,
+            camera.width,
+            camera.height,
+        )
+    state.iteration += 1
+    grown = pruned = None
+    if growing and state.iteration >= config.growth.start and state.iteration % config.growth.interval == 0:
+        grown, pruned = grow(state, stage)
+    if state.iteration % REORDER_INTERVAL == 0:
+        reorder(state)
+    l1, ssim = float(photometric.l1), float(photometric.ssim)
+    _smooth(state, value, raster.image.detach(), target)
+    return StepReport(value, l1, ssim, len(visible.rows), len(splats.opacities), grown, pruned)
+
+
+def grow(state: TrainingState, stage: Stage) -> tuple[int, int]:
+    """Add and remove anchors with their moments and statistics; returns how many of each."""
+    generator = torch.Generator().manual_seed(stage.config.seed * 1_000_003 + state.iteration)
+    decision = decide(state.anchors, state.statistics, stage.voxel, stage.config.growth, generator)
+    added = len(decision.added)
+    kept = torch.cat([decision.kept, torch.ones(added, dtype=torch.bool)])
+    state.anchors = state.anchors.extended(decision.added).select(kept)
+    state.statistics = state.statistics.extended(added).select(kept)
+    state.optimiser.anchors = state.optimiser.anchors.rebuilt(added, kept)
+    return added, decision.pruned
+
+
+def reorder(state: TrainingState) -> None:
+    """Put anchors, moments and statistics into Morton order."""
+    order = kernels.morton_order(state.anchors.positions)
+    state.anchors = state.anchors.select(order)
+    state.statistics = state.statistics.select(order)
+    state.optimiser.anchors = state.optimiser.anchors.rebuilt(0, order)
+
+
+def _background(stage: Stage, iteration: int) -> Tensor:
+    if stage.config.loss.background != "random":
+        return torch.tensor(stage.background)
+    return torch.rand(3, generator=torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration))
+
+
+def mean_colour(
+    images: TrainingImages, count: int, downscale: int, at_most: int = 32
+) -> tuple[float, float, float]:
+    """Mean colour in [0, 1] of the pixels that count, over up to `at_most` evenly chosen training views."""
+    total, pixels = np.zeros(3), 0
+    for index in np.unique(np.linspace(0, count - 1, min(count, at_most)).astype(int)):
+        image, mask = images.get(int(index), downscale)
+        colours = image.numpy().reshape(-1, 3) if mask is None else image.numpy()[mask.numpy() > 0]
+        total += colours.sum(0, dtype=np.float64)
+        pixels += len(colours)
+    red, green, blue = (float(np.float32(value)) for value in total / (255.0 * max(pixels, 1)))
+    return red, green, blue
+
+
+def _smooth(state: TrainingState, loss: float, image: Tensor, target: Tensor) -> None:
+    """Update the smoothed loss and, every tenth step, PSNR (for people and for the divergence check)."""
+    state.loss = _moving(state.loss, loss, 0.98)
+    if state.iteration % PSNR_INTERVAL == 0:
+        error = float(torch.mean((image.clamp(0, 1) - target.float() / 255.0) ** 2))
+        state.psnr = _moving(state.psnr, -10.0 * math.log10(max(error, 1e-10)), 0.9)
+    if state.iteration > 100:
+        state.best_loss = min(state.best_loss, state.loss)
+        if state.loss > 0.3 and state.loss > 4 * state.best_loss:
+            raise TrainingDiverged(
+                f"The smoothed loss rose to {state.loss:.3f} from {state.best_loss:.3f} by iteration {state.iteration}."
+            )
+
+
+def _moving(before: float, value: float, keep: float) -> float:
+    return value if math.isnan(before) else keep * before + (1 - keep) * value
+
+
+def train(
+    state: TrainingState,
+    stage: Stage,
+    *,
+    stop: Callable[[], bool],
+    after_step: Callable[[TrainingState, StepReport], None],
+    prefetch: int = 4,
+) -> bool:
+    """Steps until the stage is complete or `stop()` is true. True if complete.
+
+    `after_step` sees every step (progress, log, saving).
+    """
+    config = stage.config
+    while state.iteration < config.iterations:
+        if stop():
+            return False
+        ahead = range(state.iteration + 1, min(state.iteration + 1 + prefetch, config.iterations))
+        for iteration in ahead:
+            view = view_at(iteration, stage.image_count, config.seed)
+            stage.images.prefetch([view], downscale_at(iteration, config))
+        report = train_step(state, stage)
+        after_step(state, report)
+    return True
+
+
+def to_saved(state: TrainingState) -> SavedState:
+    """The whole state as tensors and facts."""
+    tensors = {f"anchors.{k}": v for k, v in state.anchors.tensors().items()}
+    tensors |= {f"decoder.{k}": v.detach() for k, v in state.decoder.tensors().items()}
+    tensors |= {f"statistics.{k}": v for k, v in state.statistics.tensors().items()}
+    for group, moments in (("anchors", state.optimiser.anchors), ("decoder", state.optimiser.decoder)):
+        tensors |= {f"first.{group}.{k}": v for k, v in moments.first.items()}
+        tensors |= {f"second.{group}.{k}": v for k, v in moments.second.items()}
+    facts = {"loss": repr(state.loss), "best_loss": repr(state.best_loss), "psnr": repr(state.psnr),
+             "seconds": state.seconds}  # fmt: skip
+    return SavedState(state.iteration, facts, tensors)
+
+
+def from_saved(saved: SavedState) -> TrainingState:
+    """The inverse of `to_saved`, bit for bit. Raises KeyError if a tensor is missing."""
+
+    def part(prefix: str) -> dict[str, Tensor]:
+        return {k.removeprefix(prefix): v for k, v in saved.tensors.items() if k.startswith(prefix)}
+
+    anchors = Anchors(**part("anchors."))
+    decoder = Decoder.from_tensors(part("decoder."))
+    state = start_state(anchors, decoder)
+    state.statistics = Statistics(**part("statistics."))
+    state.optimiser = Optimiser(
+        Moments(part("first.anchors."), part("second.anchors.")),
+        Moments(part("first.decoder."), part("second.decoder.")),
+    )
+    state.iteration = saved.iteration
+    state.loss, state.best_loss = float(saved.facts["loss"]), float(saved.facts["best_loss"])
+    state.psnr, state.seconds = float(saved.facts["psnr"]), float(saved.facts["seconds"])
+    return state

@@ -1,0 +1,32 @@
+"""Which native kernels a test runs, and on how many threads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from unittest.mock import patch
+
+import pytest
+
+from vdgs.kernels.native import module
+
+#: Runs a test once for every instruction set that this processor supports.
+every_instruction_set = pytest.mark.parametrize("instructions", module.supported())
+
+
+@contextmanager
+def using(instructions: str) -> Iterator[None]:
+    """Run the kernels built for one instruction set."""
+    with patch.object(module, "native", lambda: module.load(instructions)):
+        yield
+
+
+@contextmanager
+def on_threads(count: int) -> Iterator[None]:
+    """Let the kernels use `count` threads."""
+    before = module.threads()
+    module.set_threads(count)
+    try:
+        yield
+    finally:
+        module.set_threads(before)

@@ -1,0 +1,383 @@
+"""transforms.json, Mega-NeRF and MatrixCity: written here as their tools write them, read as one scene."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from captures_support import TinyScene, moved, tiny_scene, write_colmap, write_images, write_ply
+from vdgs.captures.capture import Capture
+from vdgs.captures.loading import load_capture
+from vdgs.captures.options import CaptureOptions
+from vdgs.captures.ply import read_point_cloud
+from vdgs.errors import CaptureError
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+#: DRB axes (down, right, back) of a z-up world whose x is right and y is forward.
+DRB = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@pytest.fixture
+def scene() -> TinyScene:
+    return tiny_scene()
+
+
+def assert_sees_the_scene(capture: Capture, scene: TinyScene, rename=lambda name: name) -> None:
+    """Every point falls on the same pixel as in the scene that was written."""
+    assert len(capture.views) == len(scene.cameras)
+    assert len(capture.points) == len(scene.points)
+    np.testing.assert_array_equal(capture.point_colours, scene.colours)
+    for view in capture.views:
+        camera = scene.cameras[rename(view.name)]
+        expected, depth = camera.project(scene.points)
+        found, _ = view.camera.project(capture.points)
+        front = depth > 1
+        np.testing.assert_allclose(found[front], expected[front], atol=1e-3)
+
+
+# ------------------------------------------------------------------------------------------- nerfstudio
+
+
+def write_transforms(root: Path, scene: TinyScene, applied: np.ndarray | None = None, **changes) -> dict:
+    """As ns-process-data: poses and cloud both in the world after `applied`."""
+    world = np.eye(4) if applied is None else applied
+    first = next(iter(scene.cameras.values()))
+    content: dict = {
+        "camera_model": "OPENCV", "w": first.width, "h": first.height, "fl_x": first.fx, "fl_y": first.fy,
+        "cx": first.cx, "cy": first.cy, "k1": 0.0, "ply_file_path": "sparse_pc.ply",
+        "frames": [
+            {"file_path": f"images/{name}", "transform_matrix": (
+                world @ np.linalg.inv(camera.camera_from_world) @ OPENGL).tolist()}
+            for name, camera in scene.cameras.items()
+        ],
+    }  # fmt: skip
+    if applied is not None:
+        content["applied_transform"] = applied[:3].tolist()
+    content |= changes
+    root.mkdir(parents=True, exist_ok=True)
+    (root / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
+    write_ply(root / "sparse_pc.ply", scene.points @ world[:3, :3].T + world[:3, 3], scene.colours)
+    write_images(root / "images", scene)
+    return content
+
+
+def test_transforms_json(tmp_path, scene):
+    write_transforms(tmp_path, scene)
+    capture = load_capture(tmp_path)
+    assert (capture.source, capture.images) == ("transforms", "images")
+    assert_sees_the_scene(capture, scene)
+
+
+def test_applied_transform_is_undone(tmp_path, scene):
+    """The capture's own world is the one before it, so that a georeference keeps its meaning."""
+    applied = np.eye(4)[[0, 2, 1, 3]]
+    applied[2] *= -1
+    applied[:3, 3] = [1.0, 2.0, 3.0]
+    write_transforms(tmp_path, scene, applied)
+    capture = load_capture(tmp_path, CaptureOptions(up="z"))
+    assert_sees_the_scene(capture, scene)
+    np.testing.assert_allclose(capture.ground.to_source(capture.points), scene.points, atol=1e-9)
+
+
+def test_applied_scale_is_undone_too(tmp_path, scene):
+    small = moved(scene, 0.25, np.eye(3), np.zeros(3))
+    write_transforms(tmp_path, small, applied_scale=0.25)
+    write_images(tmp_path / "images", scene)
+    capture = load_capture(tmp_path)
+    assert_sees_the_scene(capture, scene)
+    np.testing.assert_allclose(capture.ground.to_source(capture.points), scene.points, atol=1e-9)
+
+
+def test_intrinsics_per_frame_splits_and_masks(tmp_path, scene):
+    content = write_transforms(tmp_path, scene)
+    names = [frame["file_path"] for frame in content["frames"]]
+    for frame in content["frames"]:
+        frame |= {key: content[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
+        frame["mask_path"] = "masks/one.png"
+    write_images(
+        tmp_path / "masks",
+        TinyScene({"one.png": next(iter(scene.cameras.values()))}, scene.points, scene.colours),
+    )
+    content |= {"fl_x": 1.0, "train_filenames": names[:9], "test_filenames": names[9:]}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    capture = load_capture(tmp_path)
+    assert_sees_the_scene(capture, scene)
+    assert [view.split for view in capture.views] == ["train"] * 9 + ["test"] * 3
+    assert all(view.mask_path == tmp_path / "masks" / "one.png" for view in capture.views)
+
+
+def test_angles_stand_in_for_focal_lengths(tmp_path, scene):
+    camera = next(iter(scene.cameras.values()))
+    content = write_transforms(tmp_path, scene)
+    for key in ("fl_x", "fl_y", "w", "h", "cx", "cy"):
+        content.pop(key)
+    content["camera_angle_x"] = 2 * np.arctan(camera.width / 2 / camera.fx)
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    assert_sees_the_scene(load_capture(tmp_path), scene)
+
+
+def frame(pose: np.ndarray, path: str = "images/frame_000.png") -> dict:
+    return {"file_path": path, "transform_matrix": pose.tolist()}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frames": []}, "none"),
+        ({"frames": [{"file_path": "images/frame_000.png"}]}, "4x4 matrix"),
+        ({"frames": [frame(2 * np.eye(4))]}, "orthonormal"),
+        ({"frames": [frame(np.eye(4), "../frame_000.png")]}, "inside the image folder"),
+        ({"frames": [frame(np.eye(4), "images/no.png")]}, "no such image"),
+        ({"fl_x": "wide"}, "finite number"),
+        ({"fl_x": -3.0, "fl_y": -3.0}, "focal length"),
+        ({"k1": 0.2}, "lens distortion"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "lens distortion"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "not supported"),
+        ({"ply_file_path": "../../cloud.ply"}, "inside the image folder"),
+        ({"ply_file_path": None}, None),
+        ({"applied_transform": (3 * np.eye(4)[:3]).tolist()}, "orthonormal"),
+    ],
+)  # fmt: skip
+def test_mistakes_in_transforms_json_are_named(tmp_path, scene, changes, message):
+    write_transforms(tmp_path, scene, **changes)
+    if message is None:  # sparse_pc.ply is found by its usual name
+        assert len(load_capture(tmp_path).points) == len(scene.points)
+        return
+    with pytest.raises(CaptureError, match=message):
+        load_capture(tmp_path)
+
+
+@FUZZ
+@given(data=st.data())
+def test_damaged_transforms_json_ends_in_a_message_or_a_capture(tmp_path, data):
+    write_transforms(tmp_path, tiny_scene(columns=2, rows=2, points=8))
+    file = tmp_path / "transforms.json"
+    content = bytearray(file.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        position = data.draw(st.integers(0, len(content) - 1))
+        match data.draw(st.sampled_from(["flip", "digit", "cut"])):
+            case "flip":
+                content[position] ^= 1 << data.draw(st.integers(0, 7))
+            case "digit":
+                content[position : position + 1] = data.draw(
+                    st.sampled_from([b"9e999", b"null", b"[]", b"{}", b'""', b"-"])
+                )
+            case "cut":
+                del content[position : position + data.draw(st.integers(1, 400))]
+        content = content or bytearray(b"{}")
+    file.write_bytes(bytes(content))
+    with contextlib.suppress(CaptureError):
+        capture = load_capture(tmp_path)
+        assert all(np.isfinite(view.camera.camera_from_world).all() for view in capture.views)
+        assert np.isfinite(capture.points).all()
+
+
+# -------------------------------------------------------------------------------------------------- PLY
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_point_clouds_are_read_as_written(tmp_path, scene, text):
+    write_ply(tmp_path / "a.ply", scene.points, scene.colours, text=text)
+    points, colours = read_point_cloud(tmp_path / "a.ply")
+    np.testing.assert_array_equal(points, scene.points)
+    np.testing.assert_array_equal(colours, scene.colours)
+
+
+def test_point_clouds_of_other_programs_are_read(tmp_path, scene):
+    import trimesh
+
+    cloud = trimesh.PointCloud(
+        scene.points, np.column_stack([scene.colours, np.full(len(scene.points), 255)])
+    )
+    for encoding in ("ascii", "binary"):
+        (tmp_path / "a.ply").write_bytes(trimesh.exchange.ply.export_ply(cloud, encoding=encoding))
+        points, colours = read_point_cloud(tmp_path / "a.ply")
+        np.testing.assert_allclose(points, scene.points, atol=1e-5)
+        np.testing.assert_array_equal(colours, scene.colours)
+
+
+@FUZZ
+@given(data=st.data(), text=st.booleans())
+def test_damaged_point_clouds_end_in_a_message_or_points(tmp_path, data, text):
+    file = tmp_path / "a.ply"
+    write_ply(file, np.zeros((5, 3)), np.zeros((5, 3), np.uint8), text=text)
+    content = bytearray(file.read_bytes())
+    content = content[: data.draw(st.integers(0, len(content)))] if data.draw(st.booleans()) else content
+    for _ in range(3 if content else 0):
+        content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    file.write_bytes(bytes(content))
+    with contextlib.suppress(CaptureError):
+        points, colours = read_point_cloud(file)
+        assert points.shape == colours.shape
+
+
+# -------------------------------------------------------------------------------------------- Mega-NeRF
+
+
+def write_mega_nerf(root: Path, scene: TinyScene, scale: float = 50.0) -> TinyScene:
+    """As Mega-NeRF's converter: DRB world, moved and scaled.
+
+    NeRF camera axes; original names in mappings.txt.
+    """
+    drb = moved(scene, 1.0, DRB, np.zeros(3))
+    origin = np.mean([camera.position for camera in drb.cameras.values()], axis=0)
+    mappings = []
+    renamed = {}
+    for index, (name, camera) in enumerate(drb.cameras.items()):
+        folder = root / ("val" if index % 5 == 0 else "train")
+        (folder / "metadata").mkdir(parents=True, exist_ok=True)
+        in_drb = (np.linalg.inv(camera.camera_from_world) @ OPENGL)[:3]
+        in_drb[:, 3] = (in_drb[:, 3] - origin) / scale
+        torch.save(
+            {
+                "H": camera.height, "W": camera.width, "c2w": torch.tensor(in_drb, dtype=torch.float32),
+                "intrinsics": torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy]),
+                "distortion": torch.tensor([0.05, 0.0, 0.0, 0.0]),
+            },
+            folder / "metadata" / f"{index:06d}.pt",
+        )  # fmt: skip
+        renamed[f"{folder.name}/{index:06d}.png"] = scene.cameras[name]
+        mappings.append(f"{name},{index:06d}.pt")
+    torch.save({"origin_drb": torch.tensor(origin), "pose_scale_factor": scale}, root / "coordinates.pt")
+    (root / "mappings.txt").write_text("\n".join(mappings))
+    for name, camera in renamed.items():
+        one = TinyScene({Path(name).name: camera}, scene.points, scene.colours)
+        write_images(root / name.split("/")[0] / "rgbs", one)
+    return TinyScene(renamed, scene.points, scene.colours)
+
+
+@pytest.mark.parametrize("points", ["ply", "colmap", "colmap of the originals"])
+def test_mega_nerf(tmp_path, scene, points):
+    """The split is the shipped one, down is x, and points may come from a COLMAP model in any world."""
+    renamed = write_mega_nerf(tmp_path, scene)
+    if points == "ply":
+        write_ply(tmp_path / "points3D.ply", scene.points @ DRB.T, scene.colours)
+    else:
+        of = scene if "originals" in points else TinyScene(
+            {Path(name).name: camera for name, camera in renamed.cameras.items()}, scene.points, scene.colours
+        )  # fmt: skip
+        angle = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+        write_colmap(tmp_path, moved(of, 0.07, angle, np.array([1.0, 2, 3])), images=None)
+    capture = load_capture(tmp_path)
+    assert capture.source == "mega-nerf"
+    assert capture.ground.metric
+    assert {view.name for view in capture.test_views} == {n for n in renamed.cameras if n.startswith("val/")}
+    assert_sees_the_scene(capture, renamed)
+    back = capture.points - np.median(capture.points, axis=0)
+    np.testing.assert_allclose(back, scene.points - np.median(scene.points, axis=0), atol=1e-3)
+
+
+def test_mistakes_in_mega_nerf_folders_are_named(tmp_path, scene):
+    write_mega_nerf(tmp_path, scene)
+    with pytest.raises(CaptureError, match=r"brings no 3D points(?s:.)*points3D\.ply"):
+        load_capture(tmp_path)
+    write_ply(tmp_path / "points3D.ply", scene.points @ DRB.T, scene.colours)
+    file = tmp_path / "train" / "metadata" / "000001.pt"
+    whole = file.read_bytes()
+    for content in (whole[:100], b"", b"not torch at all", whole[:-60]):
+        file.write_bytes(content)
+        with pytest.raises(CaptureError, match=r"000001\.pt: cannot be read as a torch file"):
+            load_capture(tmp_path)
+    torch.save({"H": 48, "W": 64}, file)
+    with pytest.raises(CaptureError, match="needs 'intrinsics'"):
+        load_capture(tmp_path)
+    file.write_bytes(whole)
+    (tmp_path / "train" / "rgbs" / "000002.png").unlink()
+    with pytest.raises(CaptureError, match=r"1 images named by metadata are missing(?s:.)*000002\.pt"):
+        load_capture(tmp_path)
+
+
+def test_a_foreign_colmap_model_is_refused(tmp_path, scene):
+    write_mega_nerf(tmp_path, scene)
+    shuffled = np.random.default_rng(0).permutation(list(scene.cameras))
+    others = dict(zip(shuffled.tolist(), scene.cameras.values(), strict=True))
+    write_colmap(tmp_path, TinyScene(others, scene.points, scene.colours), images=None)
+    with pytest.raises(CaptureError, match="disagree"):
+        load_capture(tmp_path)
+
+
+# -------------------------------------------------------------------------------------------- MatrixCity
+
+
+KEYS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
+
+
+def matrixcity_frames(scene: TinyScene, block: str, unit: float) -> list[dict]:
+    frames = []
+    for index, camera in enumerate(scene.cameras.values()):
+        pose = np.linalg.inv(camera.camera_from_world) @ OPENGL
+        pose[:3, 3] /= unit
+        frames.append(
+            {
+                "file_path": f"../../{block}/{index:04d}.png",
+                "frame_index": index,
+                "transform_matrix": pose.tolist(),
+            }
+        )
+    return frames
+
+
+def halves(scene: TinyScene) -> tuple[TinyScene, TinyScene]:
+    items = list(scene.cameras.items())
+    parts = []
+    for part in (items[:9], items[9:]):
+        cameras = {f"{index:04d}.png": camera for index, (_, camera) in enumerate(part)}
+        parts.append(TinyScene(cameras, scene.points, scene.colours))
+    return parts[0], parts[1]
+
+
+def test_matrixcity_pose_folder(tmp_path, scene):
+    """pose/<block>/transforms_train.json: units of 100 m, images found above, in their blocks."""
+    train, test = halves(scene)
+    first = next(iter(scene.cameras.values()))
+    intrinsics = {key: getattr(first, name) for key, name in KEYS.items()}
+    intrinsics["camera_angle_x"] = 2 * np.arctan(first.width / 2 / first.fx)
+    root = tmp_path / "aerial" / "pose" / "block_A"
+    root.mkdir(parents=True)
+    for side, part, block in (("train", train, "train/block_1"), ("test", test, "test/block_1_test")):
+        content = intrinsics | {"frames": matrixcity_frames(part, block, 100.0)}
+        (root / f"transforms_{side}.json").write_text(json.dumps(content))
+        write_images(tmp_path / "aerial" / block, part)
+    write_ply(root / "points3D.ply", scene.points / 100, scene.colours)
+    capture = load_capture(root)
+    assert capture.source == "matrixcity"
+    assert capture.ground.metric
+    assert (len(capture.train_views), len(capture.test_views)) == (9, 3)
+    both = {f"train/block_1/{n}": c for n, c in train.cameras.items()}
+    both |= {f"test/block_1_test/{n}": c for n, c in test.cameras.items()}
+    assert_sees_the_scene(capture, TinyScene(both, scene.points, scene.colours))
+    np.testing.assert_allclose(np.ptp(capture.points, axis=0), np.ptp(scene.points, axis=0), rtol=1e-9)
+    (tmp_path / "aerial" / "train" / "block_1" / "0003.png").unlink()
+    with pytest.raises(CaptureError, match=r"0003\.png' is not found(?s:.)*Unpack the \.tar"):
+        load_capture(root)
+
+
+def test_matrixcity_blocks(tmp_path, scene):
+    """train/<block>/transforms.json: metres, the rotation divided by 100, images in rgb/."""
+    train, test = halves(scene)
+    first = next(iter(scene.cameras.values()))
+    for part, block in ((train, "train/block_1"), (test, "test/block_1_test")):
+        frames = []
+        for frame in matrixcity_frames(part, block, 1.0):
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, :3] *= 0.01
+            frames.append({"frame_index": frame["frame_index"], "rot_mat": pose.tolist()})
+        (tmp_path / block).mkdir(parents=True)
+        content = {"camera_angle_x": 2 * np.arctan(first.width / 2 / first.fx), "frames": frames}
+        (tmp_path / block / "transforms.json").write_text(json.dumps(content))
+        write_images(tmp_path / block / "rgb", part)
+    write_ply(tmp_path / "points3D.ply", scene.points, scene.colours)
+    capture = load_capture(tmp_path)
+    assert capture.ground.metric
+    both = {f"train/block_1/rgb/{n}": c for n, c in train.cameras.items()}
+    both |= {f"test/block_1_test/rgb/{n}": c for n, c in test.cameras.items()}
+    assert_sees_the_scene(capture, TinyScene(both, scene.points, scene.colours))
+    np.testing.assert_allclose(np.ptp(capture.points, axis=0), np.ptp(scene.points, axis=0), rtol=1e-9)

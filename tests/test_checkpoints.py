@@ -1,0 +1,91 @@
+"""States are whole or absent; a damaged one is noticed and the one before it used."""
+
+import json
+
+import pytest
+import torch
+
+from vdgs.checkpoints import SavedState, load_newest, remove_leftovers, save_state
+from vdgs.errors import VdgsError
+
+
+def state(iteration: int) -> SavedState:
+    generator = torch.Generator().manual_seed(iteration)
+    return SavedState(
+        iteration, {"loss": "nan"}, {"a": torch.randn(50, 3, generator=generator), "b": torch.arange(4)}
+    )
+
+
+def same(left: SavedState, right: SavedState) -> bool:
+    return left.iteration == right.iteration and all(
+        torch.equal(left.tensors[k], right.tensors[k]) for k in "ab"
+    )
+
+
+def test_what_is_saved_is_loaded(tmp_path):
+    save_state(tmp_path, state(7))
+    loaded, complaints = load_newest(tmp_path)
+    assert loaded is not None
+    assert same(loaded, state(7))
+    assert complaints == []
+
+
+def test_the_two_newest_are_kept(tmp_path):
+    for iteration in (1, 2, 3, 4):
+        save_state(tmp_path, state(iteration))
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        f"{i:08d}.{e}" for i in (3, 4) for e in ("json", "safetensors")
+    ]
+
+
+@pytest.mark.parametrize("damage", ["truncate", "flip", "delete", "json"])
+def test_a_damaged_state_falls_back_to_the_one_before(tmp_path, damage):
+    save_state(tmp_path, state(1))
+    save_state(tmp_path, state(2))
+    newest = tmp_path / "00000002.safetensors"
+    data = bytearray(newest.read_bytes())
+    if damage == "truncate":
+        newest.write_bytes(data[: len(data) // 2])
+    elif damage == "flip":
+        data[-5] ^= 4
+        newest.write_bytes(data)
+    elif damage == "delete":
+        newest.unlink()
+    else:
+        newest.with_suffix(".json").write_text("{")
+    loaded, complaints = load_newest(tmp_path)
+    assert loaded is not None
+    assert same(loaded, state(1))
+    assert len(complaints) == 1
+    assert "00000002" in complaints[0]
+
+
+def test_nothing_whole_is_said(tmp_path):
+    save_state(tmp_path, state(1))
+    (tmp_path / "00000001.safetensors").write_bytes(b"")
+    loaded, complaints = load_newest(tmp_path)
+    assert loaded is None
+    assert len(complaints) == 1
+
+
+def test_leftovers_of_a_cut_off_write_are_removed(tmp_path):
+    save_state(tmp_path, state(1))
+    (tmp_path / ".00000002.safetensors.99.tmp").write_bytes(b"half")
+    (tmp_path / "00000003.safetensors").write_bytes(b"no json yet")
+    remove_leftovers(tmp_path)
+    assert sorted(p.suffix for p in tmp_path.iterdir()) == [".json", ".safetensors"]
+    assert json.loads((tmp_path / "00000001.json").read_text())["iteration"] == 1
+
+
+def test_a_refusing_disk_is_reported_and_loses_nothing(tmp_path, monkeypatch):
+    save_state(tmp_path, state(1))
+
+    def full(*_args, **_kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("vdgs.checkpoints.save_file", full)
+    with pytest.raises(VdgsError, match=r"No space left.*continues"):
+        save_state(tmp_path, state(2))
+    loaded, _ = load_newest(tmp_path)
+    assert loaded is not None
+    assert same(loaded, state(1))

@@ -1,0 +1,75 @@
+"""The command line: help comes without heavy imports, errors come without tracebacks."""
+
+import subprocess
+import sys
+
+import pytest
+
+from vdgs.cli import HELP, VERBS, main
+
+HEAVY = ("torch", "numpy", "matplotlib", "pycolmap", "cv2", "scipy")
+
+
+def vdgs(*arguments: str, **kwargs) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, "-m", "vdgs.cli", *arguments], capture_output=True, text=True, timeout=120
+    )
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["coarse", "--help"], ["eval", "--help"]])
+def test_help_imports_nothing_heavy(arguments):
+    code = (
+        "import sys\nfrom vdgs.cli import main\n"
+        f"try:\n    main({arguments!r})\nexcept SystemExit as exit:\n    assert not exit.code, exit.code\n"
+        f"heavy = [name for name in {HEAVY!r} if name in sys.modules]\nassert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "usage" in done.stdout.lower()
+
+
+def test_every_verb_is_in_the_help_and_has_an_action():
+    from vdgs import verbs
+
+    for verb in VERBS:
+        assert f"  {verb} " in HELP
+        assert callable(getattr(verbs, verb))
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_explains_itself(verb, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([verb, "--help"])
+    assert ended.value.code == 0
+    assert len(capsys.readouterr().out) > 100
+
+
+def test_the_preset_decides_the_defaults(capsys):
+    with pytest.raises(SystemExit):
+        main(["coarse", "--preset", "laptop", "--help"])
+    laptop = capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["coarse", "--help"])
+    assert "100000" in capsys.readouterr().out
+    assert "100000" not in laptop
+
+
+def test_an_unknown_verb_is_a_usage_error(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["trian"])
+    assert ended.value.code == 2
+    assert "trian" in capsys.readouterr().err
+
+
+def test_a_missing_capture_is_one_line_and_no_traceback(tmp_path):
+    done = vdgs("coarse", str(tmp_path / "nowhere"), "--output", str(tmp_path / "run"))
+    assert done.returncode == 1
+    assert "nowhere" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "run" / "config.yaml").exists()
+
+
+def test_settings_that_do_not_work_are_named(tmp_path):
+    done = vdgs("coarse", str(tmp_path), "--output", str(tmp_path / "run"), "--iterations", "0")
+    assert done.returncode == 1
+    assert "iterations is 0" in done.stderr

@@ -1,0 +1,78 @@
+"""Laws of culling: nothing that touches the image is lost, and little that does not is kept."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from decode_scenes import looking_down, turned
+from vdgs.cameras import NEAR
+from vdgs.kernels.native import module
+from vdgs.kernels.native.cull import cull as native_cull
+from vdgs.kernels.reference.cull import cull as twin_cull
+from vdgs.kernels.reference.project import project
+
+CAMERAS = [looking_down(), looking_down("orthographic"), turned()]
+BOTH = pytest.mark.parametrize("cull", [twin_cull, native_cull])
+
+
+def anchors(
+    n: int, seed: int, spread: float = 8.0, log_scale: float = -1.0
+) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    return spread * torch.randn(n, 3, generator=g), torch.randn(n, 6, generator=g) + log_scale
+
+
+def ellipse_touches_image(positions, log_scales, camera) -> torch.Tensor:
+    """Whether the box around the projected 3-sigma ellipse (axes of the world) meets the image."""
+    identity = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(len(positions), 4)
+    projected = project(positions.double(), log_scales[:, :3].double().exp(), identity, camera)
+    xx, xy, yy = projected.conics.unbind(-1)
+    reach = 3 * torch.sqrt(torch.stack([yy, xx], -1) / (xx * yy - xy * xy)[:, None])
+    size = torch.tensor([camera.width, camera.height])
+    inside = (projected.means_px + reach > 1e-3) & (projected.means_px - reach < size - 1e-3)
+    return projected.valid & inside.all(-1)
+
+
+@BOTH
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10**6), spread=st.floats(0.5, 30), log_scale=st.floats(-6, 3), which=st.integers(0, 2)
+)
+def test_never_drops_what_touches_the_image(cull, seed, spread, log_scale, which):
+    positions, log_scales = anchors(400, seed, spread, log_scale)
+    touching = ellipse_touches_image(positions, log_scales, CAMERAS[which]).nonzero()[:, 0]
+    assert set(touching.tolist()) <= set(cull(positions, log_scales, CAMERAS[which]).tolist())
+
+
+@BOTH
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_keeps_little_else(cull, camera):
+    positions, log_scales = anchors(20_000, seed=1, log_scale=-2.0)
+    kept = cull(positions, log_scales, camera)
+    touching = ellipse_touches_image(positions, log_scales, camera)
+    assert len(kept) < 1.5 * int(touching.sum())
+    assert (torch.diff(kept) > 0).all()
+    _, depths = camera.project(positions[kept].double().numpy())
+    assert (depths > NEAR).all()
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("n", [0, 1, 15, 17, 5000])
+@pytest.mark.parametrize("isa", module.supported())
+def test_native_equals_the_twin(camera, n, isa, monkeypatch):
+    monkeypatch.setattr(module, "native", lambda: module.load(isa))
+    positions, log_scales = anchors(n, seed=2)
+    ours = set(native_cull(positions, log_scales, camera).tolist())
+    twin = set(twin_cull(positions.double(), log_scales.double(), camera).tolist())
+    assert len(ours ^ twin) <= n // 1000  # the last bit decides at the bound
+
+
+@BOTH
+def test_what_is_not_a_number_is_dropped(cull):
+    positions, log_scales = torch.zeros(5, 3), torch.zeros(5, 6)
+    positions[0, 0] = positions[1, 2] = float("nan")
+    positions[2, 1] = float("inf")
+    assert cull(positions, log_scales, looking_down()).tolist() == [3, 4]

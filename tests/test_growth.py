@@ -1,0 +1,141 @@
+"""Laws of growth: new anchors fill empty cells that hold a strong offset, and nothing else."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vdgs.anchors import Anchors
+from vdgs.config import GrowthConfig
+from vdgs.growth import Statistics, decide
+
+K = 4
+ALWAYS = GrowthConfig(gate=0.0, levels=1, coarsest_cell=1.0, threshold=1.0)
+
+
+def anchors(n: int, seed: int = 0) -> Anchors:
+    g = torch.Generator().manual_seed(seed)
+    return Anchors(
+        positions=torch.round(torch.randn(n, 3, generator=g) * 4),
+        features=torch.randn(n, 32, generator=g),
+        offsets=torch.randn(n, K, 3, generator=g),
+        log_scales=torch.randn(n, 6, generator=g) * 0.3,
+    )
+
+
+def statistics(n: int, gradient: float = 10.0, seed: int = 0) -> Statistics:
+    g = torch.Generator().manual_seed(seed)
+    drawn = torch.ones(n, K)
+    return Statistics(gradient * torch.rand(n, K, generator=g), drawn, torch.ones(n), torch.ones(n))
+
+
+def cell_of(points: torch.Tensor, cell: float) -> set[tuple[int, ...]]:
+    return {tuple(int(c) for c in row) for row in torch.floor(points / cell + 0.5)}
+
+
+@settings(deadline=None, max_examples=25)
+@given(n=st.integers(1, 60), seed=st.integers(0, 1000), cell=st.sampled_from([0.5, 1.0, 2.5]))
+def test_new_anchors_are_centred_in_empty_cells_that_hold_a_strong_offset(n, seed, cell):
+    before = anchors(n, seed)
+    stats = statistics(n, seed=seed)
+    strong = stats.gradient >= ALWAYS.threshold
+    means = before.positions[:, None] + before.offsets * before.log_scales[:, None, :3].exp()
+    added = decide(before, stats, cell, ALWAYS, torch.Generator().manual_seed(seed)).added
+    new = cell_of(added.positions, cell)
+    assert len(new) == len(added)
+    assert new.isdisjoint(cell_of(before.positions, cell))
+    assert new <= cell_of(means[strong], cell)
+    centred = torch.round(added.positions / cell) * cell
+    torch.testing.assert_close(added.positions, centred, atol=1e-4, rtol=1e-5)
+    assert torch.all(added.offsets == 0)
+    torch.testing.assert_close(added.log_scales, torch.full_like(added.log_scales, math.log(cell)))
+
+
+def test_the_random_keep_follows_its_share():
+    before, stats = anchors(20_000), statistics(20_000)
+    stats.gradient[:] = 10.0
+    before.positions[:, 0] = torch.arange(20_000) * 10.0 - 1e5
+    added = decide(before, stats, 0.2, ALWAYS, torch.Generator().manual_seed(1)).added
+    assert 0.48 < len(added) / (20_000 * K) < 0.52
+
+
+def test_features_are_the_elementwise_maximum_of_the_parents():
+    parents = Anchors(
+        positions=torch.tensor([[0.0, 0, 0], [10.0, 0, 0]]),
+        features=torch.stack([torch.linspace(-1, 1, 32), torch.linspace(1, -1, 32)]),
+        offsets=torch.zeros(2, 1, 3),
+        log_scales=torch.zeros(2, 6),
+    )
+    parents.offsets[0, 0, 0], parents.offsets[1, 0, 0] = 5.0, -5.0  # both Gaussians lie at x = 5
+    config = GrowthConfig(gate=0.0, levels=1, coarsest_cell=1.0)
+    for seed in range(50):
+        stats = Statistics(torch.ones(2, 1), torch.ones(2, 1), torch.ones(2), torch.ones(2))
+        added = decide(parents, stats, 1.0, config, torch.Generator().manual_seed(seed)).added
+        if len(added) and bool((added.features[0] >= 0).all()):
+            torch.testing.assert_close(added.features[0], parents.features.amax(0))
+            return
+    pytest.fail("both parents were never kept together in 50 draws")
+
+
+def test_what_lies_beyond_the_lattice_does_not_grow():
+    before, stats = anchors(3), statistics(3)
+    stats.gradient[:] = 10.0
+    before.positions[0] = 1e9
+    before.positions[1] = float("inf")
+    added = decide(before, stats, 1.0, ALWAYS, torch.Generator().manual_seed(0)).added
+    assert 0 < len(added) <= K
+    assert float(added.positions.abs().max()) < 1000
+
+
+def test_weak_gradients_and_unseen_offsets_grow_nothing():
+    before = anchors(30)
+    weak = Statistics(torch.full((30, K), 0.5), torch.ones(30, K), torch.ones(30), torch.ones(30))
+    assert len(decide(before, weak, 1.0, ALWAYS, torch.Generator()).added) == 0
+    gated = GrowthConfig(gate=0.4, interval=100, threshold=0.0)
+    unseen = Statistics(torch.full((30, K), 9.0), torch.full((30, K), 40.0), torch.ones(30), torch.ones(30))
+    assert len(decide(before, unseen, 1.0, gated, torch.Generator()).added) == 0
+
+
+def test_statistics_are_reset_only_where_they_were_judged():
+    stats = statistics(2)
+    stats.drawn = torch.tensor([[41.0, 40.0, 0.0, 90.0], [1.0, 2.0, 3.0, 41.0]])
+    stats.seen = torch.tensor([81.0, 80.0])
+    config = GrowthConfig(gate=0.4, prune_views=0.8, interval=100, levels=0)
+    decide(anchors(2), stats, 1.0, config, torch.Generator())
+    assert stats.drawn.tolist() == [[0, 40, 0, 0], [1, 2, 3, 0]]
+    assert stats.seen.tolist() == [0, 80]
+
+
+def test_faint_anchors_go_once_they_were_seen_often_enough():
+    stats = statistics(3)
+    stats.seen = torch.tensor([100.0, 100.0, 10.0])
+    stats.opacity = torch.tensor([0.4, 0.6, 0.0])  # limit 0.005 per view
+    config = GrowthConfig(levels=0, interval=100)
+    decision = decide(anchors(3), stats, 1.0, config, torch.Generator())
+    assert decision.kept.tolist() == [False, True, True]
+    assert decision.pruned == 1
+
+
+def test_the_budget_serves_the_strongest_first():
+    before, stats = anchors(200), statistics(200)
+    free = decide(before, statistics(200), 0.1, ALWAYS, torch.Generator().manual_seed(0)).added
+    config = GrowthConfig(gate=0.0, levels=1, coarsest_cell=1.0, threshold=1.0, max_anchors=210)
+    capped = decide(before, stats, 0.1, config, torch.Generator().manual_seed(0)).added
+    assert len(free) > 10
+    assert len(capped) == 10
+    assert cell_of(capped.positions, 0.1) <= cell_of(free.positions, 0.1)
+
+
+def test_a_view_is_counted_where_it_was_drawn():
+    stats = Statistics.zeros(5, K)
+    visible = torch.tensor([1, 3])
+    source = torch.tensor([0, 2, K + 1], dtype=torch.int32)  # anchor 1: offsets 0, 2; anchor 3: offset 1
+    gradient = torch.tensor([[3.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    stats.add_view(visible, source, torch.tensor([0.5, 0.25, 1.0]), gradient, width=4, height=2)
+    assert stats.gradient[1].tolist() == [6.0, 0.0, 1.0, 0.0]
+    assert stats.gradient[3, 1] == pytest.approx(math.hypot(2.0, 1.0))
+    assert stats.drawn.sum() == 3
+    assert stats.opacity.tolist() == [0, 0.75, 0, 1.0, 0]
+    assert stats.seen.tolist() == [0, 1, 0, 1, 0]

@@ -1,0 +1,220 @@
+"""The generated town: what is written is true, repeatable, and worth looking at."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("embreex")
+import pycolmap
+
+from vdgs.cameras import Camera
+from vdgs.errors import VdgsError
+from vdgs.synth import SynthOptions, generate
+from vdgs.synth.flight import fly
+from vdgs.synth.photography import sample_offsets
+from vdgs.synth.streets import street_plan
+from vdgs.synth.terrain import Terrain
+from vdgs.synth.town import build_town
+from vdgs.synth.zones import Zone
+
+TINY = SynthOptions(
+    seed=3, images=6, width=96, height=72, extent_m=50.0, points=400, noise_px=0.3, truth=True
+)
+
+
+FLAT = Terrain(60.0, (0.0, 1.0, 2.0, 3.0))
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("synth") / "capture"
+    generate(folder, TINY)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(capture: Path) -> pycolmap.Reconstruction:
+    return pycolmap.Reconstruction(str(capture / "sparse" / "0"))
+
+
+def camera_of(image: pycolmap.Image) -> Camera:
+    rigid = np.eye(4)
+    rigid[:3] = image.cam_from_world().matrix()
+    fx, fy, cx, cy = image.camera.params
+    return Camera(rigid, fx, fy, cx, cy, image.camera.width, image.camera.height)
+
+
+def observations(
+    model: pycolmap.Reconstruction,
+) -> list[tuple[Camera, str, np.ndarray, np.ndarray, np.ndarray]]:
+    """Per image: camera, name, observed pixels [n, 2], points [n, 3], rows of the points [n]."""
+    found = []
+    for image in model.images.values():
+        seen = [(point.xy, point.point3D_id) for point in image.points2D if point.has_point3D()]
+        ids = np.array([identity for _, identity in seen])
+        points = np.array([model.points3D[identity].xyz for identity in ids])
+        found.append((camera_of(image), image.name, np.array([xy for xy, _ in seen]), points, ids - 1))
+    return found
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_points_reproject_to_within_the_noise(model: pycolmap.Reconstruction) -> None:
+    residuals = []
+    for camera, _, pixels, points, _ in observations(model):
+        projected, depth = camera.project(points)
+        assert (depth > 0).all()
+        residuals.append(projected - pixels)
+    rms = np.sqrt(np.mean(np.concatenate(residuals) ** 2))
+    # a fitted point takes up part of the noise, never adds to it
+    assert 0.3 * TINY.noise_px < rms <= 1.05 * TINY.noise_px
+
+
+def test_every_track_is_truly_seen(capture: Path, model: pycolmap.Reconstruction) -> None:
+    visibility = np.load(capture / "truth" / "visibility.npy", allow_pickle=False)
+    assert visibility.shape == (model.num_points3D(), model.num_images())
+    assert model.num_points3D() > 0.5 * TINY.points
+    for point_id, point in model.points3D.items():
+        seen_by = [element.image_id - 1 for element in point.track.elements]
+        assert len(set(seen_by)) == len(seen_by) >= 2
+        assert visibility[point_id - 1, seen_by].all()
+
+
+def test_depth_maps_agree_with_the_tracks(capture: Path, model: pycolmap.Reconstruction) -> None:
+    places = np.load(capture / "truth" / "places.npy", allow_pickle=False)
+    agreeing, total = 0, 0
+    for camera, name, _, _, rows in observations(model):
+        depth = np.load(capture / "truth" / "depth" / f"{Path(name).stem}.npy", allow_pickle=False)
+        assert depth.shape == (camera.height, camera.width)
+        assert np.isfinite(depth).all(), "the drone never looks above the horizon"
+        pixels, true_depth = camera.project(places[rows])
+        column, row = np.floor(pixels).astype(int).T
+        around = [
+            depth[np.clip(row + dy, 0, camera.height - 1), np.clip(column + dx, 0, camera.width - 1)]
+            for dy in (-1, 0, 1)
+            for dx in (-1, 0, 1)
+        ]
+        # a place lies between the depths of the pixels around it, give or take a steep surface
+        inside = (true_depth > np.min(around, 0) - 0.15) & (true_depth < np.max(around, 0) + 0.15)
+        agreeing, total = agreeing + inside.sum(), total + len(inside)
+    assert agreeing > 0.97 * total
+
+
+def test_the_same_options_give_the_same_bytes(capture: Path, tmp_path: Path) -> None:
+    generate(tmp_path / "again", replace(TINY, workers=1))
+    first, second = files(capture), files(tmp_path / "again")
+    assert first.keys() == second.keys()
+    assert [name for name in first if first[name] != second[name]] == []
+
+
+def test_pictures_show_something_everywhere(capture: Path) -> None:
+    for path in sorted((capture / "images").glob("*.jpg")):
+        image = np.asarray(Image.open(path), np.float64) / 255
+        assert image.shape == (TINY.height, TINY.width, 3)
+        assert 0.2 < image.mean() < 0.7
+        assert image.std() > 0.08
+        tiles = image[:72, :96].mean(2).reshape(3, 24, 4, 24).swapaxes(1, 2).reshape(12, -1)
+        assert (tiles.std(1) > 0.015).all(), f"{path.name} has an empty corner"
+        saturation = image.max(2) - image.min(2)
+        assert saturation.mean() > 0.04
+
+
+def test_the_world_is_metric_and_z_is_up(model: pycolmap.Reconstruction) -> None:
+    points = np.array([point.xyz for point in model.points3D.values()])
+    centres = np.array([camera_of(image).position for image in model.images.values()])
+    assert np.abs(np.median(points[:, 2])) < 8
+    assert (centres[:, 2] > 25).all()
+    assert points[:, 2].max() < centres[:, 2].min()
+
+
+def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(VdgsError, match="not empty"):
+        generate(tmp_path, TINY)
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
+    def interrupt(stage: str, done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        generate(tmp_path / "capture", TINY, interrupt)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(VdgsError, match=r"vdgs\[synth\]"):
+        generate(tmp_path / "capture", TINY)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"images": 1}, {"extent_m": 5.0}, {"samples_per_pixel": 0}, {"size": "city"}]
+)
+def test_options_that_make_no_capture_are_refused(wrong: dict, tmp_path: Path) -> None:
+    with pytest.raises(VdgsError):
+        generate(tmp_path / "capture", replace(TINY, **wrong))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_options_import_no_numerics() -> None:
+    code = "import sys, vdgs.synth.options; sys.exit('numpy' in sys.modules or 'torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("flight", ["uneven", "even"])
+@pytest.mark.parametrize("images", [48, 120, 41])
+def test_test_views_fall_all_over_the_place(flight: str, images: int) -> None:
+    options = replace(SynthOptions(images=images), flight=flight).resolved()
+    cameras = fly(options, FLAT)
+    places = np.array([camera.position[:2] for camera in cameras])
+    held_out = places[::8]
+    assert (np.abs(held_out.mean(0) - places.mean(0)) < 0.25 * options.extent_m).all()
+    assert (held_out.std(0) > 0.6 * places.std(0)).all()
+    tilts = [camera.forward[2] for camera in cameras]
+    assert max(tilts) < -np.cos(np.radians(52)), "no camera looks near the horizon"
+
+
+def test_uneven_flight_is_denser_over_the_centre() -> None:
+    share = {}
+    for flight in ("uneven", "even"):
+        options = replace(SynthOptions(), flight=flight).resolved()
+        places = np.array([camera.position[:2] for camera in fly(options, FLAT)])
+        share[flight] = np.mean(np.abs(places).max(1) < 0.3 * options.extent_m)
+    assert share["uneven"] > 1.2 * share["even"]
+
+
+def test_plan_coordinates_invert() -> None:
+    plan = street_plan(np.random.default_rng(0), 200.0)
+    p, q = np.random.default_rng(1).uniform(-150, 150, (2, 200))
+    back = plan.to_plan(*plan.to_world(p, q))
+    np.testing.assert_allclose(back, (p, q), atol=1e-4)
+
+
+def test_every_seed_gives_a_town_of_its_own() -> None:
+    towns = [build_town(seed, 50.0) for seed in (0, 1)]
+    assert towns[0].mesh.vertices.shape != towns[1].mesh.vertices.shape
+    for town in towns:
+        square_metres = np.bincount(town.zones.cells.ravel(), minlength=len(Zone)) * town.zones.cell**2
+        assert (square_metres[[Zone.LAWN, Zone.BUILDING, Zone.SQUARE]] > 400).all()
+        assert np.isfinite(town.mesh.vertices).all()
+        assert np.isfinite(town.mesh.normals).all()
+        assert town.mesh.faces.max() < len(town.mesh.vertices)
+
+
+@pytest.mark.parametrize("count", [1, 4, 7, 9])
+def test_samples_surround_the_pixel_centre(count: int) -> None:
+    offsets = sample_offsets(count)
+    assert offsets.shape == (count, 2)
+    assert np.abs(offsets).max() < 0.8
+    assert np.abs(offsets.mean(0)).max() < 1e-12

@@ -1,0 +1,200 @@
+"""Training: deterministic, resumable bit for bit, loud when it diverges."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from vdgs.anchors import AnchorModel, initial_anchors
+from vdgs.cameras import Camera
+from vdgs.checkpoints import load_newest, save_state
+from vdgs.config import AnchorConfig, GrowthConfig, TrainConfig
+from vdgs.decoder import Decoder
+from vdgs.errors import TrainingDiverged, VdgsError
+from vdgs.kernels.native.module import set_threads, threads
+from vdgs.render import render
+from vdgs.training import Stage, downscale_at, from_saved, start_state, to_saved, train, train_step, view_at
+
+SIZE = (48, 40)
+BLACK = (0.0, 0.0, 0.0)
+CONFIG = TrainConfig(
+    iterations=60,
+    resolutions=((0.0, 2), (0.5, 1)),
+    anchors=AnchorConfig(offsets=4, appearance=3),
+    growth=GrowthConfig(interval=10, statistics_from=5, start=20, until=0.9, threshold=1e-6, gate=0.05),
+)
+
+
+class Photographs:
+    """Eight views from above of a coloured checkerboard plane, ray cast exactly."""
+
+    def __init__(self) -> None:
+        self.cameras = [self._camera(x, y) for x in (-2.0, -0.7, 0.7, 2.0) for y in (-1.0, 1.0)]
+
+    @staticmethod
+    def _camera(x: float, y: float) -> Camera:
+        pose = np.diag([1.0, -1.0, -1.0, 1.0])
+        pose[:3, 3] = -pose[:3, :3] @ np.array([x, y, 5.0])
+        width, height = SIZE
+        return Camera(pose, 40.0, 40.0, width / 2, height / 2, width, height)
+
+    def camera(self, index: int, downscale: int = 1) -> Camera:
+        return self.cameras[index].resized(SIZE[0] // downscale, SIZE[1] // downscale)
+
+    def get(self, index: int, downscale: int = 1):
+        camera = self.camera(index, downscale)
+        v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+        x = camera.position[0] + (u - camera.cx) / camera.fx * 5
+        y = camera.position[1] - (v - camera.cy) / camera.fy * 5
+        checks = (np.floor(x) + np.floor(y)) % 2
+        picture = np.stack([0.2 + 0.6 * checks, 0.5 + 0.1 * x, 0.5 + 0.1 * y], axis=-1)
+        return torch.from_numpy((picture.clip(0, 1) * 255).astype(np.uint8)), None
+
+    def prefetch(self, indices, downscale: int = 1) -> None:
+        pass
+
+
+def stage(config: TrainConfig = CONFIG) -> Stage:
+    return Stage(config, Photographs(), 8, 0.4, 5.0)
+
+
+def start(config: TrainConfig = CONFIG):
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-4, 4, (300, 2)), np.zeros((300, 1))], axis=1)
+    anchors, _ = initial_anchors(points, np.full((300, 3), 128, np.uint8), replace(config.anchors, voxel=0.4))
+    generator = torch.Generator().manual_seed(config.seed)
+    return start_state(
+        anchors, Decoder.initial(config.anchors.offsets, False, config.anchors.appearance, 8, generator)
+    )
+
+
+def run(state, stage_, until: int | None = None):
+    train(
+        state, stage_,
+        stop=lambda: until is not None and state.iteration >= until, after_step=lambda *_: None,
+    )  # fmt: skip
+    return state
+
+
+def bits(state) -> dict[str, bytes]:
+    return {name: tensor.numpy().tobytes() for name, tensor in to_saved(state).tensors.items()}
+
+
+@pytest.fixture(scope="module")
+def unbroken():
+    return run(start(), stage())
+
+
+def test_training_learns_the_place():
+    state = run(start(longer := replace(CONFIG, iterations=400)), stage(longer))
+    model = AnchorModel(state.anchors, state.decoder, 0.4, BLACK, {})
+    photographs = Photographs()
+    errors = []
+    for index in range(8):
+        picture = render(model, photographs.camera(index), image=index).image
+        errors.append(float(((picture - photographs.get(index)[0].float() / 255) ** 2).mean()))
+    before = float(torch.var(photographs.get(0)[0].float() / 255))
+    assert np.mean(errors) < 0.2 * before
+    assert len(state.anchors) > len(start().anchors)
+
+
+def test_a_stopped_and_continued_run_has_the_same_bits(unbroken, tmp_path):
+    state = start()
+    for stop_at in (1, 13, 20, 33, 59):
+        run(state, stage(), until=stop_at)
+        assert state.iteration == stop_at
+        save_state(tmp_path, to_saved(state))
+        saved, _ = load_newest(tmp_path)
+        assert saved is not None
+        state = from_saved(saved)
+    assert bits(run(state, stage())) == bits(unbroken)
+
+
+def test_the_number_of_threads_changes_no_bit(unbroken):
+    before = threads()
+    try:
+        set_threads(1 if before > 1 else 3)
+        assert bits(run(start(), stage())) == bits(unbroken)
+    finally:
+        set_threads(before)
+
+
+def test_another_seed_is_another_run(unbroken):
+    config = replace(CONFIG, seed=1, iterations=10)
+    assert bits(run(start(config), stage(config))) != bits(
+        run(start(), stage(replace(CONFIG, iterations=10)))
+    )
+
+
+def test_every_view_is_used_once_an_epoch():
+    for epoch in range(3):
+        assert sorted(view_at(epoch * 7 + i, 7, seed=3) for i in range(7)) == list(range(7))
+
+
+def test_the_resolution_schedule():
+    assert [downscale_at(i, CONFIG) for i in (0, 29, 30, 59)] == [2, 2, 1, 1]
+
+
+def test_parameters_state_and_statistics_stay_aligned(unbroken):
+    n = len(unbroken.anchors)
+    tensors = {name: t for name, t in to_saved(unbroken).tensors.items() if "decoder" not in name}
+    assert {t.shape[0] for t in tensors.values()} == {n}
+
+
+def test_anchors_that_no_camera_sees_keep_their_bits():
+    state = start()
+    far = state.anchors.positions[:, 0] > 3.5
+    state.anchors.positions[far] += torch.tensor([1000.0, 0.0, 0.0])
+    before = state.anchors.select(far)
+    run(state, stage(), until=9)
+    after = state.anchors.select(state.anchors.positions[:, 0] > 500)
+    assert all(torch.equal(before.tensors()[name], after.tensors()[name]) for name in before.tensors())
+
+
+def test_a_parameter_that_is_not_a_number_stops_training():
+    state = start()
+    with torch.no_grad():
+        state.decoder.weights.colour.w2[:] = float("nan")
+    with pytest.raises(TrainingDiverged, match="iteration 1"):
+        train_step(state, stage())
+
+
+def test_a_model_is_loaded_as_it_was_saved(unbroken, tmp_path):
+    model = AnchorModel(unbroken.anchors, unbroken.decoder, 0.4, BLACK, {"place": "checkerboard"})
+    model.save(tmp_path / "model.safetensors")
+    again = AnchorModel.load(tmp_path / "model.safetensors")
+    assert again.facts == {"place": "checkerboard"}
+    camera = Photographs().camera(3)
+    assert torch.equal(render(again, camera).image, render(model, camera).image)
+
+
+@pytest.mark.parametrize("damage", ["truncate", "text", "nan", "missing"])
+def test_a_damaged_model_is_refused(unbroken, tmp_path, damage):
+    path = tmp_path / "model.safetensors"
+    anchors = unbroken.anchors
+    if damage == "nan":
+        anchors = replace(anchors, features=anchors.features * float("nan"))
+    AnchorModel(anchors, unbroken.decoder, 0.4, BLACK, {}).save(path)
+    if damage == "truncate":
+        path.write_bytes(path.read_bytes()[:1000])
+    elif damage == "text":
+        path.write_text("not a model")
+    elif damage == "missing":
+        path.unlink()
+    with pytest.raises(VdgsError, match=r"model\.safetensors"):
+        AnchorModel.load(path)
+
+
+def test_anchors_start_on_the_voxel_grid():
+    points = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [5.0, 5.0, 5.0]])
+    colours = np.array([[255, 0, 0], [0, 0, 0], [0, 255, 0]], np.uint8)
+    anchors, voxel = initial_anchors(points, colours, AnchorConfig(voxel=1.0, colour_start=True))
+    assert voxel == 1.0
+    assert anchors.positions.tolist() == [[0, 0, 0], [5, 5, 5]]
+    torch.testing.assert_close(anchors.features[:, :3], torch.tensor([[0.0, -1, -1], [-1, 1, -1]]))
+
+
+def test_one_distinct_point_is_too_few():
+    with pytest.raises(VdgsError, match="distinct sparse point"):
+        initial_anchors(np.zeros((4, 3)), np.zeros((4, 3), np.uint8), AnchorConfig())
