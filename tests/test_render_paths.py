@@ -23,9 +23,7 @@ TEMPLATE = Camera(np.eye(4), 400.0, 410.0, 160.0, 90.0, 320, 180)
 
 
 def standing(position, target, **changes) -> Camera:
-    return replace(
-        TEMPLATE, camera_from_world=look_at(np.array(position, float), np.array(target, float)), **changes
-    )
+    return replace(TEMPLATE, camera_from_world=look_at(np.array(position, float), np.array(target, float)), **changes)
 
 
 def write(folder: Path, content) -> Path:
@@ -148,7 +146,7 @@ def test_a_file_with_everything(tmp_path: Path):
     assert (second.width, second.height) == (320, 180)  # one film, one size
     assert second.fx == pytest.approx(800 / 3)
     np.testing.assert_allclose(second.camera_from_world, pose)
-    smooth = load_path(write(tmp_path, entries), TEMPLATE, seconds=2, fps=10)
+    smooth = load_path(write(tmp_path, entries), TEMPLATE, seconds=2.0, fps=10.0)
     assert len(smooth.cameras) == 20
 
 
@@ -167,9 +165,7 @@ def test_a_path_in_the_source_frame_shows_the_same(tmp_path: Path):
 
 
 def test_a_path_of_nerfstudio(tmp_path: Path):
-    looking_north = np.array(
-        [[1, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3], [0, 0, 0, 1.0]]
-    )  # OpenGL: -z forward
+    looking_north = np.array([[1, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3], [0, 0, 0, 1.0]])  # OpenGL: -z forward
     content = {
         "render_width": 640, "render_height": 480, "fps": 25, "seconds": 1,
         "camera_path": [{"camera_to_world": looking_north.ravel().tolist(), "fov": 90, "aspect": 4 / 3}] * 3,
@@ -217,16 +213,14 @@ def test_a_file_that_is_not_json(tmp_path: Path):
 
 def strips(rows: int = 4, columns: int = 10) -> list[Camera]:
     """A flight to and fro at 30 m, looking straight down."""
-    places = [
-        (x if row % 2 == 0 else columns - 1 - x, row * 3) for row in range(rows) for x in range(columns)
-    ]
+    places = [(x if row % 2 == 0 else columns - 1 - x, row * 3) for row in range(rows) for x in range(columns)]
     return [standing([4.0 * x, 4.0 * y, 30], [4.0 * x, 4.0 * y, 0]) for x, y in places]
 
 
 def test_an_orbit_looks_at_the_scene_from_where_the_flight_was():
     cameras = strips()
     points = np.random.default_rng(2).uniform([0, 0, -1], [36, 36, 1], (500, 3))
-    path = orbit(points, cameras, TEMPLATE, seconds=4, fps=25)
+    path = orbit(points, cameras, TEMPLATE, seconds=4.0, fps=25.0)
     assert len(path.cameras) == 100
     centre = np.median(points, axis=0)
     for camera in path.cameras:
@@ -242,7 +236,7 @@ def test_a_flyover_follows_the_flight(shuffled: bool):
     if shuffled:
         order = np.random.default_rng(3).permutation(len(cameras))
         cameras = [cameras[i] for i in order]
-    path = flyover(cameras, TEMPLATE, seconds=8, fps=25)
+    path = flyover(cameras, TEMPLATE, seconds=8.0, fps=25.0)
     places = np.array([camera.position for camera in path.cameras])
     flown = np.array([camera.position for camera in cameras])
     apart = np.linalg.norm(places[:, None] - flown[None], axis=2)
@@ -260,7 +254,7 @@ def test_a_flyover_follows_the_flight(shuffled: bool):
 
 
 def test_a_flyover_of_one_camera_stands_still():
-    path = flyover(strips(1, 1), TEMPLATE, seconds=0.2, fps=25)
+    path = flyover(strips(1, 1), TEMPLATE, seconds=0.2, fps=25.0)
     assert len(path.cameras) == 5
     assert all(is_rigid(camera) for camera in path.cameras)
 
@@ -268,7 +262,7 @@ def test_a_flyover_of_one_camera_stands_still():
 def test_a_film_holds_its_frames(tmp_path: Path):
     file = tmp_path / "films" / "film.mp4"
     levels = (40, 120, 200)
-    with VideoWriter(file, 30, encoder="mpeg4") as film:
+    with VideoWriter(file, 30.0, encoder="mpeg4") as film:
         for level in levels:
             film.write(np.full((49, 65, 3), (level, level // 2, 30), np.uint8))
         assert not file.exists()
@@ -290,19 +284,19 @@ def interrupted() -> np.ndarray:
 def test_a_film_that_fails_leaves_nothing(tmp_path: Path):
     file = tmp_path / "film.mp4"
     frame = np.zeros((32, 32, 3), np.uint8)
-    with VideoWriter(tmp_path / "good.mp4", 30, encoder="mpeg4") as film:
+    with VideoWriter(tmp_path / "good.mp4", 30.0, encoder="mpeg4") as film:
         film.write(frame)
         with pytest.raises(ValueError, match="in a film of"):
             film.write(frame[:16])
     with (
         pytest.raises(KeyboardInterrupt),
-        VideoWriter(file, 30, encoder="mpeg4") as film,
+        VideoWriter(file, 30.0, encoder="mpeg4") as film,
     ):
         film.write(frame + interrupted())
-    with pytest.raises(VdgsError, match="no frames"), VideoWriter(file, 30):
+    with pytest.raises(VdgsError, match="no frames"), VideoWriter(file, 30.0):
         pass
     with pytest.raises(VdgsError, match=r"\.mp4"):
-        VideoWriter(tmp_path / "film.avi", 30)
+        VideoWriter(tmp_path / "film.avi", 30.0)
     assert [path.name for path in tmp_path.iterdir()] == ["good.mp4"]
 
 
@@ -322,6 +316,6 @@ def test_a_missing_encoder_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("vdgs.video.cv2.VideoWriter", Closed)
     with (
         pytest.raises(VdgsError, match="pip install imageio-ffmpeg"),
-        VideoWriter(tmp_path / "film.mp4", 30) as film,
+        VideoWriter(tmp_path / "film.mp4", 30.0) as film,
     ):
         film.write(np.zeros((8, 8, 3), np.uint8))
