@@ -71,9 +71,7 @@ def print_report(as_json: bool = False, checks: list[Check] | None = None) -> in
     """Print the report as a table, or as JSON; returns the exit code, 0 if everything essential works."""
     checks = report() if checks is None else checks
     if as_json:
-        print(
-            json.dumps({"healthy": healthy(checks), "checks": [asdict(check) for check in checks]}, indent=2)
-        )
+        print(json.dumps({"healthy": healthy(checks), "checks": [asdict(check) for check in checks]}, indent=2))
     else:
         _print_table(checks)
     return 0 if healthy(checks) else 1
@@ -127,9 +125,7 @@ def _dependencies() -> list[Check]:
 
 
 def _processor() -> list[Check]:
-    return [
-        Check("processor", "ok", f"{_processor_name()}, {_usable_cores()} of {os.cpu_count()} cores usable")
-    ]
+    return [Check("processor", "ok", f"{_processor_name()}, {_usable_cores()} of {os.cpu_count()} cores usable")]
 
 
 def _processor_name() -> str:
@@ -163,9 +159,7 @@ def _kernels() -> list[Check]:
     unbuilt = [name for name, _ in refused if name in supported]
     value = f"{module.isa()} in use; available: {', '.join(built)}"
     if unbuilt:
-        faster = (
-            f"The processor also runs {', '.join(unbuilt)}, which this installation lacks: reinstall vdgs."
-        )
+        faster = f"The processor also runs {', '.join(unbuilt)}, which this installation lacks: reinstall vdgs."
         return [Check("native kernels", "note", value, faster, True)]
     return [Check("native kernels", "ok", value, essential=True)]
 
@@ -210,19 +204,13 @@ def _container_limit() -> int | None:
 def _torch() -> list[Check]:
     import torch
 
-    checks = [
-        Check(
-            "torch", "ok", f"{torch.__version__}, built for CUDA {torch.version.cuda or '–'}", essential=True
-        )
-    ]
+    checks = [Check("torch", "ok", f"{torch.__version__}, built for CUDA {torch.version.cuda or '–'}", essential=True)]
     if torch.cuda.is_available():
         for index in range(torch.cuda.device_count()):
             device = torch.cuda.get_device_properties(index)
             checks.append(Check(f"GPU {index}", "ok", f"{device.name}, {_gb(device.total_memory)}"))
     elif shutil.which("nvidia-smi"):
-        advice = (
-            "pip install --force-reinstall torch (the default build has CUDA); nvidia-smi tests the driver."
-        )
+        advice = "pip install --force-reinstall torch (the default build has CUDA); nvidia-smi tests the driver."
         checks.append(Check("GPU", "note", "there is an NVIDIA driver, but this torch cannot use it", advice))
     else:
         checks.append(Check("GPU", "note", "none: everything runs on the processor"))
@@ -278,9 +266,7 @@ def _film() -> list[Check]:
     except Exception as error:
         return [Check("film", "missing", f"{encoder}: {error}", "pip install imageio-ffmpeg")]
     if encoder == "mpeg4":
-        return [
-            Check("film", "ok", "MPEG-4", "pip install imageio-ffmpeg for H.264, which browsers play too.")
-        ]
+        return [Check("film", "ok", "MPEG-4", "pip install imageio-ffmpeg for H.264, which browsers play too.")]
     return [Check("film", "ok", "H.264")]
 
 

@@ -22,6 +22,7 @@ caller gives. Cameras come back in the ground frame (z up).
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -88,9 +89,7 @@ def load_path(
     if source and ground is not None:
         cameras = [_to_ground(camera, ground) for camera in cameras]
     if interpolated or (seconds is not None and len(cameras) > 1):
-        cameras = interpolate(
-            cameras, max(1, round(rate * length)), closed=bool(content.get("closed", False))
-        )
+        cameras = interpolate(cameras, max(1, round(rate * length)), closed=bool(content.get("closed", False)))
     return CameraPath(tuple(_one_size(cameras)), rate)
 
 
@@ -131,19 +130,22 @@ def orbit(
 ) -> CameraPath:
     """Once around the middle of the scene, looking at it, as high as the flight.
 
-    The middle is the median of the points; the radius two thirds of the 90 % extent of the training
-    cameras about it, but at least half the height, so that a small flight is not looked at from
-    straight above (choices). `template` gives intrinsics and size.
+    The middle is the median of the points. The orbit is an ellipse along the axes of the flight, so that
+    a long narrow one is not left sideways: its half axes are two thirds of the 90 % extent of the
+    training cameras, but at least a quarter of the height (choices). `template` gives intrinsics and size.
     """
     centre = np.median(points, axis=0)
     positions = np.stack([camera.position for camera in cameras])
     height = max(float(np.median(positions[:, 2]) - centre[2]), 1e-3)
-    reach = float(np.quantile(np.linalg.norm(positions[:, :2] - centre[:2], axis=1), 0.9))
-    radius = max(2.0 / 3.0 * reach, 0.5 * height)
+    offsets = positions[:, :2] - centre[:2]
+    axes = np.linalg.svd(offsets, full_matrices=False)[2] if len(offsets) > 1 else np.eye(2)
+    reach = np.quantile(np.abs(offsets @ axes.T), 0.9, axis=0)
+    radii = np.maximum(2.0 / 3.0 * reach, 0.25 * height)
     frames = []
     for angle in np.linspace(0.0, 2.0 * np.pi, max(1, round(seconds * fps)), endpoint=False):
-        offset = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
-        frames.append(replace(template, camera_from_world=look_at(centre + offset, centre)))
+        level = (radii * [np.cos(angle), np.sin(angle)]) @ axes
+        pose = look_at(centre + np.append(level, height), centre)
+        frames.append(replace(template, camera_from_world=pose))
     return CameraPath(tuple(frames), fps)
 
 
@@ -176,16 +178,12 @@ def flyover(
     for position, angle in zip(track, heading, strict=True):
         level = np.array([np.cos(angle), np.sin(angle), 0.0])
         forward = ahead * level - np.array([0.0, 0.0, down])
-        pose = look_at(
-            position, position + forward, up=level if tilt_deg < 45.0 else np.array([0.0, 0.0, 1.0])
-        )
+        pose = look_at(position, position + forward, up=level if tilt_deg < 45.0 else np.array([0.0, 0.0, 1.0]))
         frames.append(replace(template, camera_from_world=pose))
     return CameraPath(tuple(frames), fps)
 
 
-def look_at(
-    position: np.ndarray, target: np.ndarray, up: Sequence[float] | np.ndarray = (0, 0, 1)
-) -> np.ndarray:
+def look_at(position: np.ndarray, target: np.ndarray, up: Sequence[float] | np.ndarray = (0, 0, 1)) -> np.ndarray:
     """`camera_from_world` [4, 4] of a camera at `position` that sees `target` in its middle.
 
     `up` points to the upper edge of the image; where it is parallel to the view, north (+y) does.
@@ -199,9 +197,7 @@ def look_at(
     if np.linalg.norm(right) < 1e-6:
         right = np.cross(forward, [0.0, 1.0, 0.0] if abs(forward[1]) < 0.9 else [1.0, 0.0, 0.0])
     right /= np.linalg.norm(right)
-    return _rigid(
-        np.stack([right, np.cross(forward, right), forward]), np.asarray(position, dtype=np.float64)
-    )
+    return _rigid(np.stack([right, np.cross(forward, right), forward]), np.asarray(position, dtype=np.float64))
 
 
 def _from_keyframes(content: Mapping[str, Any], default: Camera) -> tuple[list[Camera], bool, bool]:
@@ -222,9 +218,7 @@ def _keyframe(entry: Mapping[str, Any], default: Camera) -> Camera:
     if "camera_from_world" in entry:
         pose = _matrix(entry["camera_from_world"], "camera_from_world")
     else:
-        _require(
-            "position" in entry and "look_at" in entry, "give camera_from_world, or position and look_at"
-        )
+        _require("position" in entry and "look_at" in entry, "give camera_from_world, or position and look_at")
         pose = look_at(
             _vector(entry["position"], "position"),
             _vector(entry["look_at"], "look_at"),
@@ -232,15 +226,13 @@ def _keyframe(entry: Mapping[str, Any], default: Camera) -> Camera:
         )
     camera = replace(default, camera_from_world=pose)
     if "width" in entry or "height" in entry:
-        camera = camera.resized(
-            int(entry.get("width", camera.width)), int(entry.get("height", camera.height))
-        )
+        camera = camera.resized(int(entry.get("width", camera.width)), int(entry.get("height", camera.height)))
     _require(camera.width > 0 and camera.height > 0, "width and height must be positive")
     if "fov_deg" in entry:
         camera = _with_fov(camera, float(entry["fov_deg"]))
     given = {name: float(entry[name]) for name in ("fx", "fy", "cx", "cy") if name in entry}
     camera = replace(camera, **given)  # type: ignore[arg-type]
-    _require(camera.fx > 0 and camera.fy > 0, "fx and fy must be positive")
+    _require(min(camera.fx, camera.fy) > 0, "fx and fy must be positive")
     return camera
 
 
@@ -252,9 +244,7 @@ def _from_nerfstudio(content: Mapping[str, Any], default: Camera) -> list[Camera
     cameras = []
     for number, entry in enumerate(entries):
         try:
-            world_from_camera = _matrix(entry["camera_to_world"], "camera_to_world") @ np.diag(
-                [1.0, -1.0, -1.0, 1.0]
-            )
+            world_from_camera = _matrix(entry["camera_to_world"], "camera_to_world") @ np.diag([1.0, -1.0, -1.0, 1.0])
             camera = replace(default.resized(*size), camera_from_world=np.linalg.inv(world_from_camera))
             cameras.append(_with_fov(camera, float(entry.get("fov", 50.0))))
         except (KeyError, TypeError, ValueError) as error:
@@ -264,7 +254,7 @@ def _from_nerfstudio(content: Mapping[str, Any], default: Camera) -> list[Camera
 
 def _with_fov(camera: Camera, fov_deg: float) -> Camera:
     _require(0.0 < fov_deg < 180.0, "fov_deg must lie between 0 and 180")
-    focal = 0.5 * camera.height / np.tan(0.5 * np.radians(fov_deg))
+    focal = 0.5 * camera.height / math.tan(0.5 * math.radians(fov_deg))
     return replace(camera, fx=focal, fy=focal, cx=camera.width / 2.0, cy=camera.height / 2.0)
 
 
@@ -293,9 +283,7 @@ def _require(condition: bool, message: str) -> None:
 
 def _to_ground(camera: Camera, ground: GroundFrame) -> Camera:
     position = ground.to_ground(camera.position[None])[0]
-    return replace(
-        camera, camera_from_world=_rigid(camera.camera_from_world[:3, :3] @ ground.rotation.T, position)
-    )
+    return replace(camera, camera_from_world=_rigid(camera.camera_from_world[:3, :3] @ ground.rotation.T, position))
 
 
 def _one_size(cameras: Sequence[Camera]) -> list[Camera]:

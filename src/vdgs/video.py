@@ -88,9 +88,7 @@ class VideoWriter:
         if self.encoder == "h264":
             self._open_h264(width, height)
         else:
-            writer = cv2.VideoWriter(
-                str(self._partial), cv2.VideoWriter.fourcc(*"mp4v"), self.fps, (width, height)
-            )
+            writer = cv2.VideoWriter(str(self._partial), cv2.VideoWriter.fourcc(*"mp4v"), self.fps, (width, height))
             if not writer.isOpened():
                 raise self._failure("OpenCV has no MPEG-4 encoder here, or the folder cannot be written")
             self._opencv = writer

@@ -138,9 +138,7 @@ def evaluate(
     names = ["squared_error", "ssim"] + ["squared_error_cc", "ssim_cc"] * settings.colour_correction
     gathered = _Gathered(histogram=VisibilityHistogram(names) if visibility_map else None)
     stems = saving.file_stems([view.name for view in views])
-    on_sheet = set(
-        np.linspace(0, len(views) - 1, min(len(views), settings.contact_views)).round().astype(int)
-    )
+    on_sheet = set(np.linspace(0, len(views) - 1, min(len(views), settings.contact_views)).round().astype(int))
     indices: Iterable[int] = range(len(views))
     for index in progress(indices, len(views)) if progress else indices:
         _evaluate_view(views[index], stems[index], index in on_sheet, inputs, gathered)
@@ -191,9 +189,7 @@ def _evaluate_view(view: View, stem: str, on_sheet: bool, inputs: _Inputs, gathe
     _draw(view, stem, on_sheet, raw, row, inputs, gathered)
 
 
-def _photograph(
-    view: View, inputs: _Inputs
-) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
+def _photograph(view: View, inputs: _Inputs) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
     reference, mask = inputs.load_image(view), inputs.load_mask(view)
     wanted = (view.camera.height, view.camera.width)
     for what, shape in (
@@ -208,9 +204,7 @@ def _photograph(
     return reference, mask
 
 
-def _rendered(
-    view: View, render: Callable[[Camera], RenderedView]
-) -> tuple[UInt8[np.ndarray, "h w 3"], float]:
+def _rendered(view: View, render: Callable[[Camera], RenderedView]) -> tuple[UInt8[np.ndarray, "h w 3"], float]:
     """The render in 8 bits and the seconds it took, the GPU's work included."""
     with torch.inference_mode():
         _wait_for_gpu()
@@ -241,9 +235,7 @@ def _maps(pair: _Pair, suffix: str) -> dict[str, Float[np.ndarray, "h w"]]:
     }
 
 
-def _figures(
-    pair: _Pair, maps: Mapping[str, np.ndarray], suffix: str, lpips: Lpips | None
-) -> dict[str, float | None]:
+def _figures(pair: _Pair, maps: Mapping[str, np.ndarray], suffix: str, lpips: Lpips | None) -> dict[str, float | None]:
     """The four figures of a pair; LPIPS is None without weights or where the image is too small for it."""
     figures: dict[str, float | None] = {
         f"psnr{suffix}": metrics.psnr_of(metrics.masked_mean(maps[f"squared_error{suffix}"], pair.mask)),
@@ -297,9 +289,7 @@ def _draw(
         gathered.cells.append(pictures.Thumbnail(view.name, f"{row['psnr']:.2f} dB", *small))
 
 
-def _summary(
-    gathered: _Gathered, facts: ModelFacts, lpips_note: str, settings: EvaluationSettings
-) -> dict[str, Any]:
+def _summary(gathered: _Gathered, facts: ModelFacts, lpips_note: str, settings: EvaluationSettings) -> dict[str, Any]:
     rows = gathered.rows
     means = {name: mean_or_none([row[name] for row in rows]) for name in RAW + CORRECTED}
     pixel_bins = gathered.histogram.bins(settings.visibility_bins) if gathered.histogram else None

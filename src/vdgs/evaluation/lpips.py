@@ -70,18 +70,12 @@ class Lpips:
                 weight = _take(backbone, f"features.{index}.weight", (outputs, inputs, 3, 3))
                 layers.append((weight, _take(backbone, f"features.{index}.bias", (outputs,))))
             self._stages.append(layers)
-            self._heads.append(
-                _take(heads, f"lin{number}.model.1.weight", (1, stage[-1][2], 1, 1)).reshape(-1)
-            )
+            self._heads.append(_take(heads, f"lin{number}.model.1.weight", (1, stage[-1][2], 1, 1)).reshape(-1))
 
-    def __call__(
-        self, image: UInt8[np.ndarray, "h w 3"], reference: UInt8[np.ndarray, "h w 3"]
-    ) -> LpipsScores:
+    def __call__(self, image: UInt8[np.ndarray, "h w 3"], reference: UInt8[np.ndarray, "h w 3"]) -> LpipsScores:
         """Both variants for one pair; ValueError where a side is shorter than 16 pixels."""
         if image.shape != reference.shape or min(image.shape[:2]) < MIN_SIDE_PX:
-            raise ValueError(
-                f"LPIPS needs two images of one size, 16 pixels or more a side: {image.shape[:2]}"
-            )
+            raise ValueError(f"LPIPS needs two images of one size, 16 pixels or more a side: {image.shape[:2]}")
         x, y = _planes(image), _planes(reference)
         return LpipsScores(self._distance(2.0 * x - 1.0, 2.0 * y - 1.0), self._distance(x, y))
 

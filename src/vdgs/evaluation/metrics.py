@@ -22,14 +22,12 @@ SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 
 
-def to_8bit(image: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
+def to_8bit(image: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
     """Linear values in [0, 1] to the nearest of 256 levels; values outside are clipped."""
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
-def squared_error(
-    image: UInt8[np.ndarray, "h w 3"], reference: UInt8[np.ndarray, "h w 3"]
-) -> Float[np.ndarray, "h w"]:
+def squared_error(image: UInt8[np.ndarray, "h w 3"], reference: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
     """Squared difference per pixel, mean over the channels, on the scale where white is 1."""
     _check(image, reference)
     difference = image.astype(np.int32) - reference.astype(np.int32)

@@ -39,9 +39,7 @@ class TrainedRun:
 
     def views_of_anchors(self) -> Int32[Tensor, " n"]:
         """V_i: how many training cameras hold each anchor in their frustum."""
-        return kernels.count_views(
-            self.model.anchors.positions, [view.camera for view in self.capture.train_views]
-        )
+        return kernels.count_views(self.model.anchors.positions, [view.camera for view in self.capture.train_views])
 
 
 def open_run(path: Path) -> TrainedRun:
@@ -67,9 +65,7 @@ def options_from(settings: dict[str, Any], source: Path) -> CaptureOptions:
     try:
         return CaptureOptions(**values)
     except TypeError as error:
-        raise RunError(
-            f"{source}: holds capture settings that this version does not know ({error})"
-        ) from error
+        raise RunError(f"{source}: holds capture settings that this version does not know ({error})") from error
 
 
 def evaluate_run(path: Path, lpips_weights: Path | None, bins: int, console: Console) -> None:

@@ -102,9 +102,7 @@ def contact_sheet(cells: list[Thumbnail], title: str, columns: int | None = None
     cell_height = 2 * height + between + text * 2 + gap
     canvas = Image.new("RGB", (gap + columns * (width + gap), head + rows * cell_height), PAPER)
     draw = ImageDraw.Draw(canvas)
-    draw.text(
-        (gap, 14), _fitted(title, font(22, bold=True), canvas.width - 2 * gap), INK, font(22, bold=True)
-    )
+    draw.text((gap, 14), _fitted(title, font(22, bold=True), float(canvas.width - 2 * gap)), INK, font(22, bold=True))
     draw.text((gap, 42), "photograph above, render below", FAINT, font(13))
     for index, cell in enumerate(cells):
         left = gap + (index % columns) * (width + gap)
@@ -113,12 +111,12 @@ def contact_sheet(cells: list[Thumbnail], title: str, columns: int | None = None
         canvas.paste(Image.fromarray(cell.render), (left, top + height + between))
         line = top + 2 * height + between + text // 3
         draw.text((left + width, line), cell.caption, INK, font(text - 2), anchor="ra")
-        room = width - draw.textlength(cell.caption, font(text - 2)) - 10
+        room = float(width - draw.textlength(cell.caption, font(text - 2)) - 10)
         draw.text((left, line), _fitted(cell.name, font(text - 2), room), FAINT, font(text - 2))
     return canvas
 
 
-def thumbnail(picture: UInt8[np.ndarray, "h w 3"], width: int = THUMBNAIL_PX) -> UInt8[np.ndarray, "h w 3"]:
+def thumbnail(picture: UInt8[np.ndarray, "h w 3"], width: int = THUMBNAIL_PX) -> UInt8[np.ndarray, "small_h small_w 3"]:
     """The picture at the width of a contact sheet cell; a tall one is bounded by the same height."""
     scale = width / max(picture.shape[1], picture.shape[0])
     size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))

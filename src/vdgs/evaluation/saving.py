@@ -53,7 +53,8 @@ def file_stems(names: Sequence[str]) -> list[str]:
     stems = []
     for name in names:
         path = PurePosixPath(name.replace("\\", "/"))
-        plain = "__".join(_safe(part) for part in path.with_suffix("").parts)[-_LONGEST_NAME:] or "view"
+        parts = [*path.parent.parts, path.stem]
+        plain = "__".join(_safe(part) for part in parts if part.strip("/."))[-_LONGEST_NAME:] or "view"
         stem, number = plain, 2
         if stem.casefold() in taken and path.suffix:
             plain = stem = f"{plain}_{_safe(path.suffix[1:])}"

@@ -40,9 +40,7 @@ def shown(value: float | None, form: str) -> str:
 
 
 def _visibility_table(bins: list[Mapping[str, Any]]) -> Table:
-    table = Table(
-        box=box.SIMPLE_HEAD, title="by visibility (training cameras that see a pixel)", title_justify="left"
-    )
+    table = Table(box=box.SIMPLE_HEAD, title="by visibility (training cameras that see a pixel)", title_justify="left")
     for column in ("V", "pixels", "PSNR (dB)", "SSIM", "PSNR cc"):
         table.add_column(column, justify="right")
     for each in bins:

@@ -1,0 +1,119 @@
+"""The doctor: true on this machine, calm on a broken one."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from vdgs import doctor
+from vdgs.doctor import Check, healthy, print_report, report
+
+
+@pytest.fixture(scope="module")
+def checks() -> list[Check]:
+    return report()
+
+
+def by_name(checks: list[Check]) -> dict[str, Check]:
+    return {check.name: check for check in checks}
+
+
+def test_every_subject_is_reported(checks: list[Check]):
+    names = by_name(checks)
+    for name in ("vdgs", "python", "dependencies", "processor", "native kernels", "threads"):
+        assert name in names
+    for name in ("memory", "torch", "OMP_WAIT_POLICY", "LPIPS", "film", "disk"):
+        assert name in names
+    assert names["python"].state == "ok"
+    assert names["dependencies"].works
+    for check in checks:
+        assert check.state in ("ok", "note") or check.remedy
+
+
+def test_extras_come_from_the_metadata(checks: list[Check]):
+    names = by_name(checks)
+    groups = doctor._required()
+    assert {"synth", "lpips", "tensorboard", "test"} <= set(groups)
+    assert "torch" in groups[""]
+    assert "vdgs" not in groups["test"]
+    for extra in set(groups) - {""}:
+        check = names[f"extra {extra}"]
+        assert check.works  # an extra is never essential
+        if check.state == "missing":
+            assert check.remedy == f"pip install 'vdgs[{extra}]'"
+    assert names["extra test"].value.startswith("pytest")
+
+
+def test_the_exit_code_follows_what_is_essential(capsys: pytest.CaptureFixture):
+    fine = [Check("torch", "ok", "2.13", essential=True), Check("extra synth", "missing", "lacks x", "pip")]
+    broken = [*fine, Check("native kernels", "missing", "not built", "build them", essential=True)]
+    assert healthy(fine)
+    assert print_report(checks=fine) == 0
+    assert "Everything essential works" in capsys.readouterr().out
+    assert print_report(checks=broken) == 1
+    out = capsys.readouterr().out
+    assert "Not usable yet: native kernels" in out
+    assert "build them" in out
+
+
+def test_as_json(checks: list[Check], capsys: pytest.CaptureFixture):
+    code = print_report(as_json=True, checks=checks)
+    content = json.loads(capsys.readouterr().out)
+    assert content["healthy"] == (code == 0)
+    assert [each["name"] for each in content["checks"]] == [check.name for check in checks]
+
+
+def native(**loads) -> SimpleNamespace:
+    """A stand-in for the choice of kernels: a build loads, or raises what is given."""
+
+    def load(name: str) -> str:
+        if isinstance(loads[name], Exception):
+            raise loads[name]
+        return name
+
+    return SimpleNamespace(
+        INSTRUCTION_SETS=tuple(loads), load=load, isa=lambda: "avx2", threads=lambda: 2,
+        supported=lambda: ("avx512", "avx2", "portable"),
+    )  # fmt: skip
+
+
+def test_kernels_in_use_and_missing(monkeypatch: pytest.MonkeyPatch):
+    unbuilt = ImportError("not built: pip install -e .")
+    monkeypatch.setattr(doctor, "_native_module", lambda: native(avx512=unbuilt, avx2=1, portable=1))
+    (check,) = doctor._kernels()
+    assert check.state == "note"
+    assert check.works
+    assert check.value == "avx2 in use; available: avx2, portable"
+    assert "avx512" in check.remedy
+    monkeypatch.setattr(doctor, "_native_module", lambda: native(avx2=unbuilt, portable=unbuilt))
+    (check,) = doctor._kernels()
+    assert not check.works
+    assert "pip install -e ." in check.remedy
+
+
+def test_a_broken_part_is_reported_not_raised(monkeypatch: pytest.MonkeyPatch):
+    def explode() -> list[Check]:
+        raise OSError("no such device")
+
+    monkeypatch.setattr(doctor, "_LOOKS", (explode, doctor._disk))
+    first, disk = report()
+    assert (first.name, first.state, first.works) == ("explode", "broken", False)
+    assert "no such device" in first.value
+    assert disk.state in ("ok", "note")
+
+
+def test_a_missing_dependency_has_its_command(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(doctor, "_required", lambda: {"": ["torch", "no-such-package"]})
+    (check,) = doctor._dependencies()
+    assert not check.works
+    assert check.remedy == "pip install no-such-package"
+
+
+def test_it_imports_nothing_heavy_before_it_looks():
+    code = "import sys, vdgs.doctor; print(sorted({'torch', 'numpy', 'cv2', 'rich'} & set(sys.modules)))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"

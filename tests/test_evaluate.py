@@ -1,0 +1,236 @@
+"""An evaluation from views to files."""
+
+from __future__ import annotations
+
+import json
+import math
+from io import StringIO
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from evaluation_support import as_render, noisy, photograph, real_photographs, view
+from vdgs.errors import CaptureError, RunError, TrainingDiverged
+from vdgs.evaluation import metrics, pictures, saving
+from vdgs.evaluation.evaluate import EvaluationSettings, ModelFacts, evaluate
+from vdgs.evaluation.lpips import Lpips, LpipsScores
+
+NAMES = ["a/b.jpg", "c/b.jpg", "a/b.png", "plain.jpg"]
+
+
+class City:
+    """Four photographs and a poor renderer of them, found by where the camera stands."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        self.views = [view(name, shift=float(i)) for i, name in enumerate(NAMES)]
+        self.photographs = [photograph(rng) for _ in NAMES]
+        self.renders = [noisy(each, rng, 0.02 * (i + 1)) for i, each in enumerate(self.photographs)]
+
+    def load_image(self, which):
+        return self.photographs[NAMES.index(which.name)]
+
+    def render(self, camera):
+        return as_render(self.renders[round(camera.camera_from_world[0, 3])])
+
+    def visibility(self, camera):
+        seen = np.tile(np.arange(camera.width, dtype=np.float32), (camera.height, 1))
+        seen[:2] = np.nan
+        return seen + camera.camera_from_world[0, 3]
+
+
+@pytest.fixture(scope="module")
+def city() -> City:
+    return City()
+
+
+def read(path: Path):
+    def refuse(name: str):
+        raise AssertionError(f"{path} holds {name}")
+
+    return json.loads(path.read_text(), parse_constant=refuse)
+
+
+def test_what_is_written_is_what_was_measured(city: City, tmp_path: Path):
+    facts = ModelFacts(n_anchors=1234, model_bytes=10**6)
+    result = evaluate(
+        city.views, city.load_image, city.render, tmp_path, visibility_map=city.visibility,
+        facts=facts, lpips_note="LPIPS is null: no weights.",
+    )  # fmt: skip
+    assert result == read(tmp_path / "metrics.json")
+    rows = read(tmp_path / "per_view.json")
+    assert [row["name"] for row in rows] == NAMES
+    for row, reference in zip(rows, city.photographs, strict=True):
+        saved = cv2.imread(str(tmp_path / row["render"]))[..., ::-1]
+        assert row["psnr"] == metrics.psnr(saved, reference)
+        assert row["ssim"] == pytest.approx(metrics.ssim(saved, reference), abs=1e-12)
+        assert row["psnr_cc"] > row["psnr"] - 0.01
+        assert (tmp_path / "comparisons" / Path(row["render"]).name).is_file()
+    assert result["psnr"] == pytest.approx(np.mean([row["psnr"] for row in rows]))
+    assert result["lpips_vgg"] is None
+    assert result["lpips_vgg_01_cc"] is None
+    assert result["train_seconds"] is None
+    assert (result["n_anchors"], result["model_bytes"], result["test_views"]) == (1234, 10**6, 4)
+    assert result["fps"] > 0
+    assert (tmp_path / "contact_sheet.png").is_file()
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+def test_quality_by_visibility(city: City, tmp_path: Path):
+    result = evaluate(city.views, city.load_image, city.render, tmp_path, visibility_map=city.visibility)
+    empty, *bins = result["by_visibility"]
+    assert empty["lower"] is None
+    assert empty["pixels"] == 4 * 2 * 64
+    assert sum(each["pixels"] for each in bins) == 4 * 46 * 64
+    pooled = sum(10 ** (-each["psnr"] / 10) * each["pixels"] for each in [empty, *bins])
+    direct = sum(metrics.squared_error(a, b).sum() for a, b in zip(city.renders, city.photographs, strict=True))
+    assert pooled == pytest.approx(direct, rel=1e-9)
+    by_view = result["views_by_visibility"]
+    assert [each["views"] for each in by_view] == [1, 1, 1, 1]
+    assert [each["lower"] for each in by_view] == pytest.approx([31.5, 32.5, 33.5, 34.5])
+    assert [each["psnr"] for each in by_view] == sorted((each["psnr"] for each in by_view), reverse=True)
+
+
+def test_the_same_twice(city: City, tmp_path: Path):
+    for folder in ("one", "two"):
+        evaluate(city.views, city.load_image, city.render, tmp_path / folder, visibility_map=city.visibility)
+    one, two = (read(tmp_path / folder / "metrics.json") for folder in ("one", "two"))
+    assert {**one, "fps": 0} == {**two, "fps": 0}
+    for file in (tmp_path / "one").rglob("*.png"):
+        assert file.read_bytes() == (tmp_path / "two" / file.relative_to(tmp_path / "one")).read_bytes()
+
+
+def test_masks_are_respected(city: City, tmp_path: Path):
+    mask = np.zeros((48, 64), np.uint8)
+    mask[:, :32] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    masked = view(NAMES[0], mask=tmp_path / "mask.png")
+    result = evaluate([masked], city.load_image, city.render, tmp_path / "out")
+    left = metrics.psnr(city.renders[0][:, :32], city.photographs[0][:, :32])
+    assert result["psnr"] == pytest.approx(left, abs=1e-9)
+    assert read(tmp_path / "out" / "per_view.json")[0]["kept_pixels"] == 48 * 32
+
+
+def test_a_view_that_is_masked_entirely_leaves_the_means_alone(city: City, tmp_path: Path):
+    def load_mask(which):
+        return np.full((48, 64), which.name != NAMES[1])
+
+    result = evaluate(city.views, city.load_image, city.render, tmp_path, load_mask=load_mask)
+    rows = read(tmp_path / "per_view.json")
+    assert rows[1]["psnr"] is rows[1]["ssim_cc"] is None
+    assert result["psnr"] == pytest.approx(np.mean([rows[i]["psnr"] for i in (0, 2, 3)]))
+
+
+def test_a_perfect_render_is_null_not_infinity(city: City, tmp_path: Path):
+    def perfect(camera):
+        return as_render(city.photographs[round(camera.camera_from_world[0, 3])])
+
+    result = evaluate(city.views, city.load_image, perfect, tmp_path)
+    assert result["psnr"] is None
+    assert result["ssim"] == pytest.approx(1.0)
+
+
+def test_lpips_is_measured_raw_and_corrected(city: City, tmp_path: Path):
+    class Fake(Lpips):
+        def __init__(self) -> None:
+            """Without weights."""
+
+        def __call__(self, image, reference):
+            error = float(metrics.squared_error(image, reference).mean())
+            return LpipsScores(error, 2 * error)
+
+    result = evaluate(city.views, city.load_image, city.render, tmp_path, lpips=Fake())
+    rows = read(tmp_path / "per_view.json")
+    assert result["lpips_vgg_01"] == pytest.approx(2 * result["lpips_vgg"])
+    assert rows[0]["lpips_vgg_cc"] == pytest.approx(10 ** (-rows[0]["psnr_cc"] / 10))
+    plain = EvaluationSettings(colour_correction=False, comparisons=False, contact_views=2)
+    result = evaluate(city.views, city.load_image, city.render, tmp_path / "plain", settings=plain)
+    assert result["psnr_cc"] is None
+    assert not (tmp_path / "plain" / "comparisons").exists()
+
+
+def test_the_table_shows_the_figures(city: City, tmp_path: Path):
+    out = StringIO()
+    result = evaluate(
+        city.views, city.load_image, city.render, tmp_path, visibility_map=city.visibility,
+        lpips_note="LPIPS is null: no weights.", console=Console(file=out, width=100),
+    )  # fmt: skip
+    text = out.getvalue()
+    assert f"{result['psnr']:.2f}" in text
+    assert f"{result['ssim_cc']:.4f}" in text
+    assert "nothing drawn" in text
+    assert "LPIPS is null: no weights." in text
+
+
+def test_what_cannot_be_evaluated_is_said(city: City, tmp_path: Path):
+    with pytest.raises(RunError, match="no test views"):
+        evaluate([], city.load_image, city.render, tmp_path)
+    with pytest.raises(CaptureError, match=r"a/b.jpg is 60 x 48 pixels, its camera 64 x 48"):
+        evaluate(city.views, lambda v: city.load_image(v)[:, :60], city.render, tmp_path)
+    with pytest.raises(CaptureError, match=r"gone\.png"):
+        evaluate([view(NAMES[0], mask=tmp_path / "gone.png")], city.load_image, city.render, tmp_path)
+    broken = as_render(city.renders[0])
+    broken.image[3, 4, 1] = torch.nan
+    with pytest.raises(TrainingDiverged, match="not finite"):
+        evaluate(city.views, city.load_image, lambda camera: broken, tmp_path)
+    assert not (tmp_path / "metrics.json").exists()
+
+
+@given(st.lists(st.text("ab/.\\_: é", min_size=1, max_size=8), min_size=1, max_size=8))
+def test_every_view_has_its_own_plain_file_name(names: list[str]):
+    stems = saving.file_stems(names)
+    assert len({stem.casefold() for stem in stems}) == len(names)
+    for stem in stems:
+        assert not set(stem) & set('/\\:*?"<>|')
+        assert not stem.startswith(".")
+
+
+def test_readable_file_names():
+    names = ["a/b.jpg", "c/b.jpg", "a/b.png", "A/B.JPG", "DJI_0018.JPG"]
+    assert saving.file_stems(names) == ["a__b", "c__b", "a__b_png", "A__B_JPG", "DJI_0018"]
+
+
+def test_json_has_no_nan():
+    value = {"a": [np.float32("nan"), math.inf, np.int64(3)], "b": (None, "x", True)}
+    assert saving.jsonable(value) == {"a": [None, None, 3], "b": [None, "x", True]}
+
+
+def test_the_colour_map_grows_with_the_error():
+    ramp = pictures.colourise(np.linspace(0, 0.3, 64)[None], limit=0.2).astype(int)
+    brightness = ramp.sum(axis=2)[0]
+    assert (np.diff(brightness) >= 0).all()
+    assert brightness[0] < 20
+    assert (ramp[0, 45:] == ramp[0, -1]).all()
+    assert pictures.colourise(np.array([[np.nan]]), 0.2).tolist() == [[[255, 255, 255]]]
+
+
+@pytest.mark.parametrize("size", [(48, 64), (300, 20), (900, 1400)])
+def test_a_comparison_of_any_size(size: tuple[int, int]):
+    reference = photograph(np.random.default_rng(1), *size)
+    picture = pictures.comparison(reference, reference, "a name " * 3, "30.00 dB")
+    width, height = pictures.panel_size(size[1], size[0], pictures.PANEL_MIN_PX, pictures.PANEL_MAX_PX)
+    assert picture.width > 3 * width
+    assert picture.height > height
+
+
+@pytest.mark.capture
+def test_on_photographs(tmp_path: Path):
+    photographs = real_photographs("brighton", 3)
+    height, width = photographs[0].shape[:2]
+    views = [view(f"{i}.jpg", width, height, float(i)) for i in range(3)]
+    rng = np.random.default_rng(2)
+
+    def render(camera):
+        index = round(camera.camera_from_world[0, 3])
+        return as_render(noisy(cv2.GaussianBlur(photographs[index], (0, 0), 1.0), rng, 0.01))
+
+    result = evaluate(views, lambda v: photographs[int(v.name[0])], render, tmp_path)
+    assert 20 < result["psnr"] < 40
+    assert result["psnr_cc"] >= result["psnr"]
+    assert 0.3 < result["ssim"] < 1

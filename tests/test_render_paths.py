@@ -1,0 +1,321 @@
+"""Camera paths: what the file says, what a smooth path promises, what a film holds."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from vdgs.cameras import Camera
+from vdgs.captures.capture import GroundFrame
+from vdgs.errors import VdgsError
+from vdgs.render_paths import flyover, interpolate, load_path, look_at, orbit
+from vdgs.video import VideoWriter, best_encoder
+
+TEMPLATE = Camera(np.eye(4), 400.0, 410.0, 160.0, 90.0, 320, 180)
+
+
+def standing(position, target, **changes) -> Camera:
+    return replace(TEMPLATE, camera_from_world=look_at(np.array(position, float), np.array(target, float)), **changes)
+
+
+def write(folder: Path, content) -> Path:
+    file = folder / "path.json"
+    file.write_text(json.dumps(content))
+    return file
+
+
+def is_rigid(camera: Camera) -> bool:
+    rotation = camera.camera_from_world[:3, :3]
+    return np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) and np.linalg.det(rotation) > 0
+
+
+coordinates = st.tuples(*[st.floats(-50, 50)] * 3)
+
+
+@given(coordinates, coordinates)
+@settings(deadline=None, max_examples=60)
+def test_look_at_puts_the_target_in_the_middle(position, target):
+    if np.linalg.norm(np.subtract(position, target)) < 0.1:
+        return
+    camera = standing(position, target)
+    assert is_rigid(camera)
+    np.testing.assert_allclose(camera.position, position, atol=1e-9)
+    pixels, depth = camera.project(np.array([target]))
+    np.testing.assert_allclose(pixels[0], [160, 90], atol=1e-6)
+    assert depth[0] > 0
+
+
+def test_up_is_up():
+    camera = standing([0, 0, 10], [0, 30, 0])
+    (higher, right), _ = camera.project(np.array([[0, 30, 3.0], [5.0, 30, 0]]))
+    assert higher[1] < 90
+    assert right[0] > 160
+
+
+def test_interpolation_meets_its_keyframes():
+    keys = [
+        standing([0, 0, 10], [0, 5, 0]),
+        standing([10, 0, 12], [10, 9, 0]),
+        standing([20, 8, 10], [0, 9, 0]),
+    ]
+    path = interpolate(keys, 501)
+    np.testing.assert_allclose(path[0].camera_from_world, keys[0].camera_from_world, atol=1e-9)
+    np.testing.assert_allclose(path[-1].camera_from_world, keys[-1].camera_from_world, atol=1e-9)
+    nearest = min(path, key=lambda camera: np.linalg.norm(camera.position - keys[1].position))
+    np.testing.assert_allclose(nearest.camera_from_world, keys[1].camera_from_world, atol=0.1)
+    assert all(is_rigid(camera) for camera in path)
+
+
+def test_interpolation_is_smooth_and_even():
+    rng = np.random.default_rng(0)
+    places = np.cumsum(rng.uniform(1, 3, (6, 3)), axis=0)
+    path = interpolate([standing(place, place + np.array([1, 2, -5])) for place in places], 600)
+    velocity = np.diff([camera.position for camera in path], axis=0)
+    speed = np.linalg.norm(velocity, axis=1)
+    assert speed.max() < 4 * np.median(speed)
+    assert np.linalg.norm(np.diff(velocity, axis=0), axis=1).max() < 0.1 * np.median(speed)
+
+
+def test_a_straight_line_stays_straight():
+    keys = [standing([x, 2 * x, 10], [x, 2 * x + 5, 0]) for x in (0.0, 1.0, 2.0, 3.0)]
+    path = np.array([camera.position for camera in interpolate(keys, 50)])
+    np.testing.assert_allclose(path, np.linspace([0, 0, 10], [3, 6, 10], 50), atol=1e-9)
+
+
+def test_interpolation_commutes_with_a_rigid_motion():
+    keys = [
+        standing([0, 0, 10], [0, 5, 0]),
+        standing([10, 0, 12], [10, 9, 0]),
+        standing([20, 8, 10], [0, 9, 0]),
+    ]
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_euler("xyz", [0.4, -0.2, 1.1]).as_matrix()
+    motion[:3, 3] = [3, -4, 5]
+    back = np.linalg.inv(motion)
+    moved = [replace(key, camera_from_world=key.camera_from_world @ back) for key in keys]
+    for here, there in zip(interpolate(keys, 40), interpolate(moved, 40), strict=True):
+        np.testing.assert_allclose(here.camera_from_world @ back, there.camera_from_world, atol=1e-9)
+
+
+def test_a_closed_path_loops_without_a_seam():
+    angles = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    keys = [standing([10 * np.cos(a), 10 * np.sin(a), 8], [0, 0, 0]) for a in angles]
+    path = np.array([camera.position for camera in interpolate(keys, 400, closed=True)])
+    around = np.concatenate([path, path[:2]])
+    steps = np.linalg.norm(np.diff(around, axis=0), axis=1)
+    assert steps.max() < 1.2 * steps.min()
+    np.testing.assert_allclose(np.linalg.norm(path[:, :2], axis=1), 10, atol=0.1)
+
+
+def test_single_and_repeated_keyframes():
+    key = standing([0, 0, 10], [0, 5, 0])
+    for keys in ([key], [key, key, key]):
+        path = interpolate(keys, 4)
+        assert len(path) == 4
+        for camera in path:
+            np.testing.assert_allclose(camera.camera_from_world, key.camera_from_world, atol=1e-12)
+
+
+def test_a_file_with_everything(tmp_path: Path):
+    pose = look_at(np.array([1.0, 2, 3]), np.array([4.0, 5, 0]))
+    entries = [
+        {"position": [0, 0, 30], "look_at": [0, 20, 0], "fov_deg": 60},
+        {
+            "camera_from_world": pose.tolist(),
+            "fx": 800,
+            "fy": 790,
+            "cx": 480,
+            "cy": 270,
+            "width": 960,
+            "height": 540,
+        },
+    ]
+    file = write(tmp_path, {"keyframes": entries, "interpolate": False, "fps": 24})
+    path = load_path(file, TEMPLATE)
+    first, second = path.cameras
+    assert path.fps == 24
+    assert first.fy == pytest.approx(90 / np.tan(np.radians(30)))
+    assert (second.width, second.height) == (320, 180)  # one film, one size
+    assert second.fx == pytest.approx(800 / 3)
+    np.testing.assert_allclose(second.camera_from_world, pose)
+    smooth = load_path(write(tmp_path, entries), TEMPLATE, seconds=2.0, fps=10.0)
+    assert len(smooth.cameras) == 20
+
+
+def test_a_path_in_the_source_frame_shows_the_same(tmp_path: Path):
+    rotation = Rotation.from_euler("xyz", [1.2, 0.3, -0.4]).as_matrix()
+    ground = GroundFrame(2.5, rotation, np.array([10.0, -4, 7]), metric=False, how="test")
+    entry = {"position": [0, 1, 2], "look_at": [3, 3, 3], "up": [0, 1, 0]}
+    plain = load_path(write(tmp_path, [entry]), TEMPLATE).cameras[0]
+    file = write(tmp_path, {"frame": "source", "keyframes": [entry]})
+    moved = load_path(file, TEMPLATE, ground).cameras[0]
+    points = np.random.default_rng(1).uniform(-5, 5, (20, 3))
+    before, depth = plain.project(points)
+    after, scaled = moved.project(ground.to_ground(points))
+    np.testing.assert_allclose(after, before, atol=1e-6)
+    np.testing.assert_allclose(scaled, 2.5 * depth, atol=1e-9)
+
+
+def test_a_path_of_nerfstudio(tmp_path: Path):
+    looking_north = np.array([[1, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3], [0, 0, 0, 1.0]])  # OpenGL: -z forward
+    content = {
+        "render_width": 640, "render_height": 480, "fps": 25, "seconds": 1,
+        "camera_path": [{"camera_to_world": looking_north.ravel().tolist(), "fov": 90, "aspect": 4 / 3}] * 3,
+    }  # fmt: skip
+    path = load_path(write(tmp_path, content), TEMPLATE)
+    assert (len(path.cameras), path.fps) == (3, 25)
+    camera = path.cameras[0]
+    assert (camera.width, camera.height, camera.fx, camera.cx) == (640, 480, pytest.approx(240), 320)
+    np.testing.assert_allclose(camera.position, [1, 2, 3], atol=1e-12)
+    np.testing.assert_allclose(camera.forward, [0, 1, 0], atol=1e-12)
+    above, _ = camera.project(np.array([[1.0, 10, 4]]))
+    assert above[0, 1] < 240
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ({"keyframes": []}, "at least one"),
+        ({"keyframes": [{"position": [0, 0, 1]}]}, "key frame 0: give camera_from_world"),
+        ([{"position": [0, 0, 1], "look_at": [0, 0, 1]}], "same point"),
+        ([{"position": [0, 0], "look_at": [0, 0, 1]}], "position must be three numbers"),
+        ([{"camera_from_world": np.diag([2.0, 2, 2, 1]).tolist()}], "rotation and a translation"),
+        ([{"position": [0, 0, 1], "look_at": [0, 0, 0], "fov_deg": 180}], "fov_deg"),
+        ({"frame": "moon", "keyframes": [{}]}, "ground or source"),
+        ({"camera_path": [{}]}, "camera_to_world"),
+        ("path", "list of key frames"),
+        ({"keyframes": [{"position": [0, 0, 1], "look_at": [0, 0, 0]}], "fps": -3}, "positive"),
+    ],
+)
+def test_what_is_wrong_is_named(content, says: str, tmp_path: Path):
+    file = write(tmp_path, content)
+    with pytest.raises(VdgsError, match=says) as caught:
+        load_path(file, TEMPLATE)
+    assert str(file) in str(caught.value)
+
+
+def test_a_file_that_is_not_json(tmp_path: Path):
+    file = tmp_path / "path.json"
+    with pytest.raises(VdgsError, match="no such camera path"):
+        load_path(file, TEMPLATE)
+    file.write_text("{")
+    with pytest.raises(VdgsError, match="not a camera path in JSON"):
+        load_path(file, TEMPLATE)
+
+
+def strips(rows: int = 4, columns: int = 10) -> list[Camera]:
+    """A flight to and fro at 30 m, looking straight down."""
+    places = [(x if row % 2 == 0 else columns - 1 - x, row * 3) for row in range(rows) for x in range(columns)]
+    return [standing([4.0 * x, 4.0 * y, 30], [4.0 * x, 4.0 * y, 0]) for x, y in places]
+
+
+def test_an_orbit_looks_at_the_scene_from_where_the_flight_was():
+    cameras = strips()
+    points = np.random.default_rng(2).uniform([0, 0, -1], [36, 36, 1], (500, 3))
+    path = orbit(points, cameras, TEMPLATE, seconds=4.0, fps=25.0)
+    assert len(path.cameras) == 100
+    centre = np.median(points, axis=0)
+    for camera in path.cameras:
+        assert camera.position[2] == pytest.approx(30)
+        np.testing.assert_allclose(camera.project(centre[None])[0][0], [160, 90], atol=1e-6)
+    extent = np.ptp([camera.position for camera in cameras], axis=0).max()
+    assert max(np.linalg.norm(camera.position[:2] - centre[:2]) for camera in path.cameras) < extent
+
+
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_a_flyover_follows_the_flight(shuffled: bool):
+    cameras = strips()
+    if shuffled:
+        order = np.random.default_rng(3).permutation(len(cameras))
+        cameras = [cameras[i] for i in order]
+    path = flyover(cameras, TEMPLATE, seconds=8.0, fps=25.0)
+    places = np.array([camera.position for camera in path.cameras])
+    flown = np.array([camera.position for camera in cameras])
+    apart = np.linalg.norm(places[:, None] - flown[None], axis=2)
+    assert len(places) == 200
+    assert apart.min(axis=1).max() < 10  # never far from where photographs were taken
+    assert np.quantile(apart.min(axis=0), 0.8) < 6  # and past most of them
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    assert steps.max() < 1.5 * steps.min()
+    forwards = np.array([camera.forward for camera in path.cameras])
+    np.testing.assert_allclose(np.degrees(np.arccos(-forwards[:, 2])), 20, atol=1e-6)
+    assert all(is_rigid(camera) for camera in path.cameras)
+    if not shuffled:  # a turn at the end of a strip takes many frames
+        turned = np.degrees(np.arccos(np.clip((forwards[1:] * forwards[:-1]).sum(1), -1, 1)))
+        assert turned.max() < 10
+
+
+def test_a_flyover_of_one_camera_stands_still():
+    path = flyover(strips(1, 1), TEMPLATE, seconds=0.2, fps=25.0)
+    assert len(path.cameras) == 5
+    assert all(is_rigid(camera) for camera in path.cameras)
+
+
+def test_a_film_holds_its_frames(tmp_path: Path):
+    file = tmp_path / "films" / "film.mp4"
+    levels = (40, 120, 200)
+    with VideoWriter(file, 30.0, encoder="mpeg4") as film:
+        for level in levels:
+            film.write(np.full((49, 65, 3), (level, level // 2, 30), np.uint8))
+        assert not file.exists()
+    assert [path.name for path in file.parent.iterdir()] == ["film.mp4"]
+    reader = cv2.VideoCapture(str(file))
+    for level in levels:
+        done, frame = reader.read()
+        assert done
+        assert frame.shape == (48, 64, 3)
+        np.testing.assert_allclose(frame[24, 32, ::-1], (level, level // 2, 30), atol=12)
+    assert not reader.read()[0]
+    reader.release()
+
+
+def interrupted() -> np.ndarray:
+    raise KeyboardInterrupt
+
+
+def test_a_film_that_fails_leaves_nothing(tmp_path: Path):
+    file = tmp_path / "film.mp4"
+    frame = np.zeros((32, 32, 3), np.uint8)
+    with VideoWriter(tmp_path / "good.mp4", 30.0, encoder="mpeg4") as film:
+        film.write(frame)
+        with pytest.raises(ValueError, match="in a film of"):
+            film.write(frame[:16])
+    with (
+        pytest.raises(KeyboardInterrupt),
+        VideoWriter(file, 30.0, encoder="mpeg4") as film,
+    ):
+        film.write(frame + interrupted())
+    with pytest.raises(VdgsError, match="no frames"), VideoWriter(file, 30.0):
+        pass
+    with pytest.raises(VdgsError, match=r"\.mp4"):
+        VideoWriter(tmp_path / "film.avi", 30.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["good.mp4"]
+
+
+def test_a_missing_encoder_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("vdgs.video.importlib.util.find_spec", lambda name: None)
+    assert best_encoder() == "mpeg4"
+    monkeypatch.setattr("vdgs.video.cv2.VideoWriter.fourcc", lambda *letters: 0, raising=False)
+
+    class Closed:
+        fourcc = staticmethod(lambda *letters: 0)
+
+        def __init__(self, *arguments) -> None: ...
+
+        def isOpened(self) -> bool:
+            return False
+
+    monkeypatch.setattr("vdgs.video.cv2.VideoWriter", Closed)
+    with (
+        pytest.raises(VdgsError, match="pip install imageio-ffmpeg"),
+        VideoWriter(tmp_path / "film.mp4", 30.0) as film,
+    ):
+        film.write(np.zeros((8, 8, 3), np.uint8))
