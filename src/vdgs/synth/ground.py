@@ -105,7 +105,8 @@ def _soil(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
 def _flowers(x: np.ndarray, y: np.ndarray, footprint: np.ndarray) -> np.ndarray:
     """A flower bed: drifts of a few colours among leaves."""
     leaf = grass(x, y, footprint, 0.0) * np.float32(0.6)
-    i, j = np.floor(x / 0.3), np.floor(y / 0.3)
+    i = np.floor(x / 0.24 + 0.5 * smooth(x, y, 0.9))
+    j = np.floor(y / 0.24 + 0.5 * smooth(y, x, 0.9))
     palette = np.stack([srgb(c) for c in ("#d8342f", "#f0c22e", "#e86aa6", "#f4efe6", "#8d55b8")])
     kind = np.floor((smooth(x, y, 2.2) * 0.22 + 0.5) * 5 + 0.8 * cells(i, j)).astype(int) % 5
     return mix(leaf, palette[kind], (cells(i, j, 2) < 0.72) * np.float32(0.9))

@@ -8,7 +8,7 @@ from typing import Literal
 from vdgs.errors import VdgsError
 
 _SIZES: dict[str, dict[str, float]] = {
-    "toy": {"images": 48, "width": 400, "height": 300, "extent_m": 120.0, "points": 5000},
+    "toy": {"images": 56, "width": 400, "height": 300, "extent_m": 120.0, "points": 5000},
     "town": {"images": 120, "width": 800, "height": 600, "extent_m": 320.0, "points": 40000},
 }
 
@@ -20,7 +20,7 @@ class SynthOptions:
     seed: int = 0
     """The same seed and options give the same bytes."""
     size: Literal["toy", "town"] = "toy"
-    """toy: 48 images of 400x300 over 120 m; town: 120 images of 800x600 over 320 m."""
+    """toy: 56 images of 400x300 over 120 m; town: 120 images of 800x600 over 320 m."""
     images: int | None = None
     """How many photographs the drone takes."""
     width: int | None = None

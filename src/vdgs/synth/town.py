@@ -100,11 +100,13 @@ def _stretch(site: Site, position: float, half: float, span: tuple[float, float]
         return Plot(p, q, 1, 1, (1 if along_q else 0) + (2 if turn else 0))
 
     for direction in (-1, 1):
+        passing = np.inf
         if rng.random() < (0.75 if half > 4 else 0.4):
-            lane = at(direction * 0.3 * half, rng.uniform(*span), direction < 0)
+            passing = rng.uniform(*span)
+            lane = at(direction * 0.3 * half, passing, direction < 0)
             (props.bus if rng.random() < 0.12 else props.car)(site.builder, site.frame(lane), rng)
         for along in np.arange(span[0], span[1], 5.6):
-            if rng.random() < (0.32 if half > 4 else 0.25):
+            if rng.random() < (0.32 if half > 4 else 0.25) and abs(along - passing) > 8:
                 kerb = at(direction * (half - 1.02), along, direction < 0)
                 props.car(site.builder, site.frame(kerb, turn=rng.normal(0, 0.02)), rng)
         for along in np.arange(span[0] + 1, span[1], 8.5):
