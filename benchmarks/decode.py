@@ -120,9 +120,7 @@ def report_cull(n: int, isas: list[str]) -> None:
 
 def main() -> None:
     """Measure what the command line asks for."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--anchors", type=int, nargs="*", default=[20_000, 100_000])
     parser.add_argument("--offsets", type=int, default=10)
     parser.add_argument("--isa", nargs="*", default=list(module.supported()))

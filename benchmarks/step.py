@@ -70,9 +70,7 @@ def one_step(
     rates = rates_at(TrainConfig().rates, 0.1)
     visible = timed(times, "cull", lambda: gather_visible(state.anchors, camera))
     leaves = {name: getattr(visible.anchors, name).requires_grad_(True) for name in TRAINED}
-    splats = timed(
-        times, "decode", lambda: decode_visible(visible.anchors, state.decoder.for_image(0), camera)
-    )
+    splats = timed(times, "decode", lambda: decode_visible(visible.anchors, state.decoder.for_image(0), camera))
     splats.means_px.retain_grad()
     raster = timed(times, "rasterise", lambda: draw(splats, camera, torch.zeros(3)))
     photometric = timed(times, "loss", lambda: kernels.photometric_loss(raster.image, target, None))
@@ -95,9 +93,7 @@ def measure(visible: int, width: int, height: int, repeats: int) -> None:
     before = process.memory_info().rss
     anchors, camera = scene(visible, width, height)
     state = start_state(anchors, Decoder.initial(10, False, 0, 1, torch.Generator().manual_seed(0)))
-    target = torch.randint(
-        0, 256, (height, width, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1)
-    )
+    target = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
     times: dict[str, list[float]] = {phase: [] for phase in PHASES}
     peak = before
     for step in range(1, repeats + 4):
@@ -110,15 +106,11 @@ def measure(visible: int, width: int, height: int, repeats: int) -> None:
         f"{width}x{height}  {seen} visible anchors, {splats} splats: {total:.1f} ms a step   ({parts})",
         flush=True,
     )
-    print(
-        f"    memory: {(peak - before) / visible:.0f} B an anchor (growth of the process, image buffers included)"
-    )
+    print(f"    memory: {(peak - before) / visible:.0f} B an anchor (growth of the process, image buffers included)")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--visible", type=int, default=20_000)
     parser.add_argument("--repeats", type=int, default=15)

@@ -71,9 +71,7 @@ def main() -> None:
         expected = reference.count_views(points, few)
         brute_force = (time.perf_counter() - start) * len(cameras) / len(few)
         differing = int((native.count_views(points, few) != expected).sum())
-        print(
-            f"{name:>22} {seconds:9.2f} {brute_force:23.1f} {float(count.float().mean()):7.1f} {differing:9}"
-        )
+        print(f"{name:>22} {seconds:9.2f} {brute_force:23.1f} {float(count.float().mean()):7.1f} {differing:9}")
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB")
 
 

@@ -71,9 +71,7 @@ class Scene:
     def with_trainable(self, tensors) -> Scene:
         """The same scene with other trainable tensors."""
         features, offsets, log_scales, *weights = tensors
-        return Scene(
-            self.positions, features, offsets, log_scales, DecoderWeights.from_tensors(tuple(weights))
-        )
+        return Scene(self.positions, features, offsets, log_scales, DecoderWeights.from_tensors(tuple(weights)))
 
     def to(self, dtype: torch.dtype, frozen: bool = False) -> Scene:
         """A copy in another precision, as leaves that require gradients (but the decoder, where frozen)."""

@@ -17,9 +17,7 @@ BOTH = pytest.mark.parametrize("implementation", [reference, native])
 def state(n: int, *rest: int, seed: int = 0, dtype=torch.float32):
     """Parameter, gradient for all rows and moments in mid-training."""
     generator = torch.Generator().manual_seed(seed)
-    parameter, gradient, first, second = (
-        torch.randn(n, *rest, generator=generator, dtype=dtype) for _ in range(4)
-    )
+    parameter, gradient, first, second = (torch.randn(n, *rest, generator=generator, dtype=dtype) for _ in range(4))
     return parameter, gradient, first * 0.1, second.square() * 0.1
 
 
@@ -40,9 +38,7 @@ def test_all_rows_are_torch_adam(implementation):
         peer.grad = gradient.clone()
         optimiser.step()
         rows = None if step % 2 else torch.arange(37)
-        assert implementation.adam_rows(
-            parameter, rows, gradient, first, second, learning_rate=0.01, step=step
-        )
+        assert implementation.adam_rows(parameter, rows, gradient, first, second, learning_rate=0.01, step=step)
         torch.testing.assert_close(parameter, peer.detach(), rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(first, optimiser.state[peer]["exp_avg"])
     torch.testing.assert_close(second, optimiser.state[peer]["exp_avg_sq"])
@@ -127,9 +123,7 @@ def test_wrong_rows_are_refused_before_any_change(implementation, rows, error):
     parameter, gradient, first, second = state(4, 3)
     before = [tensor.clone() for tensor in (parameter, first, second)]
     with pytest.raises(error, match="rows"):
-        implementation.adam_rows(
-            parameter, torch.tensor(rows), gradient[:2], first, second, learning_rate=0.1, step=1
-        )
+        implementation.adam_rows(parameter, torch.tensor(rows), gradient[:2], first, second, learning_rate=0.1, step=1)
     assert all(torch.equal(a, b) for a, b in zip((parameter, first, second), before, strict=True))
 
 
@@ -137,9 +131,7 @@ def test_wrong_rows_are_refused_before_any_change(implementation, rows, error):
 def test_zero_gradients_of_fresh_rows_change_nothing(implementation):
     parameter = torch.randn(5, 3)
     before, zeros = parameter.clone(), torch.zeros(5, 3)
-    assert implementation.adam_rows(
-        parameter, None, zeros, zeros.clone(), zeros.clone(), learning_rate=1.0, step=1
-    )
+    assert implementation.adam_rows(parameter, None, zeros, zeros.clone(), zeros.clone(), learning_rate=1.0, step=1)
     assert torch.equal(parameter, before)
 
 

@@ -34,9 +34,7 @@ def assert_same(model, scene: TinyScene) -> None:
 
 
 @pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize(
-    ("model", "extra"), [("PINHOLE", ()), ("SIMPLE_PINHOLE", ()), ("SIMPLE_RADIAL", (0.0,))]
-)
+@pytest.mark.parametrize(("model", "extra"), [("PINHOLE", ()), ("SIMPLE_PINHOLE", ()), ("SIMPLE_RADIAL", (0.0,))])
 def test_reading_is_the_inverse_of_writing(tmp_path, text, model, extra):
     scene = tiny_scene()
     folder = write_colmap(tmp_path, scene, text=text, model=model, extra=extra, images=None)

@@ -194,9 +194,7 @@ def test_point_clouds_are_read_as_written(tmp_path, scene, text):
 def test_point_clouds_of_other_programs_are_read(tmp_path, scene):
     import trimesh
 
-    cloud = trimesh.PointCloud(
-        scene.points, np.column_stack([scene.colours, np.full(len(scene.points), 255)])
-    )
+    cloud = trimesh.PointCloud(scene.points, np.column_stack([scene.colours, np.full(len(scene.points), 255)]))
     for encoding in ("ascii", "binary"):
         (tmp_path / "a.ply").write_bytes(trimesh.exchange.ply.export_ply(cloud, encoding=encoding))
         points, colours = read_point_cloud(tmp_path / "a.ply")

@@ -86,9 +86,7 @@ def test_the_frame_is_exactly_invertible_and_keeps_projections(tmp_path):
         np.testing.assert_allclose(local[:, 2], depth * frame.scale, rtol=1e-6, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    ("up", "vector"), [("x", [1, 0, 0]), ("-y", [0, -1, 0]), ("z", [0, 0, 1]), ("-z", [0, 0, -1])]
-)
+@pytest.mark.parametrize(("up", "vector"), [("x", [1, 0, 0]), ("-y", [0, -1, 0]), ("z", [0, 0, 1]), ("-z", [0, 0, -1])])
 def test_up_can_be_said_outright(tmp_path, up, vector):
     frame, _ = ground_of(tiny_scene(), tmp_path, up=up)
     np.testing.assert_allclose(frame.rotation @ vector, [0, 0, 1], atol=1e-12)
@@ -117,11 +115,7 @@ def write_gps(file, scene, origin=ORIGIN, noise=0.0, wrong=()):
     generator = np.random.default_rng(1)
     rows = ["name,model,lat,lon,alt"]
     for index, (name, camera) in enumerate(scene.cameras.items()):
-        enu = (
-            camera.position
-            + generator.normal(0, noise, 3)
-            + (np.array([400.0, 90, 30]) if index in wrong else 0)
-        )
+        enu = camera.position + generator.normal(0, noise, 3) + (np.array([400.0, 90, 30]) if index in wrong else 0)
         lat, lon, alt = geodetic_from_enu(enu[None], origin)[0]
         rows.append(f"{name.upper().replace('.PNG', '.JPG')},X,{lat!r},{lon!r},{alt!r}")
     file.write_text("\n".join(rows).replace("np.float64(", "").replace(")", ""), encoding="utf-8")
@@ -143,9 +137,7 @@ def test_gps_gives_metres_and_east_north_up(tmp_path, wrong):
     np.testing.assert_allclose(offset, np.broadcast_to(offset[0], offset.shape), atol=1e-4)
     assert np.median(back[:, 2]) == pytest.approx(0, abs=1e-9)
     assert frame.origin_geo is not None
-    np.testing.assert_allclose(
-        enu_from_geodetic(np.array([frame.origin_geo]), ORIGIN)[0], offset[0], atol=1e-4
-    )
+    np.testing.assert_allclose(enu_from_geodetic(np.array([frame.origin_geo]), ORIGIN)[0], offset[0], atol=1e-4)
 
 
 def test_gps_along_one_line_falls_back_to_the_estimate(tmp_path):
@@ -255,9 +247,7 @@ def test_geodesy_agrees_with_pycolmap():
         if hasattr(pycolmap, "GPSTransfromEllipsoid")
         else pycolmap.GPSTransform()
     )
-    np.testing.assert_allclose(
-        np.asarray(transform.ellipsoid_to_ecef(places)), ecef_from_geodetic(places), atol=1e-5
-    )
+    np.testing.assert_allclose(np.asarray(transform.ellipsoid_to_ecef(places)), ecef_from_geodetic(places), atol=1e-5)
 
 
 def test_a_similarity_survives_gross_outliers():

@@ -26,9 +26,7 @@ def picture(seed: int = 0) -> np.ndarray:
 
 
 def make_view(path: Path, mask: Path | None = None, width: int = WIDTH, height: int = HEIGHT) -> View:
-    return View(
-        path.name, Camera(np.eye(4), 50.0, 50.0, width / 2, height / 2, width, height), path, mask, "train"
-    )
+    return View(path.name, Camera(np.eye(4), 50.0, 50.0, width / 2, height / 2, width, height), path, mask, "train")
 
 
 @pytest.fixture
@@ -161,9 +159,7 @@ def test_grey_sixteen_bit_alpha_and_palette(tmp_path):
     cv2.imwrite(str(tmp_path / "deep.png"), deep)
     np.testing.assert_array_equal(decode_photograph(tmp_path / "deep.png")[0], rgb)
     Image.fromarray(rgb[:, :, 0]).save(tmp_path / "grey.png")
-    np.testing.assert_array_equal(
-        decode_photograph(tmp_path / "grey.png")[0], np.repeat(rgb[:, :, :1], 3, axis=2)
-    )
+    np.testing.assert_array_equal(decode_photograph(tmp_path / "grey.png")[0], np.repeat(rgb[:, :, :1], 3, axis=2))
     alpha = np.full((HEIGHT, WIDTH, 1), 255, np.uint8)
     Image.fromarray(np.concatenate([rgb, alpha], axis=2)).save(tmp_path / "opaque.png")
     pixels, opaque = decode_photograph(tmp_path / "opaque.png")

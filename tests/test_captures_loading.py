@@ -39,9 +39,7 @@ def folder(tmp_path, scene):
 
 
 def test_options_import_nothing_heavy():
-    code = (
-        "import sys, vdgs.captures.options; print(*{'torch', 'numpy', 'cv2', 'pycolmap'} & set(sys.modules))"
-    )
+    code = "import sys, vdgs.captures.options; print(*{'torch', 'numpy', 'cv2', 'pycolmap'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
 
@@ -97,13 +95,9 @@ def test_sizes_that_any_resizer_makes_are_accepted(tmp_path_factory, width, heig
     """Floor, ceil and round of an even division all fit; the camera covers the same field of view."""
     rounding = -1 if up_rounded else 1
     w, h = (rounding * (rounding * side // factor) for side in (width, height))
-    view = SourceView(
-        "a.png", np.eye(4), Intrinsics("PINHOLE", (width, width, width / 2, height / 2), width, height)
-    )
+    view = SourceView("a.png", np.eye(4), Intrinsics("PINHOLE", (width, width, width / 2, height / 2), width, height))
     path = tmp_path_factory.mktemp("sizes") / "a.bmp"
-    header = (
-        b"BM" + bytes(12) + (40).to_bytes(4, "little") + w.to_bytes(4, "little") + h.to_bytes(4, "little")
-    )
+    header = b"BM" + bytes(12) + (40).to_bytes(4, "little") + w.to_bytes(4, "little") + h.to_bytes(4, "little")
     path.write_bytes(header + (1).to_bytes(2, "little") + (24).to_bytes(2, "little") + bytes(24))
     fitted = fit_to_image(view, path)
     assert (fitted.width, fitted.height) == (w, h)
@@ -161,9 +155,7 @@ def test_missing_things_are_named(tmp_path, scene):
     with pytest.raises(CaptureError, match="no images/ folder"):
         load_capture(tmp_path, UP)
     (tmp_path / "images_2").mkdir()
-    with pytest.raises(
-        CaptureError, match=r"12 of 12 images that have a camera are missing.*(?s:.)*and 2 more"
-    ):
+    with pytest.raises(CaptureError, match=r"12 of 12 images that have a camera are missing.*(?s:.)*and 2 more"):
         load_capture(tmp_path, UP)
     with pytest.raises(CaptureError, match=r"images_9: no such folder. Present: images_2, sparse"):
         load_capture(tmp_path, up(images="images_9"))
@@ -259,9 +251,7 @@ def test_truncated_images_are_found_before_training(folder, scene):
         file = folder / "images" / name
         file.write_bytes(file.read_bytes()[:-200])
     capture = load_capture(folder, UP)
-    with pytest.raises(
-        CaptureError, match=f"2 of 12 images cannot be decoded(?s:.)*{names[4]}(?s:.)*{names[5]}"
-    ):
+    with pytest.raises(CaptureError, match=f"2 of 12 images cannot be decoded(?s:.)*{names[4]}(?s:.)*{names[5]}"):
         check_images(capture)
 
 
@@ -287,9 +277,7 @@ def test_distorted_cameras_are_refused_with_a_remedy(tmp_path, scene):
         load_capture(tmp_path, UP)
 
 
-@pytest.mark.parametrize(
-    ("model", "extra"), [("SIMPLE_RADIAL", (-0.12,)), ("OPENCV", (-0.1, 0.02, 0.004, -0.003))]
-)
+@pytest.mark.parametrize(("model", "extra"), [("SIMPLE_RADIAL", (-0.12,)), ("OPENCV", (-0.1, 0.02, 0.004, -0.003))])
 def test_undistorting_gives_the_pinhole_picture(tmp_path, model, extra):
     """Pictures are bent by the forward model here; straightened, they equal the pinhole renderings."""
     import pycolmap

@@ -11,15 +11,11 @@ from vdgs.errors import VdgsError
 
 def state(iteration: int) -> SavedState:
     generator = torch.Generator().manual_seed(iteration)
-    return SavedState(
-        iteration, {"loss": "nan"}, {"a": torch.randn(50, 3, generator=generator), "b": torch.arange(4)}
-    )
+    return SavedState(iteration, {"loss": "nan"}, {"a": torch.randn(50, 3, generator=generator), "b": torch.arange(4)})
 
 
 def same(left: SavedState, right: SavedState) -> bool:
-    return left.iteration == right.iteration and all(
-        torch.equal(left.tensors[k], right.tensors[k]) for k in "ab"
-    )
+    return left.iteration == right.iteration and all(torch.equal(left.tensors[k], right.tensors[k]) for k in "ab")
 
 
 def test_what_is_saved_is_loaded(tmp_path):

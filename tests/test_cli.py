@@ -11,9 +11,7 @@ HEAVY = ("torch", "numpy", "matplotlib", "pycolmap", "cv2", "scipy")
 
 
 def vdgs(*arguments: str, **kwargs) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, "-m", "vdgs.cli", *arguments], capture_output=True, text=True, timeout=120
-    )
+    return subprocess.run([sys.executable, "-m", "vdgs.cli", *arguments], capture_output=True, text=True, timeout=120)
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["coarse", "--help"], ["eval", "--help"]])

@@ -38,9 +38,7 @@ def finish(capture: Path, run: Path, *more: str) -> subprocess.CompletedProcess:
 
 def begin(capture: Path, run: Path) -> subprocess.Popen:
     """Start the command and wait until it trains."""
-    started = subprocess.Popen(
-        command(capture, run), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    started = subprocess.Popen(command(capture, run), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     status, before = run / "coarse" / "status.json", time.time()
     while started.poll() is None and not (status.exists() and status.stat().st_mtime >= before - 0.01):
         time.sleep(0.01)

@@ -18,9 +18,7 @@ CAMERAS = [looking_down(), looking_down("orthographic"), turned()]
 BOTH = pytest.mark.parametrize("cull", [twin_cull, native_cull])
 
 
-def anchors(
-    n: int, seed: int, spread: float = 8.0, log_scale: float = -1.0
-) -> tuple[torch.Tensor, torch.Tensor]:
+def anchors(n: int, seed: int, spread: float = 8.0, log_scale: float = -1.0) -> tuple[torch.Tensor, torch.Tensor]:
     g = torch.Generator().manual_seed(seed)
     return spread * torch.randn(n, 3, generator=g), torch.randn(n, 6, generator=g) + log_scale
 
@@ -38,9 +36,7 @@ def ellipse_touches_image(positions, log_scales, camera) -> torch.Tensor:
 
 @BOTH
 @settings(max_examples=25, deadline=None)
-@given(
-    seed=st.integers(0, 10**6), spread=st.floats(0.5, 30), log_scale=st.floats(-6, 3), which=st.integers(0, 2)
-)
+@given(seed=st.integers(0, 10**6), spread=st.floats(0.5, 30), log_scale=st.floats(-6, 3), which=st.integers(0, 2))
 def test_never_drops_what_touches_the_image(cull, seed, spread, log_scale, which):
     positions, log_scales = anchors(400, seed, spread, log_scale)
     touching = ellipse_touches_image(positions, log_scales, CAMERAS[which]).nonzero()[:, 0]

@@ -65,9 +65,7 @@ def test_splats_follow_the_definition(decode):
     torch.testing.assert_close(splats.colours[index], torch.sigmoid(colour.reshape(4, 3)[offset]), **close)
     torch.testing.assert_close(splats.volumes[index], scale.prod(), **close)
     pixels, depths = camera.project(mean[None].double().numpy())
-    torch.testing.assert_close(
-        splats.means_px[index].double(), torch.from_numpy(pixels[0]), rtol=1e-4, atol=1e-3
-    )
+    torch.testing.assert_close(splats.means_px[index].double(), torch.from_numpy(pixels[0]), rtol=1e-4, atol=1e-3)
     torch.testing.assert_close(splats.depths[index].double(), torch.from_numpy(depths)[0], **close)
 
 

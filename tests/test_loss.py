@@ -23,9 +23,7 @@ def scene(height: int, width: int, seed: int = 0, kept: float | None = None):
     base = (base - base.min()) / max(np.ptp(base), 1e-3)
     noisy = np.clip(base + generator.normal(0, 0.1, base.shape), -0.2, 1.2)
     target = torch.from_numpy((base * 255).astype(np.uint8))
-    mask = (
-        None if kept is None else torch.from_numpy((generator.random((height, width)) < kept) * np.uint8(9))
-    )
+    mask = None if kept is None else torch.from_numpy((generator.random((height, width)) < kept) * np.uint8(9))
     return torch.from_numpy(noisy.astype(np.float32)), target, mask
 
 
@@ -83,9 +81,7 @@ def test_the_twin_combines_l1_and_ssim():
 def test_gradients_of_the_twin_are_finite_differences():
     image, target, mask = scene(7, 6, kept=0.7)
     leaf = image.double().requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda x: reference.photometric_loss(x, target, mask).loss, leaf, eps=1e-7
-    )
+    assert torch.autograd.gradcheck(lambda x: reference.photometric_loss(x, target, mask).loss, leaf, eps=1e-7)
 
 
 @every_instruction_set
@@ -153,9 +149,7 @@ class TestMeaning:
 
     def test_nothing_kept_means_no_loss_and_no_gradient(self, implementation):
         image, target, _ = scene(12, 17)
-        result, gradient = with_gradient(
-            implementation, image, target, torch.zeros(12, 17, dtype=torch.uint8)
-        )
+        result, gradient = with_gradient(implementation, image, target, torch.zeros(12, 17, dtype=torch.uint8))
         assert [float(value.detach()) for value in result] == [0.0, 0.0, 1.0]
         assert torch.all(gradient == 0)
 

@@ -24,9 +24,7 @@ from vdgs.synth.terrain import Terrain
 from vdgs.synth.town import build_town
 from vdgs.synth.zones import Zone
 
-TINY = SynthOptions(
-    seed=3, images=6, width=96, height=72, extent_m=50.0, points=400, noise_px=0.3, truth=True
-)
+TINY = SynthOptions(seed=3, images=6, width=96, height=72, extent_m=50.0, points=400, noise_px=0.3, truth=True)
 
 
 FLAT = Terrain(60.0, (0.0, 1.0, 2.0, 3.0))
@@ -158,9 +156,7 @@ def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         generate(tmp_path / "capture", TINY)
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"images": 1}, {"extent_m": 5.0}, {"samples_per_pixel": 0}, {"size": "city"}]
-)
+@pytest.mark.parametrize("wrong", [{"images": 1}, {"extent_m": 5.0}, {"samples_per_pixel": 0}, {"size": "city"}])
 def test_options_that_make_no_capture_are_refused(wrong: dict, tmp_path: Path) -> None:
     with pytest.raises(VdgsError):
         generate(tmp_path / "capture", replace(TINY, **wrong))

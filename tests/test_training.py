@@ -64,9 +64,7 @@ def start(config: TrainConfig = CONFIG):
     points = np.concatenate([rng.uniform(-4, 4, (300, 2)), np.zeros((300, 1))], axis=1)
     anchors, _ = initial_anchors(points, np.full((300, 3), 128, np.uint8), replace(config.anchors, voxel=0.4))
     generator = torch.Generator().manual_seed(config.seed)
-    return start_state(
-        anchors, Decoder.initial(config.anchors.offsets, False, config.anchors.appearance, 8, generator)
-    )
+    return start_state(anchors, Decoder.initial(config.anchors.offsets, False, config.anchors.appearance, 8, generator))
 
 
 def run(state, stage_, until: int | None = None):
@@ -122,9 +120,7 @@ def test_the_number_of_threads_changes_no_bit(unbroken):
 
 def test_another_seed_is_another_run(unbroken):
     config = replace(CONFIG, seed=1, iterations=10)
-    assert bits(run(start(config), stage(config))) != bits(
-        run(start(), stage(replace(CONFIG, iterations=10)))
-    )
+    assert bits(run(start(config), stage(config))) != bits(run(start(), stage(replace(CONFIG, iterations=10))))
 
 
 def test_every_view_is_used_once_an_epoch():

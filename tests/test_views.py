@@ -87,9 +87,7 @@ def test_points_at_the_border_of_the_image_are_decided_in_float64(model, offset_
     u[:100], u[100:200] = offset_px, camera.width + offset_px
     v[200:300], v[300:] = offset_px, camera.height + offset_px
     scale = depth if model == "pinhole" else 1.0
-    local = np.stack(
-        [(u - camera.cx) / camera.fx * scale, (v - camera.cy) / camera.fy * scale, depth], axis=1
-    )
+    local = np.stack([(u - camera.cx) / camera.fx * scale, (v - camera.cy) / camera.fy * scale, depth], axis=1)
     points = (local - camera.camera_from_world[:3, 3]) @ camera.camera_from_world[:3, :3]
     cloud = torch.from_numpy(points)
     # Two float64 formulas may differ in the last bits of a pixel coordinate, and nowhere else.
@@ -101,9 +99,7 @@ def test_points_at_the_border_of_the_image_are_decided_in_float64(model, offset_
 
 def test_points_about_the_camera_and_on_the_near_plane():
     camera = Camera(np.eye(4), 100.0, 100.0, 50.0, 50.0, 100, 100)
-    points = torch.tensor(
-        [[0, 0, 0], [0, 0, NEAR], [0, 0, NEAR * 1.01], [0, 0, -1], [0, 0, 1.0]], dtype=torch.float64
-    )
+    points = torch.tensor([[0, 0, 0], [0, 0, NEAR], [0, 0, NEAR * 1.01], [0, 0, -1], [0, 0, 1.0]], dtype=torch.float64)
     for implementation in (reference, native):
         assert implementation.mark_views(points, camera).tolist() == [False, False, True, False, True]
 
@@ -121,9 +117,7 @@ class TestMeaning:
 
     @pytest.mark.parametrize("repeats", [3, 30])
     def test_points_that_are_not_finite_are_in_no_view(self, implementation, repeats):
-        points = torch.tensor(
-            [[0.0, 0, 5], [0, 0, torch.nan], [0, torch.inf, 5], [0, 0, torch.inf], [1, 1, 5]]
-        )
+        points = torch.tensor([[0.0, 0, 5], [0, 0, torch.nan], [0, torch.inf, 5], [0, 0, torch.inf], [1, 1, 5]])
         camera = Camera(np.eye(4), 10.0, 10.0, 50.0, 50.0, 100, 100)
         assert implementation.count_views(points, [camera] * repeats).tolist() == [repeats, 0, 0, 0, repeats]
 

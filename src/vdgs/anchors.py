@@ -86,20 +86,14 @@ class AnchorModel:
         try:
             anchors = Anchors(**{n: tensors[f"anchors.{n}"] for n in ("positions", *TRAINED)})
             decoder = Decoder.from_tensors(
-                {
-                    name.removeprefix("decoder."): t
-                    for name, t in tensors.items()
-                    if name.startswith("decoder.")
-                }
+                {name.removeprefix("decoder."): t for name, t in tensors.items() if name.startswith("decoder.")}
             )
             known = json.loads(header[FORMAT])
             red, green, blue = (float(value) for value in known["background"])
             model = AnchorModel(anchors, decoder, float(known["voxel"]), (red, green, blue), known["facts"])
             model.check()
         except (KeyError, ValueError, TypeError) as error:
-            raise VdgsError(
-                f"{path}: is damaged or incomplete ({error}). Restore it or train again."
-            ) from error
+            raise VdgsError(f"{path}: is damaged or incomplete ({error}). Restore it or train again.") from error
         return model
 
     def check(self) -> None:
@@ -131,9 +125,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     except FileNotFoundError as error:
         raise VdgsError(f"{path}: is not there. Train first, or point to the right run.") from error
     except (OSError, SafetensorError, ValueError) as error:
-        raise VdgsError(
-            f"{path}: cannot be read ({error}). It is damaged; restore it or train again."
-        ) from error
+        raise VdgsError(f"{path}: cannot be read ({error}). It is damaged; restore it or train again.") from error
 
 
 def automatic_voxel(points: np.ndarray) -> float:

@@ -59,9 +59,7 @@ def load_newest(folder: Path) -> tuple[SavedState | None, list[str]]:
         try:
             return _read(sidecar), complaints
         except (OSError, ValueError, KeyError, TypeError) as error:
-            complaints.append(
-                f"{sidecar.with_suffix('.safetensors')}: is damaged ({error}); using the state before it"
-            )
+            complaints.append(f"{sidecar.with_suffix('.safetensors')}: is damaged ({error}); using the state before it")
     return None, complaints
 
 

@@ -107,9 +107,7 @@ def camera_height(capture: Capture) -> float:
     return max(height, 1e-3 * float(np.ptp(capture.points, axis=0).max()), 1e-9)
 
 
-def _train(
-    run: RunFolder, capture: Capture, config: TrainConfig, options: CoarseOptions, console: Console
-) -> None:
+def _train(run: RunFolder, capture: Capture, config: TrainConfig, options: CoarseOptions, console: Console) -> None:
     folder, views = run.coarse, capture.train_views
     folder.checkpoints.mkdir(parents=True, exist_ok=True)
     state, voxel = _continue_or_start(run, capture, config, console)
@@ -174,9 +172,7 @@ def _continue_or_start(
                 f"{run.coarse.checkpoints}: holds a state of another version ({error}). Start a new --output."
             ) from error
         if state.iteration > config.iterations:
-            raise RunError(
-                f"{run.coarse.checkpoints}: is at iteration {state.iteration}, beyond {config.iterations}."
-            )
+            raise RunError(f"{run.coarse.checkpoints}: is at iteration {state.iteration}, beyond {config.iterations}.")
         console.print(f"continuing at iteration {state.iteration}")
     else:
         if complaints:
@@ -251,9 +247,7 @@ def _board(run: RunFolder, options: CoarseOptions) -> Any:
     return SummaryWriter(str(run.coarse.path / "tensorboard"))
 
 
-def _announce(
-    capture: Capture, state: TrainingState, config: TrainConfig, budget: int, console: Console
-) -> None:
+def _announce(capture: Capture, state: TrainingState, config: TrainConfig, budget: int, console: Console) -> None:
     camera = capture.train_views[0].camera
     pixels = sum(view.camera.width * view.camera.height for view in capture.train_views)
     console.print(

@@ -30,9 +30,7 @@ class Decoder:
     appearance_weight: Float[Tensor, "32 a"] | None = None
 
     @staticmethod
-    def initial(
-        offsets: int, distance: bool, appearance: int, images: int, generator: torch.Generator
-    ) -> Decoder:
+    def initial(offsets: int, distance: bool, appearance: int, images: int, generator: torch.Generator) -> Decoder:
         """Uniform in +-1/sqrt(inputs), as torch.nn.Linear; embeddings start at 0."""
         inputs = FEATURE_SIZE + 3 + int(distance)
         tensors: dict[str, Tensor] = {}
@@ -49,9 +47,7 @@ class Decoder:
     @staticmethod
     def from_tensors(tensors: Mapping[str, Tensor]) -> Decoder:
         """The inverse of `tensors`. Raises KeyError on a missing tensor."""
-        weights = DecoderWeights(
-            *(HeadWeights(*(tensors[f"{head}_{part}"] for part in PARTS)) for head in HEADS)
-        )
+        weights = DecoderWeights(*(HeadWeights(*(tensors[f"{head}_{part}"] for part in PARTS)) for head in HEADS))
         return Decoder(weights, tensors.get("appearance"), tensors.get("appearance_weight"))
 
     def tensors(self) -> dict[str, Tensor]:
@@ -67,9 +63,7 @@ class Decoder:
             return self.weights
         embedding = self.appearance.mean(0) if image is None else self.appearance[image]
         colour = self.weights.colour
-        return replace(
-            self.weights, colour=replace(colour, b1=colour.b1 + self.appearance_weight @ embedding)
-        )
+        return replace(self.weights, colour=replace(colour, b1=colour.b1 + self.appearance_weight @ embedding))
 
     def check(self, offsets: int) -> None:
         """Raise ValueError unless all shapes fit `offsets` Gaussians per anchor and all numbers are finite."""

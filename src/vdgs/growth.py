@@ -158,16 +158,12 @@ def _fill_cells(
     origin = torch.full((3,), -0.5 * cell)
     keys = kernels.cell_keys(means, cell, origin)
     cells, group = kernels.group_cells(keys)
-    empty = ~kernels.contains(
-        kernels.cell_keys(occupied[_within_lattice(occupied, cell)], cell, origin), cells
-    )
+    empty = ~kernels.contains(kernels.cell_keys(occupied[_within_lattice(occupied, cell)], cell, origin), cells)
     features = kernels.group_max(anchors.features[rows], group, len(cells))
     if room is not None and int(empty.sum()) > room:
         strongest = kernels.group_max(gradient.reshape(-1)[parents][:, None], group, len(cells))[:, 0]
         strongest[~empty] = -1.0
-        empty = torch.zeros_like(empty).index_fill_(
-            0, strongest.argsort(descending=True, stable=True)[:room], True
-        )
+        empty = torch.zeros_like(empty).index_fill_(0, strongest.argsort(descending=True, stable=True)[:room], True)
     centres = kernels.cell_centres(cells[empty], cell, origin)
     count = len(centres)
     return Anchors(

@@ -24,9 +24,7 @@ DPI = 120
 FIELD_CELLS = 240
 
 
-def draw_map(
-    capture: Capture, report: CaptureReport, points: np.ndarray, visibility: np.ndarray, file: Path
-) -> None:
+def draw_map(capture: Capture, report: CaptureReport, points: np.ndarray, visibility: np.ndarray, file: Path) -> None:
     """Cameras and points from above, points coloured by V; beside it the histogram of V."""
     low, high = _frame(capture, points)
     width, height = _map_size(low, high)
@@ -219,9 +217,7 @@ def _cameras(axes: Axes, capture: Capture) -> None:
 def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: Normalize) -> None:
     """The colour scale, and growing out of it the histogram of V; the last step holds all above it."""
     levels = np.arange(top + 1)
-    bar.imshow(
-        levels[:, None], origin="lower", extent=(0, 1, -0.5, top + 0.5), aspect="auto", cmap=SEEN, norm=norm
-    )
+    bar.imshow(levels[:, None], origin="lower", extent=(0, 1, -0.5, top + 0.5), aspect="auto", cmap=SEEN, norm=norm)
     bar.set_xticks([])
     step = max(1, round(top / 10))
     ticks = [level for level in levels[::step] if level < top - step / 2] + [top]

@@ -35,9 +35,7 @@ def peak_memory_bytes() -> int:
 class TrainingProgress:
     """A bar on a terminal, a line now and then elsewhere, and log.jsonl always."""
 
-    def __init__(
-        self, console: Console, folder: StageFolder, config: TrainConfig, start: int, board: Any = None
-    ):
+    def __init__(self, console: Console, folder: StageFolder, config: TrainConfig, start: int, board: Any = None):
         self._console, self._config, self._board = console, config, board
         self._log: TextIO = folder.log.open("a", encoding="utf-8")
         self._recent: deque[tuple[float, int]] = deque([(time.monotonic(), start)], maxlen=200)

@@ -31,9 +31,7 @@ def gather_visible(anchors: Anchors, camera: Camera) -> VisibleAnchors:
 
 def decode_visible(visible: Anchors, weights, camera: Camera) -> Splats:  # type: ignore[no-untyped-def]
     """Splats of the gathered anchors in this view; differentiable."""
-    return kernels.decode(
-        visible.positions, visible.features, visible.offsets, visible.log_scales, weights, camera
-    )
+    return kernels.decode(visible.positions, visible.features, visible.offsets, visible.log_scales, weights, camera)
 
 
 def draw(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:

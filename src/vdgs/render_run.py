@@ -50,9 +50,7 @@ def _cameras(asked: RenderArguments, run: TrainedRun) -> tuple[list[tuple[str, C
     flown, template = [view.camera for view in capture.train_views], capture.train_views[0].camera
     length, rate = asked.seconds or render_paths.SECONDS, asked.fps or render_paths.FPS
     if asked.path is not None:
-        path = render_paths.load_path(
-            asked.path, template, capture.ground, asked.seconds or None, asked.fps or None
-        )
+        path = render_paths.load_path(asked.path, template, capture.ground, asked.seconds or None, asked.fps or None)
     elif asked.views == "orbit":
         path = render_paths.orbit(capture.points, flown, template, length, rate)
     else:

@@ -47,9 +47,7 @@ class StageFolder:
             return {"state": "new"}
         status = read_json(self.status_file)
         if not isinstance(status, dict) or not isinstance(status.get("state"), str):
-            raise RunError(
-                f"{self.status_file}: is damaged. Delete this file and run the same command again."
-            )
+            raise RunError(f"{self.status_file}: is damaged. Delete this file and run the same command again.")
         return status
 
     def set_status(self, state: str, **facts: Any) -> None:
@@ -127,9 +125,7 @@ class RunFolder:
         except (yaml.YAMLError, UnicodeDecodeError) as error:
             raise RunError(f"{self.config_file}: is damaged, not valid YAML ({error})") from error
         if not isinstance(settings, dict) or not {"capture", "training"} <= settings.keys():
-            raise RunError(
-                f"{self.config_file}: is damaged or not of a vdgs run (no `capture` and `training`)"
-            )
+            raise RunError(f"{self.config_file}: is damaged or not of a vdgs run (no `capture` and `training`)")
         settings.pop("vdgs", None)
         return settings
 
@@ -140,9 +136,7 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             handle = (self.path / ".lock").open("w")
         except OSError as error:
-            raise RunError(
-                f"{self.path}: cannot be written ({error.strerror}). Choose another --output."
-            ) from error
+            raise RunError(f"{self.path}: cannot be written ({error.strerror}). Choose another --output.") from error
         with handle:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -158,7 +152,5 @@ def _commit() -> str | None:
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists() or not (root / "native").exists():
         return None
-    found = subprocess.run(
-        ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
-    )
+    found = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
     return found.stdout.strip() or None

@@ -194,9 +194,7 @@ def _background(stage: Stage, iteration: int) -> Tensor:
     return colour + noise * (2 * torch.rand(3, generator=generator) - 1)
 
 
-def mean_colour(
-    images: TrainingImages, count: int, downscale: int, at_most: int = 32
-) -> tuple[float, float, float]:
+def mean_colour(images: TrainingImages, count: int, downscale: int, at_most: int = 32) -> tuple[float, float, float]:
     """Mean colour in [0, 1] of the pixels that count, over up to `at_most` evenly chosen training views."""
     total, pixels = np.zeros(3), 0
     for index in np.unique(np.linspace(0, count - 1, min(count, at_most)).astype(int)):

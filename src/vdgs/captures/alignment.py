@@ -42,9 +42,7 @@ def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
 
 
-def fit_similarity_robust(
-    source: np.ndarray, target: np.ndarray, rounds: int = 500
-) -> tuple[Similarity, np.ndarray]:
+def fit_similarity_robust(source: np.ndarray, target: np.ndarray, rounds: int = 500) -> tuple[Similarity, np.ndarray]:
     """Least median of squares over seeded triples, then least squares over the inliers.
 
     Inliers lie within 3 robust standard deviations (1.4826 * median residual) of the best triple's fit,

@@ -122,9 +122,7 @@ def read_colmap(folder: Path) -> ColmapModel:
         if points_file.is_file():
             points, colours = (_points_binary if binary else _points_text)(points_file)
     except OSError as error:
-        raise CaptureError(
-            f"{error.filename or folder}: cannot be read ({error.strerror or error})."
-        ) from error
+        raise CaptureError(f"{error.filename or folder}: cannot be read ({error.strerror or error}).") from error
     return ColmapModel(folder, _views(records, cameras, images_file), points, colours)
 
 
@@ -161,17 +159,14 @@ class _ImageRecord:
 
 def _views(records: list[_ImageRecord], cameras: dict[int, Intrinsics], file: Path) -> tuple[SourceView, ...]:
     """Posed views in name order; raises on silly poses, unknown cameras and names given twice."""
-    orphans = [
-        f"{record.name} (camera {record.camera})" for record in records if record.camera not in cameras
-    ]
+    orphans = [f"{record.name} (camera {record.camera})" for record in records if record.camera not in cameras]
     if orphans:
         raise CaptureError(
             f"{file}: these images name a camera that is not in the cameras file. "
             f"Both files must come from the same export.{listing(orphans)}"
         )
     views = [
-        SourceView(safe_name(record.name, file), _pose(record, file), cameras[record.camera])
-        for record in records
+        SourceView(safe_name(record.name, file), _pose(record, file), cameras[record.camera]) for record in records
     ]
     views.sort(key=lambda view: view.name)
     twice = duplicates(view.name for view in views)
@@ -279,9 +274,7 @@ def _lines(file: Path) -> Iterator[tuple[int, str]]:
 
 
 def _bad_line(file: Path, number: int, expected: str) -> CaptureError:
-    return CaptureError(
-        f"{file}: line {number} should read '{expected}'. The file is damaged; export it again."
-    )
+    return CaptureError(f"{file}: line {number} should read '{expected}'. The file is damaged; export it again.")
 
 
 def _cameras_text(file: Path) -> dict[int, Intrinsics]:

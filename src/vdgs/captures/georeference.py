@@ -92,9 +92,7 @@ def match_gps(
 
 def _check_geodetic(position: tuple[float, ...], file: Path, where: str = "") -> None:
     latitude, longitude, altitude = position
-    if not (
-        abs(latitude) <= 90 and abs(longitude) <= 360 and math.isfinite(altitude) and abs(altitude) < 1e5
-    ):
+    if not (abs(latitude) <= 90 and abs(longitude) <= 360 and math.isfinite(altitude) and abs(altitude) < 1e5):
         raise CaptureError(
             f"{file}: {where}latitude {latitude}, longitude {longitude}, altitude {altitude} is no place "
             "on Earth. Degrees and metres are expected."

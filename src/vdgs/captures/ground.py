@@ -54,9 +54,7 @@ class _Scene:
     points: np.ndarray
 
 
-def find_ground_frame(
-    source: SourceCapture, root: Path, options: CaptureOptions
-) -> tuple[GroundFrame, list[str]]:
+def find_ground_frame(source: SourceCapture, root: Path, options: CaptureOptions) -> tuple[GroundFrame, list[str]]:
     """The ground frame of a capture, and warnings for people.
 
     Raises `CaptureError` for georeferences that cannot be used.
@@ -65,9 +63,7 @@ def find_ground_frame(
     warnings: list[str] = []
     if options.up != "auto":
         if options.georef or options.gps:
-            raise CaptureError(
-                "--up contradicts --georef and --gps, which fix the up axis themselves; give one."
-            )
+            raise CaptureError("--up contradicts --georef and --gps, which fix the up axis themselves; give one.")
         if (root / "georef.json").is_file():
             warnings.append("--up is given, so georef.json is not used: the frame is not metric.")
         rotation = rotation_to_z(AXES[options.up])
@@ -195,9 +191,7 @@ def estimate_up(
     if abs(looking) >= LEVEL_VIEW:
         return (-up if looking > 0 else up), "least variance of cameras and points, against the view"
     above = float(np.median(centres @ up) - np.median(points @ up))
-    warnings.append(
-        "the cameras look level on average; up is taken to be the side of the cameras. --up overrides."
-    )
+    warnings.append("the cameras look level on average; up is taken to be the side of the cameras. --up overrides.")
     return (-up if above < 0 else up), "least variance of cameras and points, cameras above"
 
 
@@ -232,9 +226,7 @@ def _unscaled(scene: _Scene, rotation: np.ndarray, how: str, warnings: list[str]
         )
         height = distance
     if not height > 0:
-        raise CaptureError(
-            "all cameras and points lie in one place; this is no scene. Check the sparse model."
-        )
+        raise CaptureError("all cameras and points lie in one place; this is no scene. Check the sparse model.")
     return _centred(scene, rotation, CAMERA_HEIGHT / height, False, f"{how}; median camera height = 10 units")
 
 

@@ -198,8 +198,6 @@ def shrink(picture: Picture, width: int, height: int) -> Picture:
     image = cv2.resize(picture.image.numpy(), (width, height), interpolation=cv2.INTER_AREA)
     mask = None
     if picture.mask is not None:
-        share = cv2.resize(
-            picture.mask.numpy().astype(np.float32), (width, height), interpolation=cv2.INTER_AREA
-        )
+        share = cv2.resize(picture.mask.numpy().astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         mask = torch.from_numpy((share >= 1 - 1e-4).astype(np.uint8))
     return Picture(torch.from_numpy(image), mask)

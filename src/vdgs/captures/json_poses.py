@@ -90,9 +90,7 @@ def intrinsics_of(frame: dict[str, Any], common: dict[str, Any], image: Path, fi
     if fx is None or fy is None:
         raise CaptureError(f"{file}: no focal length for {image.name} (fl_x or camera_angle_x).")
     head = (fx, fy, get("cx", width / 2) or 0.0, get("cy", height / 2) or 0.0)
-    model, tail = _lens(
-        str(values.get("camera_model", "OPENCV")), {k: get(k, 0.0) or 0.0 for k in _LENS}, file
-    )
+    model, tail = _lens(str(values.get("camera_model", "OPENCV")), {k: get(k, 0.0) or 0.0 for k in _LENS}, file)
     if not (0 < width < 1e6 and 0 < height < 1e6):
         raise CaptureError(f"{file}: {image.name} has an image size of {width}x{height}. Mend w and h.")
     return check_intrinsics(Intrinsics(model, (*head, *tail), int(width), int(height)), file, image.name)
@@ -111,9 +109,7 @@ def _lens(model: str, k: dict[str, float], file: Path) -> tuple[str, tuple[float
     if "FISHEYE" in model.upper():
         return "OPENCV_FISHEYE", (k["k1"], k["k2"], k["k3"], k["k4"])
     if model.upper() not in {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"}:
-        raise CaptureError(
-            f"{file}: the camera model {model!r} is not supported; undistort to PINHOLE first."
-        )
+        raise CaptureError(f"{file}: the camera model {model!r} is not supported; undistort to PINHOLE first.")
     if not any(k.values()):
         return "PINHOLE", ()
     if k["k4"]:

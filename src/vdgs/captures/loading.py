@@ -60,9 +60,7 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
             seen |= view.camera.sees(points)
         points, colours = points[seen], colours[seen]
         if not seen.any():
-            raise CaptureError(
-                f"{root}: the chosen {options.max_images} photographs see no points; use more."
-            )
+            raise CaptureError(f"{root}: the chosen {options.max_images} photographs see no points; use more.")
     explicit = {photo.view.name: photo.view.split for photo in photographs}
     views = choose_splits(root, views, explicit, options)
     return Capture(
@@ -133,9 +131,7 @@ def image_folder(root: Path, options: CaptureOptions) -> tuple[str, list[str]]:
     if options.images is not None:
         if not (root / options.images).is_dir():
             present = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
-            raise CaptureError(
-                f"{root / options.images}: no such folder. Present: {', '.join(present) or 'none'}."
-            )
+            raise CaptureError(f"{root / options.images}: no such folder. Present: {', '.join(present) or 'none'}.")
         return Path(options.images).as_posix(), []
     if (root / "images").is_dir():
         return "images", []
@@ -145,9 +141,7 @@ def image_folder(root: Path, options: CaptureOptions) -> tuple[str, list[str]]:
         if entry.is_dir() and entry.name.removeprefix("images_").isdigit()
     }
     if not shrunk:
-        raise CaptureError(
-            f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there."
-        )
+        raise CaptureError(f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there.")
     name = shrunk[min(shrunk)]
     return name, [f"no images/ folder; {name} is used instead (--images chooses)."]
 
@@ -158,14 +152,10 @@ def _without_bad_points(source: SourceCapture, warnings: list[str]) -> SourceCap
     centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     finite = np.isfinite(source.points).all(axis=1) & (np.abs(source.points) < 1e12).all(axis=1)
     if not finite.any():
-        raise CaptureError(
-            f"{source.source} model: none of its {len(source.points)} points is a finite number."
-        )
+        raise CaptureError(f"{source.source} model: none of its {len(source.points)} points is a finite number.")
     middle = np.median(centres, axis=0)
     distance = np.linalg.norm(np.where(finite[:, None], source.points, middle) - middle, axis=1)
-    spread = max(
-        float(np.quantile(np.linalg.norm(centres - middle, axis=1), 0.9)), float(np.median(distance[finite]))
-    )
+    spread = max(float(np.quantile(np.linalg.norm(centres - middle, axis=1), 0.9)), float(np.median(distance[finite])))
     keep = finite & (distance <= FAR_POINT * spread)
     if not keep.all():
         warnings.append(
@@ -212,9 +202,7 @@ def _find_photographs(
     return _fitted(root, source, paths, options)
 
 
-def _fitted(
-    root: Path, source: SourceCapture, paths: list[Path], options: CaptureOptions
-) -> list[_Photograph]:
+def _fitted(root: Path, source: SourceCapture, paths: list[Path], options: CaptureOptions) -> list[_Photograph]:
     """The views with their images, masks and intrinsics at the images' sizes; collects what does not fit."""
     photographs, problems = [], []
     for view, path in zip(source.views, paths, strict=True):
@@ -224,9 +212,7 @@ def _fitted(
         except CaptureError as error:
             problems.append(str(error))
     if len(problems) > 1:
-        raise CaptureError(
-            f"{root / source.images}: {len(problems)} images cannot be used.{listing(problems)}"
-        )
+        raise CaptureError(f"{root / source.images}: {len(problems)} images cannot be used.{listing(problems)}")
     if problems:
         raise CaptureError(problems[0])
     return photographs
@@ -291,7 +277,5 @@ def _view(photo: _Photograph, options: CaptureOptions, ground: GroundFrame) -> V
     pose = transform_pose(photo.view.camera_from_world, ground)
     camera = Camera(pose, fx, fy, cx, cy, width, height)
     if options.downscale != 1:
-        camera = camera.resized(
-            max(1, int(width / options.downscale)), max(1, int(height / options.downscale))
-        )
+        camera = camera.resized(max(1, int(width / options.downscale)), max(1, int(height / options.downscale)))
     return View(photo.view.name, camera, photo.file.path, photo.file.mask, "train")

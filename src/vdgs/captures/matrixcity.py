@@ -38,9 +38,7 @@ def pose_files(root: Path) -> list[tuple[Path, Split]]:
     ]  # fmt: skip
     if pair[0][0].is_file():
         return [(file, split) for file, split in pair if file.is_file()]
-    blocks: list[tuple[Path, Split]] = [
-        (file, "train") for file in sorted(root.glob("train/*/transforms.json"))
-    ]
+    blocks: list[tuple[Path, Split]] = [(file, "train") for file in sorted(root.glob("train/*/transforms.json"))]
     if blocks:
         return blocks + [(file, "test") for file in sorted(root.glob("test/*/transforms.json"))]
     return []
@@ -65,9 +63,7 @@ def read_matrixcity(root: Path, options: CaptureOptions) -> SourceCapture:
     if twice:
         raise CaptureError(f"{root}: the same image occurs more than once in the pose files.{listing(twice)}")
     if len(scales) > 1:
-        raise CaptureError(
-            f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file."
-        )
+        raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
     poses = {view.name: view.camera_from_world for view in views}
     points, colours = find_sparse_points(root, poses, "MatrixCity's layout")
     world = KnownWorld(np.eye(3), 1.0, False, "z is up by the format")
@@ -105,18 +101,12 @@ def _find_image(root: Path, frame: dict[str, Any], file: Path, split: Split) -> 
     """
     path = frame.get("file_path")
     if isinstance(path, str):
-        parts = [
-            part for part in PurePosixPath(path.replace("\\", "/")).parts if part not in ("..", ".", "/")
-        ]
+        parts = [part for part in PurePosixPath(path.replace("\\", "/")).parts if part not in ("..", ".", "/")]
     elif isinstance(frame.get("frame_index"), int):
-        folder = [
-            part for part in PurePosixPath(str(frame.get("path", ""))).parts if part not in ("..", ".", "/")
-        ]
+        folder = [part for part in PurePosixPath(str(frame.get("path", ""))).parts if part not in ("..", ".", "/")]
         parts = [*folder, f"{frame['frame_index']:04d}.png"]
     else:
-        raise CaptureError(
-            f"{file}: a frame has neither 'file_path' nor 'frame_index'. Export the file again."
-        )
+        raise CaptureError(f"{file}: a frame has neither 'file_path' nor 'frame_index'. Export the file again.")
     if not parts or any("\0" in part for part in parts):
         raise CaptureError(f"{file}: a frame names no image ({path!r}). Export the file again.")
     bases = [file.parent, root]

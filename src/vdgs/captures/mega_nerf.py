@@ -79,9 +79,7 @@ def _read_folder(
     return [_read_view(file, present[file.stem], folder, split, origin, scale) for file in metadata]
 
 
-def _read_view(
-    file: Path, image: Path, folder: str, split: Split, origin: np.ndarray, scale: float
-) -> SourceView:
+def _read_view(file: Path, image: Path, folder: str, split: Split, origin: np.ndarray, scale: float) -> SourceView:
     content = _load(file)
     fx, fy, cx, cy = (float(value) for value in _array(content, "intrinsics", (4,), file))
     width, height = (int(_array(content, key, (), file)) for key in ("W", "H"))

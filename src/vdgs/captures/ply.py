@@ -45,9 +45,7 @@ def read_point_cloud(file: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _header(data: bytes, file: Path) -> _Header:
     def fail(what: str) -> CaptureError:
-        return CaptureError(
-            f"{file}: {what}. A PLY point cloud with x, y, z (ascii or little-endian) is needed."
-        )
+        return CaptureError(f"{file}: {what}. A PLY point cloud with x, y, z (ascii or little-endian) is needed.")
 
     end = data.find(b"end_header", 0, LONGEST_HEADER)
     start = data.find(b"\n", end) + 1

@@ -146,9 +146,7 @@ def check_intrinsics(intrinsics: Intrinsics, file: Path, label: str) -> Intrinsi
         longest = max(width, height)
         if not all(0.01 * longest < f < 1000 * longest for f in intrinsics.focal):
             problem = f"a focal length of {intrinsics.focal} px for an image of {width}x{height}"
-        elif not all(
-            -s <= c <= 2 * s for c, s in zip(intrinsics.principal_point, (width, height), strict=True)
-        ):
+        elif not all(-s <= c <= 2 * s for c, s in zip(intrinsics.principal_point, (width, height), strict=True)):
             problem = f"a principal point of {intrinsics.principal_point} for an image of {width}x{height}"
     if problem:
         raise CaptureError(f"{file}: {label} has {problem}. The file is damaged; copy or export it again.")

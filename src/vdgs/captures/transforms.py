@@ -47,9 +47,7 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     for frame, name in zip(frames, names, strict=True):
         short = name.removeprefix(folder + "/") if folder else name
         image = _image(root / chosen / short)
-        world_from_camera = (
-            matrix_of(frame.get("transform_matrix"), file, f"frame {name!r}") @ OPENGL_FROM_OPENCV
-        )
+        world_from_camera = matrix_of(frame.get("transform_matrix"), file, f"frame {name!r}") @ OPENGL_FROM_OPENCV
         pose = np.linalg.inv(undo(rigid(world_from_camera, file, f"frame {name!r}")))
         intrinsics = intrinsics_of(frame, content, image, file)
         mask = frame.get("mask_path")
@@ -89,9 +87,7 @@ def _image(path: Path) -> Path:
         for candidate in (path.with_name(path.name + suffix), path.with_suffix(suffix)):
             if candidate.is_file():
                 return candidate
-    raise CaptureError(
-        f"{path}: no such image, though transforms.json names it. Copy it there, or see --images."
-    )
+    raise CaptureError(f"{path}: no such image, though transforms.json names it. Copy it there, or see --images.")
 
 
 def _splits(content: dict[str, Any], file: Path) -> dict[str, Split]:
@@ -112,9 +108,7 @@ def _undo_applied(content: dict[str, Any], file: Path) -> Callable[[np.ndarray],
     """A function that takes rigid world-from-camera matrices [..., 4, 4] back to the original world."""
     applied = np.eye(4)
     if content.get("applied_transform") is not None:
-        applied = rigid(
-            matrix_of(content["applied_transform"], file, "applied_transform"), file, "applied_transform"
-        )
+        applied = rigid(matrix_of(content["applied_transform"], file, "applied_transform"), file, "applied_transform")
     scale = number(content, "applied_scale", file) or 1.0
     if not 1e-9 < scale < 1e9:
         raise CaptureError(f"{file}: applied_scale {scale} must be a positive factor.")
@@ -128,9 +122,7 @@ def _undo_applied(content: dict[str, Any], file: Path) -> Callable[[np.ndarray],
     return undo
 
 
-def _points(
-    root: Path, content: dict[str, Any], file: Path, views: list[SourceView]
-) -> tuple[np.ndarray, np.ndarray]:
+def _points(root: Path, content: dict[str, Any], file: Path, views: list[SourceView]) -> tuple[np.ndarray, np.ndarray]:
     """Points in the world of the file (before `applied_transform` is undone)."""
     ply = content.get("ply_file_path")
     if ply is not None:

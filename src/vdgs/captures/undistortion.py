@@ -37,9 +37,7 @@ def undistort(folder: Path, photographs: list[Photograph]) -> list[Photograph]:
     distortion pass through. Raises `CaptureError` if the folder cannot be written or an image cannot be
     decoded.
     """
-    targets = {
-        photo.intrinsics: pinhole_for(photo.intrinsics) for photo in photographs if photo.intrinsics.distorted
-    }
+    targets = {photo.intrinsics: pinhole_for(photo.intrinsics) for photo in photographs if photo.intrinsics.distorted}
 
     def one(photo: Photograph) -> Photograph:
         target = targets.get(photo.intrinsics)

@@ -42,9 +42,7 @@ def foundation(builder: MeshBuilder, frame: Frame, shape: Box) -> None:
     box(builder, frame, plinth, stone, stone)
 
 
-def pitched_roof(
-    builder: MeshBuilder, frame: Frame, shape: Box, pitch: float, roof: Skin, hip: float = 0.0
-) -> float:
+def pitched_roof(builder: MeshBuilder, frame: Frame, shape: Box, pitch: float, roof: Skin, hip: float = 0.0) -> float:
     """A roof whose ridge runs along x over a box, with eaves, fascias and a ridge cap; returns its rise.
 
     `hip` shortens the ridge at both ends by that part of half the depth: 0 gives gables, 1 a hipped roof.
@@ -251,9 +249,7 @@ def barn(builder: MeshBuilder, frame: Frame) -> None:
     gables(builder, frame, body, 0.75, red)
     pitched_roof(builder, frame, body, 0.75, Skin(Material.SLATE, palette.METAL * 0.7))
     for x in (-3.0, 3.0):
-        door = np.array(
-            [(x - 1.6, -4.56, 0), (x + 1.6, -4.56, 0), (x + 1.6, -4.56, 3.2), (x - 1.6, -4.56, 3.2)]
-        )
+        door = np.array([(x - 1.6, -4.56, 0), (x + 1.6, -4.56, 0), (x + 1.6, -4.56, 3.2), (x - 1.6, -4.56, 3.2)])
         face(builder, frame, door, Skin(Material.PAINT, palette.TRIM))
     silo = frame.moved(11.5, 1.5)
     steel = Skin(Material.PAINT, palette.METAL)

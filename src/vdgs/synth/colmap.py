@@ -39,10 +39,7 @@ def write_model(folder: Path, cameras: list[Camera], names: list[str], cloud: Sp
     ends = np.searchsorted(cloud.observed_point, np.arange(len(cloud.points) + 1))
     for k, (start, end) in enumerate(pairwise(ends)):
         track = pycolmap.Track(
-            [
-                pycolmap.TrackElement(int(cloud.observed_image[m]) + 1, int(place_in_image[m]))
-                for m in range(start, end)
-            ]
+            [pycolmap.TrackElement(int(cloud.observed_image[m]) + 1, int(place_in_image[m])) for m in range(start, end)]
         )
         point_id = model.add_point3D(cloud.points[k], track, cloud.colours[k])
         model.point3D(point_id).error = float(cloud.errors[k])

@@ -48,9 +48,7 @@ def _grid(half: float, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return place, np.zeros(count), heading
 
 
-def _circuits(
-    inner: float, outer: float, spacing: float, count: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _circuits(inner: float, outer: float, spacing: float, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Square circuits around the town that look straight down, `spacing` apart, the last one at `outer`."""
     circuits = max(1, round((outer - inner) / spacing))
     radii = outer - (outer - inner) / circuits * np.arange(circuits)[::-1]
@@ -69,9 +67,7 @@ def _obliques(half: float, count: int, phase: float) -> tuple[np.ndarray, np.nda
     return place, tilt, np.arctan2(-place[:, 0], -place[:, 1])
 
 
-def _mission(
-    options: ResolvedOptions, altitude: float, phase: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _mission(options: ResolvedOptions, altitude: float, phase: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Places, tilts and headings of the whole flight, in the order in which the pictures are taken."""
     half, count = options.extent_m / 2, options.images
     oblique = round(0.27 * count)

@@ -122,9 +122,7 @@ def _take_pictures(
     return seeds
 
 
-def _write_truth(
-    folder: Path, tracer: Tracer, cameras: list[Camera], names: list[str], cloud: SparseCloud
-) -> None:
+def _write_truth(folder: Path, tracer: Tracer, cameras: list[Camera], names: list[str], cloud: SparseCloud) -> None:
     (folder / "depth").mkdir(parents=True)
     for camera, name in zip(cameras, names, strict=True):
         np.save(folder / "depth" / f"{Path(name).stem}.npy", depth_map(tracer, camera), allow_pickle=False)

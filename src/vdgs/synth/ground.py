@@ -234,9 +234,7 @@ def _street_colours(
     return mix(worn, _WHITE * 0.9, paint * (0.82 + 0.1 * smooth(along, across, 0.8)))
 
 
-def _streets(
-    plan: StreetPlan, p: np.ndarray, q: np.ndarray, footprint: np.ndarray, colour: np.ndarray
-) -> np.ndarray:
+def _streets(plan: StreetPlan, p: np.ndarray, q: np.ndarray, footprint: np.ndarray, colour: np.ndarray) -> np.ndarray:
     """Draw carriageways, kerbs and pavements over whatever lies below."""
     by_p, by_q = plan.beside(p, q)
     out_p, out_q = by_p.outside, by_q.outside

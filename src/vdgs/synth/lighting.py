@@ -69,9 +69,7 @@ def sky_map(tracer: Tracer, terrain: Terrain, zones: ZoneMap, half_size: float) 
     open_air = (zones.at(x, y) != Zone.BUILDING).reshape(side, side).astype(np.float32)
     blurred = cv2.GaussianBlur(openness * open_air, (0, 0), 1.1)
     weight = cv2.GaussianBlur(open_air, (0, 0), 1.1)
-    return SkyMap(
-        np.where(weight > 0.02, blurred / np.maximum(weight, 0.02), 0.6).astype(np.float32), half_size
-    )
+    return SkyMap(np.where(weight > 0.02, blurred / np.maximum(weight, 0.02), 0.6).astype(np.float32), half_size)
 
 
 def sky_colour(directions: np.ndarray) -> np.ndarray:

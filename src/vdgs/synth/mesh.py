@@ -136,9 +136,7 @@ class MeshBuilder:
         pieces = [_triangulated(np.array(rings), skins) for rings, skins in self._polygons.values()]
         if self._parts:
             joined = _joined(self._parts)
-            pieces.append(
-                joined | self._part_skins.repeated(np.array([len(p["faces"]) for p in self._parts]))
-            )
+            pieces.append(joined | self._part_skins.repeated(np.array([len(p["faces"]) for p in self._parts])))
         return Mesh(**_joined(pieces))
 
 

@@ -33,9 +33,7 @@ def fade(wavelength: float, footprint: np.ndarray) -> np.ndarray:
     return np.clip(1.9 - footprint * np.float32(1.2 / wavelength), 0, 1)
 
 
-def smooth(
-    x: np.ndarray, y: np.ndarray, wavelength: float, footprint: np.ndarray | None = None
-) -> np.ndarray:
+def smooth(x: np.ndarray, y: np.ndarray, wavelength: float, footprint: np.ndarray | None = None) -> np.ndarray:
     """Noise of zero mean and unit variance at plane coordinates in metres, [n] float32."""
     scale = np.float32(_TEXELS / wavelength)
     column = (x * scale + _ORIGIN).astype(np.int32) & (_SIDE - 1)
@@ -53,6 +51,6 @@ def cells(i: np.ndarray, j: np.ndarray, salt: int | np.ndarray = 0) -> np.ndarra
 def line(distance: np.ndarray, half_width: float, footprint: np.ndarray) -> np.ndarray:
     """Coverage in [0, 1] of a line whose centre is `distance` metres away, anti-aliased by the footprint."""
     soft = 0.5 * footprint + np.float32(0.01)
-    return np.clip((half_width - np.abs(distance)) / soft + 0.5, 0, 1) * np.minimum(
-        1, 2 * half_width / soft
-    ).astype(np.float32)
+    return np.clip((half_width - np.abs(distance)) / soft + 0.5, 0, 1) * np.minimum(1, 2 * half_width / soft).astype(
+        np.float32
+    )

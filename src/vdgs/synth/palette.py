@@ -6,9 +6,7 @@ import numpy as np
 
 from vdgs.synth.mesh import srgb
 
-PLASTER = [
-    srgb(c) for c in ("#e9dcc0", "#f0e9dc", "#e3c38f", "#d99a74", "#c9d3d8", "#e8d3b0", "#b9594a", "#d8c7a6")
-]
+PLASTER = [srgb(c) for c in ("#e9dcc0", "#f0e9dc", "#e3c38f", "#d99a74", "#c9d3d8", "#e8d3b0", "#b9594a", "#d8c7a6")]
 ROOF_TILES = [srgb(c) for c in ("#b8532f", "#a8482c", "#c4683e", "#8f3f2b", "#9d5a3c", "#b0613f")]
 SLATE = [srgb(c) for c in ("#5b6472", "#4c525c", "#6b6a70")]
 OFFICE = [srgb(c) for c in ("#d6cdbd", "#c2a184", "#b5b9bd", "#a85f48", "#dfe0dc", "#cdb68d")]

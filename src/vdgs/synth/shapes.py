@@ -47,10 +47,7 @@ class Box:
         ring = [(self.x0, self.y0), (self.x1, self.y0), (self.x1, self.y1), (self.x0, self.y1)]
         signs = [(1, 1), (-1, 1), (-1, -1), (1, -1)]
         bottom = [(x, y, self.z0) for x, y in ring]
-        top = [
-            (x + sx * inset_x, y + sy * inset_y, self.z1)
-            for (x, y), (sx, sy) in zip(ring, signs, strict=True)
-        ]
+        top = [(x + sx * inset_x, y + sy * inset_y, self.z1) for (x, y), (sx, sy) in zip(ring, signs, strict=True)]
         return np.array(bottom + top)
 
 

@@ -57,9 +57,7 @@ class Site:
 
     def level(self, frame: Frame, width: float, depth: float) -> Frame:
         """The frame lifted so that no corner of a footprint lies below the ground."""
-        corners = frame.world(
-            np.array([(sx * width / 2, sy * depth / 2, 0) for sx in (-1, 0, 1) for sy in (-1, 0, 1)])
-        )
+        corners = frame.world(np.array([(sx * width / 2, sy * depth / 2, 0) for sx in (-1, 0, 1) for sy in (-1, 0, 1)]))
         top = float(self.terrain.height(corners[:, 0], corners[:, 1]).max())
         return Frame(frame.x, frame.y, top + 0.1, frame.angle)
 
@@ -68,9 +66,7 @@ class Site:
         t = np.linspace(0, 1, 8, endpoint=False)
         ones = np.ones_like(t)
         along = np.concatenate([a[0] + (a[1] - a[0]) * t, a[1] * ones, a[1] + (a[0] - a[1]) * t, a[0] * ones])
-        across = np.concatenate(
-            [b[0] * ones, b[0] + (b[1] - b[0]) * t, b[1] * ones, b[1] + (b[0] - b[1]) * t]
-        )
+        across = np.concatenate([b[0] * ones, b[0] + (b[1] - b[0]) * t, b[1] * ones, b[1] + (b[0] - b[1]) * t])
         return np.stack(self.plan.to_world(*plot.plan(along, across)), axis=1)
 
     def paint(self, plot: Plot, a: tuple[float, float], b: tuple[float, float], zone: Zone) -> None:

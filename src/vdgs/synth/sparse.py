@@ -46,9 +46,7 @@ class SparseCloud:
     visibility: np.ndarray
 
 
-def pick_seeds(
-    tracer: Tracer, camera: Camera, image: np.ndarray, count: int, rng: np.random.Generator
-) -> Seeds:
+def pick_seeds(tracer: Tracer, camera: Camera, image: np.ndarray, count: int, rng: np.random.Generator) -> Seeds:
     """About `count` surface places seen in an image [height, width, 3] uint8, denser where it has texture."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     slope = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
@@ -157,7 +155,5 @@ def sparse_cloud(
     for k, camera in enumerate(cameras):
         at = image == k
         residual[at] = np.linalg.norm(camera.project(points[point[at]])[0] - observed[at], axis=1)
-    errors = np.bincount(point, residual, len(places)) / np.maximum(
-        np.bincount(point, minlength=len(places)), 1
-    )
+    errors = np.bincount(point, residual, len(places)) / np.maximum(np.bincount(point, minlength=len(places)), 1)
     return SparseCloud(places, points, colours, errors, point, image, observed, visible)

@@ -25,9 +25,7 @@ class Pond:
     def distance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Roughly how far outside its wobbly shore a place is, in metres (negative: in the water)."""
         dx, dy = (x - self.x) / self.rx, (y - self.y) / self.ry
-        wobble = 0.09 * np.sin(3 * np.arctan2(dy, dx) + self.x) + 0.05 * np.sin(
-            5 * np.arctan2(dy, dx) + self.y
-        )
+        wobble = 0.09 * np.sin(3 * np.arctan2(dy, dx) + self.x) + 0.05 * np.sin(5 * np.arctan2(dy, dx) + self.y)
         return (np.hypot(dx, dy) - 1 - wobble) * min(self.rx, self.ry)
 
 

@@ -55,9 +55,7 @@ class Tracer:
         )
         return Hits(found["primID"], found["tfar"], found["u"], found["v"])
 
-    def occluded(
-        self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray | None = None
-    ) -> np.ndarray:
+    def occluded(self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray | None = None) -> np.ndarray:
         """Whether anything lies within `reach` (in lengths of the directions; None: anywhere), [n] bool."""
         far = np.full(len(origins), _FAR) if reach is None else np.ascontiguousarray(reach, np.float32)
         found = self._scene.run(

@@ -52,9 +52,7 @@ def _sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         ab, bc, ca = (inverse.reshape(3, -1) + len(vertices)).reshape(3, -1)
         a, b, c = faces.T
-        faces = np.concatenate(
-            [np.stack(t, 1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
-        )
+        faces = np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))])
         vertices = np.concatenate([vertices, middle])
     return vertices, faces
 
@@ -110,9 +108,7 @@ def _conifer_crown(variant: int) -> Crown:
     return _finish(np.vstack(vertices), np.vstack(faces), np.concatenate(openness), 0.25)
 
 
-def _plant(
-    builder: MeshBuilder, crown: Crown, at: Frame, size: np.ndarray, colour: np.ndarray, seed: float
-) -> None:
+def _plant(builder: MeshBuilder, crown: Crown, at: Frame, size: np.ndarray, colour: np.ndarray, seed: float) -> None:
     """A crown scaled by `size` [3] and stood at a frame."""
     cos, sin = np.cos(at.angle), np.sin(at.angle)
     turn = np.array([(cos, -sin, 0), (sin, cos, 0), (0, 0, 1)])

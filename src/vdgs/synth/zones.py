@@ -54,9 +54,7 @@ class ZoneMap:
     def stroke(self, points: np.ndarray, width: float, zone: Zone, closed: bool = False) -> None:
         """Draw a world polyline [k, 2] of a width in metres."""
         thickness = max(1, round(width / self.cell))
-        cv2.polylines(
-            self.cells, [self._fixed_point(points)], closed, int(zone), thickness, cv2.LINE_8, shift=4
-        )
+        cv2.polylines(self.cells, [self._fixed_point(points)], closed, int(zone), thickness, cv2.LINE_8, shift=4)
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The zone at world places, [n] uint8; OPEN off the map."""

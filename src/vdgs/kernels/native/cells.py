@@ -13,9 +13,7 @@ from vdgs.kernels.reference.cells import cell_centres
 __all__ = ["cell_centres", "cell_keys", "contains", "group_cells", "group_max", "morton_order"]
 
 
-def cell_keys(
-    positions: Float[Tensor, "n 3"], cell_size: float, origin: Float[Tensor, "3"]
-) -> Int64[Tensor, "n"]:
+def cell_keys(positions: Float[Tensor, "n 3"], cell_size: float, origin: Float[Tensor, "3"]) -> Int64[Tensor, "n"]:
     """As `reference.cells.cell_keys`."""
     reference.check_lattice(positions, cell_size, origin)
     keys = torch.empty(positions.shape[0], dtype=torch.int64)

@@ -11,9 +11,7 @@ from vdgs.kernels.native import module
 from vdgs.kernels.native.arguments import contiguous, packed_camera, require_rows
 
 
-def cull(
-    positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], camera: Camera
-) -> Int64[Tensor, "v"]:
+def cull(positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], camera: Camera) -> Int64[Tensor, "v"]:
     """Indices, ascending, of the anchors that may touch the image: the bound of
     `vdgs.kernels.reference.cull.cull`, of which this is the float32 twin.
 

@@ -51,9 +51,7 @@ class _Decode(torch.autograd.Function):
         inputs = [t.detach() for t in tensors]
         decoded = module.native().decode(*inputs[:4], inputs[4:], camera)
         m = decoded.count
-        splats = [
-            torch.empty(m, columns) if columns > 1 else torch.empty(m) for columns in (2, 3, 1, 3, 1, 1)
-        ]
+        splats = [torch.empty(m, columns) if columns > 1 else torch.empty(m) for columns in (2, 3, 1, 3, 1, 1)]
         source = torch.empty(m, dtype=torch.int32)
         decoded.write(*splats, source)
         ctx.save_for_backward(camera, *tensors, source, splats[3], splats[4])
@@ -65,9 +63,7 @@ class _Decode(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         camera, *inputs, source, colours, opacities = (t.detach() for t in ctx.saved_tensors)
         wanted = ctx.needs_input_grad[1:]
-        out = [
-            torch.empty_like(t) if want else None for t, want in zip(inputs[1:4], wanted[1:4], strict=True)
-        ]
+        out = [torch.empty_like(t) if want else None for t, want in zip(inputs[1:4], wanted[1:4], strict=True)]
         # The gradients of the weights come together or not at all.
         weights = [torch.empty_like(t) for t in inputs[4:]] if any(wanted[4:]) else None
         nothing: list[Tensor | None] = [None] * 12

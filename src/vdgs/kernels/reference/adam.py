@@ -66,12 +66,8 @@ def check_step(learning_rate: float, step: int, beta1: float, beta2: float, epsi
     if not (0 <= beta1 < 1 and 0 <= beta2 < 1):
         raise ValueError(f"beta1 and beta2 must lie in [0, 1), got {beta1} and {beta2}")
     if not (math.isfinite(learning_rate) and learning_rate >= 0 and epsilon > 0):
-        raise ValueError(
-            f"learning_rate must be finite and not negative, epsilon positive: {learning_rate}, {epsilon}"
-        )
-    return StepFactors(
-        learning_rate / (1 - beta1**step), 1 / math.sqrt(1 - beta2**step), beta1, beta2, epsilon
-    )
+        raise ValueError(f"learning_rate must be finite and not negative, epsilon positive: {learning_rate}, {epsilon}")
+    return StepFactors(learning_rate / (1 - beta1**step), 1 / math.sqrt(1 - beta2**step), beta1, beta2, epsilon)
 
 
 def check_rows(

@@ -18,9 +18,7 @@ AXIS_OFFSET = 1 << (AXIS_BITS - 1)
 AXIS_MASK = (1 << AXIS_BITS) - 1
 
 
-def cell_keys(
-    positions: Float[Tensor, "n 3"], cell_size: float, origin: Float[Tensor, "3"]
-) -> Int64[Tensor, "n"]:
+def cell_keys(positions: Float[Tensor, "n 3"], cell_size: float, origin: Float[Tensor, "3"]) -> Int64[Tensor, "n"]:
     """Key of the cell that holds each position: floor((x - origin) / cell_size) in float64, packed.
 
     Keys ascend with x, then y, then z. Raises ValueError where an index does not fit 21 bits or a
@@ -34,9 +32,7 @@ def cell_keys(
     return (x << (2 * AXIS_BITS)) | (y << AXIS_BITS) | z
 
 
-def cell_centres(
-    keys: Int64[Tensor, "n"], cell_size: float, origin: Float[Tensor, "3"]
-) -> Float[Tensor, "n 3"]:
+def cell_centres(keys: Int64[Tensor, "n"], cell_size: float, origin: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
     """Centre of each cell, in the type of `origin`."""
     shifts = torch.tensor([2 * AXIS_BITS, AXIS_BITS, 0])
     index = ((keys[:, None] >> shifts) & AXIS_MASK) - AXIS_OFFSET
@@ -146,8 +142,6 @@ def check_groups(values: Tensor, group: Tensor, count: int) -> None:
     if group.dtype != torch.int64:
         raise TypeError(f"group must be int64, not {group.dtype}")
     if values.ndim != 2 or group.shape != values.shape[:1]:
-        raise ValueError(
-            f"expected values [n, d] and group [n], got {list(values.shape)} and {list(group.shape)}"
-        )
+        raise ValueError(f"expected values [n, d] and group [n], got {list(values.shape)} and {list(group.shape)}")
     if group.numel() and (int(group.min()) < 0 or int(group.max()) >= count):
         raise IndexError(f"groups reach from {int(group.min())} to {int(group.max())}, of {count}")

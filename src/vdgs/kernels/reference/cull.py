@@ -11,9 +11,7 @@ from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
 
 
 @torch.no_grad()
-def cull(
-    positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], camera: Camera
-) -> Int64[Tensor, "v"]:
+def cull(positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], camera: Camera) -> Int64[Tensor, "v"]:
     """Indices, ascending, of the anchors whose Gaussian of scales exp(s[0:3]) may touch the image.
 
     Kept: z > near at the centre, and the square about the projected centre that surely holds the

@@ -36,8 +36,7 @@ def decode(
     finite = _finite_rows(positions, viewing, features, log_scales.exp())
     # Replaced before the arithmetic: 0 · NaN would enter the gradients of the weights.
     positions, viewing, features, log_scales = (
-        torch.where(finite[:, None], t, torch.zeros_like(t))
-        for t in (positions, viewing, features, log_scales)
+        torch.where(finite[:, None], t, torch.zeros_like(t)) for t in (positions, viewing, features, log_scales)
     )
     inputs = torch.cat([features, viewing], -1)
 
