@@ -7,5 +7,6 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 
 from jaxtyping import install_import_hook
 
-# Every jaxtyping annotation in the package is checked while the tests run.
-install_import_hook("vdgs", "beartype.beartype")
+# The numerical core's annotations (shapes and types) are checked while the tests run.
+CORE = ("kernels", "evaluation", "anchors", "cameras", "decoder", "growth", "optimiser", "render", "training")
+install_import_hook([f"vdgs.{room}" for room in CORE], "typecheck.checked")

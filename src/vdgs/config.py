@@ -89,9 +89,9 @@ class LossConfig:
     background: Literal["mean", "black"] = "mean"
     """Colour behind the scene: the mean of the training photographs (choice: what no photograph shows is then drawn
     in a colour of the place), or black."""
-    background_noise: float = 0.3
-    """In training the background is this much brighter or darker in each channel, at random: no transparent hole can
-    then pass for ground of the background's colour (choice)."""
+    background_noise: float = 0.2
+    """In training the background is up to this much brighter or darker in each channel, at random, fading to nothing at
+    the end: transparent ground cannot then hide before a background of its own colour (choice)."""
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,8 @@ class TrainingProgress:
         record = {
             "iteration": state.iteration, "loss": report.loss, "l1": report.l1, "ssim": report.ssim,
             "psnr_smoothed": None if math.isnan(state.psnr) else state.psnr,
-            "anchors": len(state.anchors), "visible": report.visible, "splats": report.splats, "downscale": downscale_at(state.iteration - 1, self._config),
+            "anchors": len(state.anchors), "visible": report.visible, "splats": report.splats,
+            "downscale": downscale_at(state.iteration - 1, self._config),
             "grown": report.grown, "pruned": report.pruned, "seconds": round(state.seconds, 3),
             "iterations_per_second": round(self.speed(), 3), "memory_bytes": self._process.memory_info().rss,
         }  # fmt: skip

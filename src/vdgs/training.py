@@ -187,7 +187,8 @@ def reorder(state: TrainingState) -> None:
 
 
 def _background(stage: Stage, iteration: int) -> Tensor:
-    colour, noise = torch.tensor(stage.background), stage.config.loss.background_noise
+    colour = torch.tensor(stage.background)
+    noise = stage.config.loss.background_noise * (1 - iteration / stage.config.iterations)
     if noise == 0:
         return colour
     generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)

@@ -177,10 +177,7 @@ def _find_photographs(
     paths: list[Path] = []
     missing: list[str] = []
     for view in source.views:
-        if view.image_path is not None:
-            path = view.image_path
-        else:
-            path = folder / (available.find(view.name) or view.name)
+        path = view.image_path or folder / (available.find(view.name) or view.name)
         paths.append(path)
         if not path.is_file():
             missing.append(str(path))
