@@ -185,7 +185,6 @@ _PAINT: dict[Zone, Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]] =
     Zone.PLOUGHED: _ploughed,
     Zone.GREENS: _greens,
     Zone.BUILDING: _drive,
-    Zone.POOL: _sand,
     Zone.COURT: _court,
 }
 

@@ -31,8 +31,7 @@ class Zone(IntEnum):
     PLOUGHED = 17
     GREENS = 18
     BUILDING = 19
-    POOL = 20
-    COURT = 21
+    COURT = 20
 
 
 class ZoneMap:
