@@ -114,14 +114,10 @@ void slab_gradients(const Frame& frame, Slab& slab, int tile, uint32_t& seen, Ti
   seen -= n;
   for (uint32_t i = n; i-- > 0;) {
     if (i >= 12) __builtin_prefetch(slab.records.data() + entries[i - 12]);
-    float* out = sums + i * size_t{kStride};
-    if (touched[i])
-      entry_gradients<with_depth, any_stop>(slab.records[entries[i]], origins, touched[i], order_of(seen + i), g, out);
-    else
-      std::memset(out, 0, kStride * sizeof(float));
+    if (!touched[i]) continue;
+    entry_gradients<with_depth, any_stop>(slab.records[entries[i]], origins, touched[i], order_of(seen + i), g,
+                                          sums + i * size_t{kStride});
   }
-  const size_t hidden = slab.tile_begin[static_cast<size_t>(tile) + 1] - (begin + n);
-  std::memset(sums + n * size_t{kStride}, 0, hidden * kStride * sizeof(float));
 }
 
 template <bool with_depth>

@@ -23,10 +23,8 @@ struct alignas(64) Batch {
   alignas(64) uint16_t touched[kBatch];
 };
 
-void prepare_batch(const Record* records, const uint32_t* entries, int n, int ahead, const BlockOrigins& origins,
-                   Batch& batch) {
+void prepare_batch(const Record* records, const uint32_t* entries, int n, const BlockOrigins& origins, Batch& batch) {
   for (int j = 0; j < n; ++j) {
-    if (j + 12 < ahead) __builtin_prefetch(records + entries[j + 12]);
     const Record& r = records[entries[j]];
     const F16 dx = origins.x - splat(r.mean_x), dy = origins.y - splat(r.mean_y);
     batch.in_reach[j] = static_cast<uint16_t>(bits(squares_in_reach(r, dx, dy, 3.0f)));
@@ -96,13 +94,22 @@ template <bool with_depth, bool counting>
 uint32_t blend_entries(const Frame& frame, Slab& slab, int tile, TilePixels& px, int64_t& pairs) {
   const uint32_t begin = slab.tile_begin[static_cast<size_t>(tile)], end = slab.tile_begin[static_cast<size_t>(tile) + 1];
   const BlockOrigins origins(frame.grid, tile);
+  const Record* records = slab.records.data();
+  const uint32_t* entries = slab.entries.data();
+  for (uint32_t k = begin; k < std::min(end, begin + kBatch); ++k) __builtin_prefetch(records + entries[k]);
   unsigned live = live_blocks(px);
   Batch batch;
   uint32_t i = begin;
   for (; i < end && live; i += std::min<uint32_t>(kBatch, end - i)) {
     const int n = static_cast<int>(std::min<uint32_t>(kBatch, end - i));
-    prepare_batch(slab.records.data(), slab.entries.data() + i, n, static_cast<int>(std::min<uint32_t>(2 * kBatch, end - i)), origins, batch);
+    prepare_batch(records, entries + i, n, origins, batch);
+    uint32_t prefetched = i + static_cast<uint32_t>(n);
+    const uint32_t prefetch_end = std::min(end, prefetched + kBatch);
     for (unsigned blocks = live; blocks; blocks &= blocks - 1) {
+      // The records of the next batch arrive while this one is blended, a few per block: memory
+      // cannot fetch all of them at once.
+      for (int k = 0; k < kBatch / kTileBlocks && prefetched < prefetch_end; ++k)
+        __builtin_prefetch(records + entries[prefetched++]);
       const int block = __builtin_ctz(blocks);
       const uint64_t chosen = bit_column(batch.in_reach, block);
       if (!chosen) continue;

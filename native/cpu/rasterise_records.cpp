@@ -56,8 +56,7 @@ Record record_of(const Sixteen& s, int k, const float* colour, float depth) {
 
 }  // namespace
 
-void make_records(const Splats& splats, const TileGrid& grid, SlabPart& part) {
-  Record* picks = part.picks.reserve(static_cast<size_t>(part.count));
+void make_records(const Splats& splats, const TileGrid& grid, const SlabPart& part, Record* records) {
   Sixteen sixteen = {};
   for (int64_t i = 0; i < part.count; i += kLanes) {
     const int n = static_cast<int>(std::min<int64_t>(kLanes, part.count - i));
@@ -65,7 +64,7 @@ void make_records(const Splats& splats, const TileGrid& grid, SlabPart& part) {
     gather_splats(splats, splat, n, sixteen);
     derive(sixteen, grid);
     for (int k = 0; k < n; ++k)
-      picks[i + k] = record_of(sixteen, k, splats.colours + 3 * static_cast<int64_t>(splat[k]), splats.depths[splat[k]]);
+      records[i + k] = record_of(sixteen, k, splats.colours + 3 * static_cast<int64_t>(splat[k]), splats.depths[splat[k]]);
   }
 }
 

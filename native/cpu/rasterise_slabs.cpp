@@ -134,8 +134,7 @@ DepthRange next_slab(const DepthSample& sample, const TileGrid& grid, const Dept
   return range;
 }
 
-void select_and_sort(const Frame& frame, const Splats& splats, const DepthSample& sample, const DepthRange& range,
-                     Slab& slab) {
+void select_and_sort(const Frame& frame, const DepthSample& sample, const DepthRange& range, Slab& slab) {
   const int64_t in_sample = static_cast<int64_t>(range.end - range.begin);
   const int64_t estimate = in_sample * frame.candidates.count / std::max<int64_t>(1, static_cast<int64_t>(sample.depth.size()));
   slab.n_parts = n_parts(estimate, 4096);
@@ -155,12 +154,11 @@ void select_and_sort(const Frame& frame, const Splats& splats, const DepthSample
   parallel_for(slab.n_parts, [&](int64_t p) {
     SlabPart& part = *slab.parts[static_cast<size_t>(p)];
     select(frame, cut(static_cast<int>(p)), cut(static_cast<int>(p) + 1), first_slab, part);
-    make_records(splats, frame.grid, part);
     sort(part);
   });
   slab.count = 0;
   for (int p = 0; p < slab.n_parts; ++p) {
-    slab.parts[static_cast<size_t>(p)]->rank_begin = slab.count;
+    slab.parts[static_cast<size_t>(p)]->begin = slab.count;
     slab.count += slab.parts[static_cast<size_t>(p)]->count;
   }
 }
