@@ -81,7 +81,8 @@ void forward(Frame& frame, const Splats& splats, const float background[3], int 
   }
 }
 
-void backward(Frame& frame, const float background[3], const PictureGradients& in, const SplatGradients& out) {
+void backward(Frame& frame, const float background[3], const PictureGradients& in,
+              const SplatGradients& out) {
   const std::lock_guard<std::mutex> lock(frame.mutex);
   Stopwatch watch;
   backward_tiles(frame, background, in);
@@ -97,8 +98,8 @@ size_t Frame::bytes() const {
     total += slab->records.bytes() + slab->entries.bytes() + slab->touched.bytes() + slab->sums.bytes() +
              slab->pick_sums.bytes();
     for (const auto& part : slab->parts)
-      total += part->splat.bytes() + part->order.bytes() + part->scratch.bytes() + part->first.bytes() + part->where.bytes() +
-               part->cursor.bytes();
+      total += part->splat.bytes() + part->order.bytes() + part->scratch.bytes() + part->first.bytes() +
+               part->where.bytes() + part->cursor.bytes();
   }
   return total;
 }

@@ -75,7 +75,7 @@ void count_per_tile(const TileGrid& grid, SlabPart& part) {
 void note_tiles(const Frame& frame, const Splats& splats, Slab& slab) {
   slab.records.reserve(static_cast<size_t>(slab.count));
   parallel_for(slab.n_parts, [&](int64_t p) {
-    SlabPart& part = *slab.parts[static_cast<size_t>(p)];
+    SlabPart& part = *slab.parts[p];
     Record* records = slab.records.data() + part.begin;
     make_records(splats, frame.grid, part, records);
     note_part(frame, records, part);
@@ -86,7 +86,7 @@ void note_tiles(const Frame& frame, const Splats& splats, Slab& slab) {
 void scatter_entries(const TileGrid& grid, Slab& slab) {
   const size_t tiles = static_cast<size_t>(grid.tiles());
   slab.n_entries = 0;
-  for (int p = 0; p < slab.n_parts; ++p) slab.n_entries += static_cast<uint64_t>(slab.parts[static_cast<size_t>(p)]->n_entries);
+  for (int p = 0; p < slab.n_parts; ++p) slab.n_entries += static_cast<uint64_t>(slab.parts[p]->n_entries);
   if (slab.n_entries > UINT32_MAX) throw std::length_error(kTooManyEntries);
   slab.entries.reserve(slab.n_entries), slab.touched.reserve(slab.n_entries), slab.visited.reserve(tiles);
   // Within a tile the parts follow each other, as they do in depth.
@@ -94,15 +94,18 @@ void scatter_entries(const TileGrid& grid, Slab& slab) {
   uint32_t total = 0;
   for (size_t tile = 0; tile < tiles; ++tile) {
     tile_begin[tile] = total;
-    for (int p = 0; p < slab.n_parts; ++p) total += std::exchange(slab.parts[static_cast<size_t>(p)]->cursor[tile], total);
+    for (int p = 0; p < slab.n_parts; ++p) {
+      const uint32_t count = std::exchange(slab.parts[p]->cursor[tile], total);
+      total += count;
+    }
   }
   tile_begin[tiles] = total;
   parallel_for(slab.n_parts, [&](int64_t p) {
-    SlabPart& part = *slab.parts[static_cast<size_t>(p)];
+    SlabPart& part = *slab.parts[p];
     uint32_t *where = part.where.data(), *cursor = part.cursor.data(), *entries = slab.entries.data();
     const uint32_t* first = part.first.data();
     for (int64_t i = 0; i < part.count; ++i) {
-      const uint32_t record = static_cast<uint32_t>(part.begin) + part.order[static_cast<size_t>(i)].pick;
+      const uint32_t record = static_cast<uint32_t>(part.begin) + part.order[i].pick;
       for (uint32_t k = first[i]; k < first[i + 1]; ++k) {
         where[k] = cursor[where[k]]++;
         entries[where[k]] = record;

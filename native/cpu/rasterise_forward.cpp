@@ -5,8 +5,8 @@
 // are all finished leaves the tile.
 #include <atomic>
 
-#include "tile.h"
 #include "threads.h"
+#include "tile.h"
 
 namespace vdgs::raster {
 namespace {
@@ -23,7 +23,8 @@ struct alignas(64) Batch {
   alignas(64) uint16_t touched[kBatch];
 };
 
-void prepare_batch(const Record* records, const uint32_t* entries, int n, const BlockOrigins& origins, Batch& batch) {
+void prepare_batch(const Record* records, const uint32_t* entries, int n, const BlockOrigins& origins,
+                   Batch& batch) {
   for (int j = 0; j < n; ++j) {
     const Record& r = records[entries[j]];
     const F16 dx = origins.x - splat(r.mean_x), dy = origins.y - splat(r.mean_y);
@@ -92,7 +93,7 @@ unsigned live_blocks(const TilePixels& px) {
 // Draws entries until they end or all pixels are finished. Returns how many were looked at.
 template <bool with_depth, bool counting>
 uint32_t blend_entries(const Frame& frame, Slab& slab, int tile, TilePixels& px, int64_t& pairs) {
-  const uint32_t begin = slab.tile_begin[static_cast<size_t>(tile)], end = slab.tile_begin[static_cast<size_t>(tile) + 1];
+  const uint32_t begin = slab.tile_begin[tile], end = slab.tile_begin[tile + 1];
   const BlockOrigins origins(frame.grid, tile);
   const Record* records = slab.records.data();
   const uint32_t* entries = slab.entries.data();
@@ -113,7 +114,8 @@ uint32_t blend_entries(const Frame& frame, Slab& slab, int tile, TilePixels& px,
       const int block = __builtin_ctz(blocks);
       const uint64_t chosen = bit_column(batch.in_reach, block);
       if (!chosen) continue;
-      const uint64_t touched = blend_block<with_depth, counting>(batch, chosen, block, px.seen + (i - begin), px, pairs);
+      const uint64_t touched =
+          blend_block<with_depth, counting>(batch, chosen, block, px.seen + (i - begin), px, pairs);
       set_bit_column(batch.touched, block, touched);
       if (!px.live[block]) live &= ~(1u << block);
     }
@@ -150,7 +152,8 @@ void clear_pixels(const TileGrid& grid, int tile, TilePixels& px) {
 }
 
 // The picture, and what the backward pass wants of the pixels.
-void finish_tile(Frame& frame, int tile, const TilePixels& px, const float background[3], const Picture& out) {
+void finish_tile(Frame& frame, int tile, const TilePixels& px, const float background[3],
+                 const Picture& out) {
   const F16 b0 = splat(background[0]), b1 = splat(background[1]), b2 = splat(background[2]);
   for_each_pixel_row(frame.grid, tile, [&](int n, int place, int64_t pixel) {
     const F16 t = load_quads(px.transmittance + place, kLanes);
@@ -162,7 +165,7 @@ void finish_tile(Frame& frame, int tile, const TilePixels& px, const float backg
   });
   const size_t first = static_cast<size_t>(tile) * kTilePixels;
   std::memcpy(frame.transmittance.data() + first, px.transmittance, sizeof px.transmittance);
-  frame.any_stop[static_cast<size_t>(tile)] = px.any_stop;
+  frame.any_stop[tile] = px.any_stop;
   if (px.any_stop) std::memcpy(frame.stop.data() + first, px.stop, sizeof px.stop);
 }
 

@@ -30,7 +30,7 @@ void add_entries(Slab& slab, const SlabPart& part) {
   const auto row = [&](uint32_t k) { return touched[where[k]] ? sums + where[k] * kStride : kZeros; };
   PickSums* out = slab.pick_sums.data() + part.begin;
   for (int64_t i = 0; i < part.count; ++i) {
-    if (i + 8 < part.count) __builtin_prefetch(out + part.order[static_cast<size_t>(i + 8)].pick, 1);
+    if (i + 8 < part.count) __builtin_prefetch(out + part.order[i + 8].pick, 1);
     F16 total = splat(0.0f);  // its first kStride lanes; the others add up what nobody reads
     for (uint32_t k = first[i]; k < first[i + 1]; ++k) {
       if (k + 2 * kAhead < n_entries) {
@@ -41,7 +41,7 @@ void add_entries(Slab& slab, const SlabPart& part) {
       }
       total = total + loadu(row(k));
     }
-    store(out[part.order[static_cast<size_t>(i)].pick].sum, total);
+    store(out[part.order[i].pick].sum, total);
   }
 }
 
@@ -80,10 +80,10 @@ void reduce_gradients(Frame& frame, const SplatGradients& out) {
                  [&](int, int64_t begin, int64_t end) { clear(out, begin, end); });
   const auto add = frame.with_depth ? add_entries<true> : add_entries<false>;
   for (int s = 0; s < frame.n_slabs; ++s) {
-    Slab& slab = *frame.slabs[static_cast<size_t>(s)];
+    Slab& slab = *frame.slabs[s];
     slab.pick_sums.reserve(static_cast<size_t>(slab.count));
     parallel_for(slab.n_parts, [&](int64_t p) {
-      const SlabPart& part = *slab.parts[static_cast<size_t>(p)];
+      const SlabPart& part = *slab.parts[p];
       add(slab, part);
       write_part(slab, part, out);
     });
