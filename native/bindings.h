@@ -33,7 +33,7 @@ using Array = nb::ndarray<Scalar, nb::c_contig, nb::device::cpu, Shape...>;
 
 }  // namespace vdgs
 
-#define VDGS_BIND(name)                                          \
-  static void bind_##name(nb::module_& m);                       \
-  static const ::vdgs::Binding binding_of_##name(bind_##name);   \
+#define VDGS_BIND(name)                                        \
+  static void bind_##name(nb::module_& m);                     \
+  static const ::vdgs::Binding binding_of_##name(bind_##name); \
   static void bind_##name([[maybe_unused]] nb::module_& m)

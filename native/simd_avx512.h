@@ -62,7 +62,9 @@ VDGS_INLINE F16 min(F16 a, F16 b) { return {_mm512_min_ps(a.v, b.v)}; }
 VDGS_INLINE F16 max(F16 a, F16 b) { return {_mm512_max_ps(a.v, b.v)}; }
 VDGS_INLINE F16 abs(F16 a) { return {_mm512_abs_ps(a.v)}; }
 VDGS_INLINE F16 sqrt(F16 a) { return {_mm512_sqrt_ps(a.v)}; }
-VDGS_INLINE F16 floor(F16 a) { return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)}; }
+VDGS_INLINE F16 floor(F16 a) {
+  return {_mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC)};
+}
 
 // The 14-bit estimates of the processor, refined by one Newton step.
 VDGS_INLINE F16 reciprocal(F16 a) {

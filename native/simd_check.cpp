@@ -68,7 +68,7 @@ int64_t sum_of_tasks(int64_t n, int64_t bad) {
   std::vector<int64_t> done(static_cast<size_t>(n), 0);
   parallel_for(n, [&](int64_t i) {
     if (i == bad) throw std::runtime_error("task failed on purpose");
-    parallel_for(1, [&](int64_t) { done[static_cast<size_t>(i)] += i; });
+    parallel_for(1, [&](int64_t) { done[i] += i; });
   });
   int64_t sum = 0;
   for (int64_t d : done) sum += d;

@@ -39,7 +39,9 @@ VDGS_INLINE FloatPart min(FloatPart a, FloatPart b) { return _mm256_min_ps(a, b)
 VDGS_INLINE FloatPart max(FloatPart a, FloatPart b) { return _mm256_max_ps(a, b); }
 VDGS_INLINE FloatPart sqrt(FloatPart a) { return _mm256_sqrt_ps(a); }
 VDGS_INLINE FloatPart reciprocal_estimate(FloatPart a) { return _mm256_rcp_ps(a); }
-VDGS_INLINE FloatPart select(IntPart m, FloatPart a, FloatPart b) { return _mm256_blendv_ps(b, a, (__m256)m); }
+VDGS_INLINE FloatPart select(IntPart m, FloatPart a, FloatPart b) {
+  return _mm256_blendv_ps(b, a, (__m256)m);
+}
 VDGS_INLINE unsigned bits(IntPart m) { return static_cast<unsigned>(_mm256_movemask_ps((__m256)m)); }
 VDGS_INLINE IntPart truncate(FloatPart a) { return (IntPart)_mm256_cvttps_epi32(a); }
 #else
@@ -122,24 +124,24 @@ VDGS_INLINE M16 mask_of_bits(unsigned u) {
 VDGS_INLINE M16 first_lanes(int count) { return mask_of_bits((1u << count) - 1u); }
 
 // Part by part: as one copy of 64 bytes the compiler would take the long way round, through the stack.
-#define VDGS_LOADS_AND_STORES(Lanes, Scalar)                                                               \
-  typedef Scalar Aligned##Lanes##Part __attribute__((vector_size(kPartLanes * 4), may_alias));             \
-  typedef Scalar Any##Lanes##Part __attribute__((vector_size(kPartLanes * 4), aligned(4), may_alias));     \
-  VDGS_INLINE Lanes load(const Scalar* p) {                                                                \
-    Lanes r;                                                                                               \
-    VDGS_EACH r.v[k] = *reinterpret_cast<const Aligned##Lanes##Part*>(p + k * kPartLanes);                 \
-    return r;                                                                                              \
-  }                                                                                                        \
-  VDGS_INLINE Lanes loadu(const Scalar* p) {                                                               \
-    Lanes r;                                                                                               \
-    VDGS_EACH r.v[k] = *reinterpret_cast<const Any##Lanes##Part*>(p + k * kPartLanes);                     \
-    return r;                                                                                              \
-  }                                                                                                        \
-  VDGS_INLINE void store(Scalar* p, Lanes a) {                                                             \
-    VDGS_EACH *reinterpret_cast<Aligned##Lanes##Part*>(p + k * kPartLanes) = a.v[k];                       \
-  }                                                                                                        \
-  VDGS_INLINE void storeu(Scalar* p, Lanes a) {                                                            \
-    VDGS_EACH *reinterpret_cast<Any##Lanes##Part*>(p + k * kPartLanes) = a.v[k];                           \
+#define VDGS_LOADS_AND_STORES(Lanes, Scalar)                                                           \
+  typedef Scalar Aligned##Lanes##Part __attribute__((vector_size(kPartLanes * 4), may_alias));         \
+  typedef Scalar Any##Lanes##Part __attribute__((vector_size(kPartLanes * 4), aligned(4), may_alias)); \
+  VDGS_INLINE Lanes load(const Scalar* p) {                                                            \
+    Lanes r;                                                                                           \
+    VDGS_EACH r.v[k] = *reinterpret_cast<const Aligned##Lanes##Part*>(p + k * kPartLanes);             \
+    return r;                                                                                          \
+  }                                                                                                    \
+  VDGS_INLINE Lanes loadu(const Scalar* p) {                                                           \
+    Lanes r;                                                                                           \
+    VDGS_EACH r.v[k] = *reinterpret_cast<const Any##Lanes##Part*>(p + k * kPartLanes);                 \
+    return r;                                                                                          \
+  }                                                                                                    \
+  VDGS_INLINE void store(Scalar* p, Lanes a) {                                                         \
+    VDGS_EACH* reinterpret_cast<Aligned##Lanes##Part*>(p + k * kPartLanes) = a.v[k];                   \
+  }                                                                                                    \
+  VDGS_INLINE void storeu(Scalar* p, Lanes a) {                                                        \
+    VDGS_EACH* reinterpret_cast<Any##Lanes##Part*>(p + k * kPartLanes) = a.v[k];                       \
   }
 VDGS_LOADS_AND_STORES(F16, float)
 VDGS_LOADS_AND_STORES(I16, int32_t)
@@ -154,10 +156,10 @@ VDGS_INLINE void store_first(float* p, int count, F16 a) {
   std::memcpy(p, &a, static_cast<size_t>(count) * sizeof(float));
 }
 
-#define VDGS_OPERATOR(Lanes, op)                     \
-  VDGS_INLINE Lanes operator op(Lanes a, Lanes b) {  \
-    VDGS_EACH a.v[k] = a.v[k] op b.v[k];             \
-    return a;                                        \
+#define VDGS_OPERATOR(Lanes, op)                    \
+  VDGS_INLINE Lanes operator op(Lanes a, Lanes b) { \
+    VDGS_EACH a.v[k] = a.v[k] op b.v[k];            \
+    return a;                                       \
   }
 VDGS_OPERATOR(F16, +)
 VDGS_OPERATOR(F16, -)
@@ -195,11 +197,11 @@ VDGS_INLINE F16 sqrt(F16 a) {
   return a;
 }
 
-#define VDGS_COMPARISON(name, op)                       \
-  VDGS_INLINE M16 name(F16 a, F16 b) {                  \
-    M16 r;                                              \
-    VDGS_EACH r.m[k] = (IntPart)(a.v[k] op b.v[k]);     \
-    return r;                                           \
+#define VDGS_COMPARISON(name, op)                   \
+  VDGS_INLINE M16 name(F16 a, F16 b) {              \
+    M16 r;                                          \
+    VDGS_EACH r.m[k] = (IntPart)(a.v[k] op b.v[k]); \
+    return r;                                       \
   }
 VDGS_COMPARISON(lt, <)
 VDGS_COMPARISON(le, <=)
@@ -411,7 +413,8 @@ VDGS_INLINE void set_bit_column(uint16_t* masks, int bit, uint64_t column) {
   for (int q = 0; q < 8; ++q) {
     Eight eight;
     std::memcpy(&eight, masks + 8 * q, 16);
-    const Eight chosen = (Eight)(((Eight{} + static_cast<uint16_t>((column >> (8 * q)) & 255)) & weight) != 0);
+    const Eight chosen =
+        (Eight)(((Eight{} + static_cast<uint16_t>((column >> (8 * q)) & 255)) & weight) != 0);
     eight |= chosen & wanted;
     std::memcpy(masks + 8 * q, &eight, 16);
   }

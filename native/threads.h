@@ -23,8 +23,7 @@ void run(int64_t n_tasks, Task task, const void* body);
 // next. Returns when all are done. The first exception stops the rest and reaches the caller.
 template <class Body>
 void parallel_for(int64_t n_tasks, const Body& body) {
-  detail::run(
-      n_tasks, [](const void* b, int64_t index) { (*static_cast<const Body*>(b))(index); }, &body);
+  detail::run(n_tasks, [](const void* b, int64_t index) { (*static_cast<const Body*>(b))(index); }, &body);
 }
 
 // How many parts parallel_parts makes of n items: one per thread, but none smaller than `grain`.

@@ -65,33 +65,37 @@ struct DepthKey {
   uint32_t pick;
 };
 
-// A contiguous part of a slab's depth order, worked on by one thread until the tiles are binned.
+// A contiguous part of a slab's range of depth, worked on by one thread until its tiles are binned.
 //
 // Its splats ("picks") are numbered in the order of the input. All that touches the rows of the input,
 // or of its gradients, goes through them in that order: memory is far slower the other way.
 struct SlabPart {
-  int64_t rank_begin = 0;  // in the slab
-  int64_t count = 0, n_entries = 0;
-  Buffer<int32_t> splat;           // [count] of each pick, ascending
-  Buffer<Record> picks;            // [count]; the backward pass keeps sums in them
+  int64_t begin = 0, count = 0;  // of its picks among those of the slab
+  int64_t n_entries = 0;
+  Buffer<int32_t> splat;            // [count] of each pick, ascending
   Buffer<DepthKey> order, scratch;  // [count] the picks by depth
-  Buffer<uint32_t> first;  // [count + 1] where a splat's entries begin in `where`
-  Buffer<uint32_t> where;  // [n_entries] splat by splat: first the tile, then the entry's place in it
-  Buffer<uint32_t> cursor;  // [tiles] where this part's next entry of a tile goes
+  Buffer<uint32_t> first;           // [count + 1] where the entries of a pick begin in `where`, by depth
+  Buffer<uint32_t> where;           // [n_entries] by depth: first the tile, then the entry's place in it
+  Buffer<uint32_t> cursor;          // [tiles] where this part's next entry of a tile goes
 };
 
-// A range of depth: its splats in order, and for every tile the entries (ranks of splats) that reach it.
+struct alignas(64) PickSums {
+  float sum[16];
+};
+
+// A range of depth: its splats, and for every tile the entries, front to back, that reach it.
 struct Slab {
   int64_t count = 0;
   uint64_t n_entries = 0;
   std::vector<std::unique_ptr<SlabPart>> parts;
   int n_parts = 0;
-  Buffer<Record> records;
+  Buffer<Record> records;       // [count] pick by pick
   Buffer<uint32_t> tile_begin;  // [tiles + 1]
-  Buffer<uint32_t> entries;     // [n_entries] rank in the slab, ascending in each tile
+  Buffer<uint32_t> entries;     // [n_entries] which record
   Buffer<uint16_t> touched;     // [n_entries] blocks in which the entry contributed
   Buffer<uint32_t> visited;     // [tiles] entries looked at before the tile was finished
-  Buffer<float> sums;           // [n_entries, n_sums] of the backward pass
+  Buffer<float> sums;           // [n_entries, n_sums] of the backward pass, where touched
+  Buffer<PickSums> pick_sums;   // [count] added up
 };
 
 // The pixels of one tile, block by block.
@@ -99,10 +103,10 @@ struct alignas(64) TilePixels {
   float transmittance[kTilePixels];
   float colour[3][kTilePixels];
   float depth[kTilePixels];
-  float stop[kTilePixels];      // order_of() of the entry that finished the pixel
-  uint16_t live[kTileBlocks];   // pixels that are not finished
-  uint32_t seen;                // entries in the slabs before
-  bool any_stop;                // whether `stop` says anything
+  float stop[kTilePixels];     // order_of() of the entry that finished the pixel
+  uint16_t live[kTileBlocks];  // pixels that are not finished
+  uint32_t seen;               // entries in the slabs before
+  bool any_stop;               // whether `stop` says anything
 };
 
 enum class TileState : uint8_t { fresh, open, finished };
@@ -159,15 +163,14 @@ struct DepthSample {
 };
 DepthSample sample_depths(const Candidates& candidates);
 struct DepthRange {
-  float low, high;      // low <= depth < high
-  size_t begin, end;    // in the sample
+  float low, high;    // low <= depth < high
+  size_t begin, end;  // in the sample
 };
 DepthRange next_slab(const DepthSample& sample, const TileGrid& grid, const DepthRange& previous, int number);
-void select_and_sort(const Frame& frame, const Splats& splats, const DepthSample& sample, const DepthRange& range,
-                     Slab& slab);
-void make_records(const Splats& splats, const TileGrid& grid, SlabPart& part);
+void select_and_sort(const Frame& frame, const DepthSample& sample, const DepthRange& range, Slab& slab);
 
-void note_tiles(const Frame& frame, Slab& slab);
+void make_records(const Splats& splats, const TileGrid& grid, const SlabPart& part, Record* records);
+void note_tiles(const Frame& frame, const Splats& splats, Slab& slab);
 void scatter_entries(const TileGrid& grid, Slab& slab);
 
 void forward_tiles(Frame& frame, Slab& slab, bool last, const float background[3], const Picture& out,

@@ -68,9 +68,9 @@ void forward(Frame& frame, const Splats& splats, const float background[3], int 
     range = next_slab(sample, frame.grid, range, frame.n_slabs - 1);
     last = range.end == sample.depth.size();
     if (!last) frame.unfinished.reserve(static_cast<size_t>(frame.grid.tiles()));
-    select_and_sort(frame, splats, sample, range, slab);
+    select_and_sort(frame, sample, range, slab);
     frame.seconds[kSelect] += watch.lap();
-    note_tiles(frame, slab);
+    note_tiles(frame, splats, slab);
     frame.seconds[kBin] += watch.lap();
     scatter_entries(frame.grid, slab);
     frame.seconds[kScatter] += watch.lap();
@@ -81,7 +81,8 @@ void forward(Frame& frame, const Splats& splats, const float background[3], int 
   }
 }
 
-void backward(Frame& frame, const float background[3], const PictureGradients& in, const SplatGradients& out) {
+void backward(Frame& frame, const float background[3], const PictureGradients& in,
+              const SplatGradients& out) {
   const std::lock_guard<std::mutex> lock(frame.mutex);
   Stopwatch watch;
   backward_tiles(frame, background, in);
@@ -94,10 +95,11 @@ size_t Frame::bytes() const {
   size_t total = candidates.depth.bytes() + candidates.splat.bytes() + candidates.columns.bytes() +
                  candidates.rows.bytes() + transmittance.bytes() + stop.bytes() + unfinished.bytes();
   for (const auto& slab : slabs) {
-    total += slab->records.bytes() + slab->entries.bytes() + slab->touched.bytes() + slab->sums.bytes();
+    total += slab->records.bytes() + slab->entries.bytes() + slab->touched.bytes() + slab->sums.bytes() +
+             slab->pick_sums.bytes();
     for (const auto& part : slab->parts)
-      total += part->splat.bytes() + part->picks.bytes() + part->order.bytes() + part->scratch.bytes() + part->first.bytes() + part->where.bytes() +
-               part->cursor.bytes();
+      total += part->splat.bytes() + part->order.bytes() + part->scratch.bytes() + part->first.bytes() +
+               part->where.bytes() + part->cursor.bytes();
   }
   return total;
 }

@@ -31,7 +31,8 @@ void load_gradients(const Frame& frame, int tile, const float background[3], con
     store_quads(g.image[1] + place, kLanes, gr);
     store_quads(g.image[2] + place, kLanes, b);
     store_quads(g.behind + place, kLanes, in.alpha ? zero - read_row(in.alpha + pixel, n) : zero);
-    if (frame.with_depth) store_quads(g.depth + place, kLanes, in.depth ? read_row(in.depth + pixel, n) : zero);
+    if (frame.with_depth)
+      store_quads(g.depth + place, kLanes, in.depth ? read_row(in.depth + pixel, n) : zero);
   });
   const size_t first = static_cast<size_t>(tile) * kTilePixels;
   const F16 b0 = splat(background[0]), b1 = splat(background[1]), b2 = splat(background[2]);
@@ -44,7 +45,7 @@ void load_gradients(const Frame& frame, int tile, const float background[3], con
     s0 = fma(t, g0, s0), s1 = fma(t, g1, s1), s2 = fma(t, g2, s2);
   }
   background_sums[0] = hsum(s0), background_sums[1] = hsum(s1), background_sums[2] = hsum(s2);
-  if (frame.any_stop[static_cast<size_t>(tile)]) std::memcpy(g.stop, frame.stop.data() + first, sizeof g.stop);
+  if (frame.any_stop[tile]) std::memcpy(g.stop, frame.stop.data() + first, sizeof g.stop);
 }
 
 // One entry: all blocks that it touched.
@@ -106,22 +107,18 @@ template <bool with_depth, bool any_stop>
 void slab_gradients(const Frame& frame, Slab& slab, int tile, uint32_t& seen, TileGradients& g) {
   constexpr int kStride = n_sums(with_depth);
   const BlockOrigins origins(frame.grid, tile);
-  const size_t begin = slab.tile_begin[static_cast<size_t>(tile)];
-  const uint32_t n = slab.visited[static_cast<size_t>(tile)];
+  const size_t begin = slab.tile_begin[tile];
+  const uint32_t n = slab.visited[tile];
   const uint32_t* entries = slab.entries.data() + begin;
   const uint16_t* touched = slab.touched.data() + begin;
   float* sums = slab.sums.data() + begin * kStride;
   seen -= n;
   for (uint32_t i = n; i-- > 0;) {
     if (i >= 12) __builtin_prefetch(slab.records.data() + entries[i - 12]);
-    float* out = sums + i * size_t{kStride};
-    if (touched[i])
-      entry_gradients<with_depth, any_stop>(slab.records[entries[i]], origins, touched[i], order_of(seen + i), g, out);
-    else
-      std::memset(out, 0, kStride * sizeof(float));
+    if (!touched[i]) continue;
+    entry_gradients<with_depth, any_stop>(slab.records[entries[i]], origins, touched[i], order_of(seen + i),
+                                          g, sums + i * size_t{kStride});
   }
-  const size_t hidden = slab.tile_begin[static_cast<size_t>(tile) + 1] - (begin + n);
-  std::memset(sums + n * size_t{kStride}, 0, hidden * kStride * sizeof(float));
 }
 
 template <bool with_depth>
@@ -130,9 +127,10 @@ void tile_gradients(Frame& frame, int tile, const float background[3], const Pic
   TileGradients g;
   load_gradients(frame, tile, background, in, g, frame.background_sums.data() + 3 * index);
   uint32_t seen = 0;
-  for (int s = 0; s < frame.n_slabs; ++s) seen += frame.slabs[static_cast<size_t>(s)]->visited[index];
-  const auto through = frame.any_stop[index] ? slab_gradients<with_depth, true> : slab_gradients<with_depth, false>;
-  for (int s = frame.n_slabs; s-- > 0;) through(frame, *frame.slabs[static_cast<size_t>(s)], tile, seen, g);
+  for (int s = 0; s < frame.n_slabs; ++s) seen += frame.slabs[s]->visited[index];
+  const auto through =
+      frame.any_stop[index] ? slab_gradients<with_depth, true> : slab_gradients<with_depth, false>;
+  for (int s = frame.n_slabs; s-- > 0;) through(frame, *frame.slabs[s], tile, seen, g);
 }
 
 }  // namespace
@@ -142,7 +140,7 @@ void backward_tiles(Frame& frame, const float background[3], const PictureGradie
   const int tiles = frame.grid.tiles();
   frame.background_sums.reserve(3 * static_cast<size_t>(tiles));
   for (int s = 0; s < frame.n_slabs; ++s) {
-    Slab& slab = *frame.slabs[static_cast<size_t>(s)];
+    Slab& slab = *frame.slabs[s];
     slab.sums.reserve(slab.n_entries * static_cast<size_t>(n_sums(frame.with_depth)));
   }
   const auto gradients = frame.with_depth ? tile_gradients<true> : tile_gradients<false>;

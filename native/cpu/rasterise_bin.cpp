@@ -39,22 +39,21 @@ size_t drop_finished(const Frame& frame, uint32_t* where, size_t begin, size_t e
   return kept;
 }
 
-// Brings the records into depth order and notes the tiles of each.
-void note_part(const Frame& frame, Slab& slab, SlabPart& part) {
+// Notes the tiles of a part's splats, front to back.
+void note_part(const Frame& frame, const Record* records, SlabPart& part) {
   uint32_t* first = part.first.reserve(static_cast<size_t>(part.count) + 1);
   const DepthKey* order = part.order.data();
-  Record* records = slab.records.data() + part.rank_begin;
   alignas(64) int32_t tile_of_lane[16];
   for (int i = 0; i < 16; ++i) tile_of_lane[i] = (i >> 2) * frame.grid.columns + (i & 3);
   constexpr int64_t kAhead = 16;
   size_t n = 0;
   for (int64_t i = 0; i < part.count; ++i) {
-    if (i + kAhead < part.count) __builtin_prefetch(part.picks.data() + order[i + kAhead].pick);
-    records[i] = part.picks[order[i].pick];
+    if (i + kAhead < part.count) __builtin_prefetch(records + order[i + kAhead].pick);
+    const Record& record = records[order[i].pick];
     first[i] = static_cast<uint32_t>(n);
-    if (records[i].columns == kNoTiles) continue;
+    if (record.columns == kNoTiles) continue;
     const size_t begin = n;
-    n = note_splat(records[i], frame.grid.columns, load(tile_of_lane), n, part.where);
+    n = note_splat(record, frame.grid.columns, load(tile_of_lane), n, part.where);
     if (frame.n_slabs > 1) n = drop_finished(frame, part.where.data(), begin, n);
     // Places in a slab are 32-bit. A slab holds some hundred entries per tile, far from this limit
     // unless thousands of splats each cover a picture of hundreds of megapixels.
@@ -73,11 +72,13 @@ void count_per_tile(const TileGrid& grid, SlabPart& part) {
 
 }  // namespace
 
-void note_tiles(const Frame& frame, Slab& slab) {
+void note_tiles(const Frame& frame, const Splats& splats, Slab& slab) {
   slab.records.reserve(static_cast<size_t>(slab.count));
   parallel_for(slab.n_parts, [&](int64_t p) {
-    SlabPart& part = *slab.parts[static_cast<size_t>(p)];
-    note_part(frame, slab, part);
+    SlabPart& part = *slab.parts[p];
+    Record* records = slab.records.data() + part.begin;
+    make_records(splats, frame.grid, part, records);
+    note_part(frame, records, part);
     count_per_tile(frame.grid, part);
   });
 }
@@ -85,7 +86,7 @@ void note_tiles(const Frame& frame, Slab& slab) {
 void scatter_entries(const TileGrid& grid, Slab& slab) {
   const size_t tiles = static_cast<size_t>(grid.tiles());
   slab.n_entries = 0;
-  for (int p = 0; p < slab.n_parts; ++p) slab.n_entries += static_cast<uint64_t>(slab.parts[static_cast<size_t>(p)]->n_entries);
+  for (int p = 0; p < slab.n_parts; ++p) slab.n_entries += static_cast<uint64_t>(slab.parts[p]->n_entries);
   if (slab.n_entries > UINT32_MAX) throw std::length_error(kTooManyEntries);
   slab.entries.reserve(slab.n_entries), slab.touched.reserve(slab.n_entries), slab.visited.reserve(tiles);
   // Within a tile the parts follow each other, as they do in depth.
@@ -93,18 +94,23 @@ void scatter_entries(const TileGrid& grid, Slab& slab) {
   uint32_t total = 0;
   for (size_t tile = 0; tile < tiles; ++tile) {
     tile_begin[tile] = total;
-    for (int p = 0; p < slab.n_parts; ++p) total += std::exchange(slab.parts[static_cast<size_t>(p)]->cursor[tile], total);
+    for (int p = 0; p < slab.n_parts; ++p) {
+      const uint32_t count = std::exchange(slab.parts[p]->cursor[tile], total);
+      total += count;
+    }
   }
   tile_begin[tiles] = total;
   parallel_for(slab.n_parts, [&](int64_t p) {
-    SlabPart& part = *slab.parts[static_cast<size_t>(p)];
+    SlabPart& part = *slab.parts[p];
     uint32_t *where = part.where.data(), *cursor = part.cursor.data(), *entries = slab.entries.data();
     const uint32_t* first = part.first.data();
-    for (int64_t i = 0; i < part.count; ++i)
+    for (int64_t i = 0; i < part.count; ++i) {
+      const uint32_t record = static_cast<uint32_t>(part.begin) + part.order[i].pick;
       for (uint32_t k = first[i]; k < first[i + 1]; ++k) {
         where[k] = cursor[where[k]]++;
-        entries[where[k]] = static_cast<uint32_t>(part.rank_begin + i);
+        entries[where[k]] = record;
       }
+    }
   });
 }
 

@@ -48,11 +48,16 @@ void drop_idle_frames() {
   idle_frames().clear();
 }
 
-std::shared_ptr<Frame> py_forward(Floats means, Floats conics, Floats colours, Floats opacities, Floats depths,
-                                  const nb::tuple& background, int width, int height, MutableFloats image,
-                                  MutableFloats alpha, std::optional<MutableFloats> depth, bool counting) {
-  const Splats splats{static_cast<int64_t>(opacities.shape(0)), means.data(), conics.data(), colours.data(),
-                      opacities.data(), depths.data()};
+std::shared_ptr<Frame> py_forward(Floats means, Floats conics, Floats colours, Floats opacities,
+                                  Floats depths, const nb::tuple& background, int width, int height,
+                                  MutableFloats image, MutableFloats alpha,
+                                  std::optional<MutableFloats> depth, bool counting) {
+  const Splats splats{static_cast<int64_t>(opacities.shape(0)),
+                      means.data(),
+                      conics.data(),
+                      colours.data(),
+                      opacities.data(),
+                      depths.data()};
   const Picture out{image.data(), alpha.data(), depth ? depth->data() : nullptr};
   float back[3];
   for (size_t c = 0; c < 3; ++c) back[c] = nb::cast<float>(background[c]);
@@ -68,8 +73,12 @@ void py_backward(std::shared_ptr<Frame> frame, const nb::tuple& background, std:
                  std::optional<MutableFloats> depths, MutableFloats background_gradient) {
   const auto pointer = [](const std::optional<Floats>& a) { return a ? a->data() : nullptr; };
   const PictureGradients in{pointer(image), pointer(alpha), pointer(depth)};
-  const SplatGradients out{means.data(), conics.data(), colours.data(), opacities.data(),
-                           depths ? depths->data() : nullptr, background_gradient.data()};
+  const SplatGradients out{means.data(),
+                           conics.data(),
+                           colours.data(),
+                           opacities.data(),
+                           depths ? depths->data() : nullptr,
+                           background_gradient.data()};
   float back[3];
   for (size_t c = 0; c < 3; ++c) back[c] = nb::cast<float>(background[c]);
   const nb::gil_scoped_release released;

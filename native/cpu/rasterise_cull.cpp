@@ -35,7 +35,8 @@ VDGS_INLINE int cull_sixteen(F16 x, F16 y, F16 a, F16 b, F16 c, F16 opacity, F16
 
   const F16 one = splat(1.0f);
   tiles = tiles + zero_unless(valid, (columns.last - columns.first + one) * (rows.last - rows.first + one));
-  alignas(64) static constexpr int32_t kLaneIndex[16] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+  alignas(64) static constexpr int32_t kLaneIndex[16] = {0, 1, 2,  3,  4,  5,  6,  7,
+                                                         8, 9, 10, 11, 12, 13, 14, 15};
   compress_store(out.depth.data() + at, valid, depth);
   compress_store(out.splat.data() + at, valid, splat(static_cast<int32_t>(i)) + load(kLaneIndex));
   compress_store(out.columns.data() + at, valid, pack(columns.first, columns.last));
@@ -67,10 +68,11 @@ void cull_chunk(const Splats& s, const TileGrid& grid, int64_t chunk, Candidates
     F16 x, y, a, b, c;
     load2(means, x, y);
     load3(conics, a, b, c);
-    at += cull_sixteen(x, y, a, b, c, loadu(opacities), loadu(depths), first_lanes(n), i, grid, out, at, tiles);
+    at +=
+        cull_sixteen(x, y, a, b, c, loadu(opacities), loadu(depths), first_lanes(n), i, grid, out, at, tiles);
   }
-  out.chunk_count[static_cast<size_t>(chunk)] = at - begin;
-  out.chunk_tiles[static_cast<size_t>(chunk)] = hsum(tiles);
+  out.chunk_count[chunk] = at - begin;
+  out.chunk_tiles[chunk] = hsum(tiles);
 }
 
 }  // namespace

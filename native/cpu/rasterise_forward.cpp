@@ -5,8 +5,8 @@
 // are all finished leaves the tile.
 #include <atomic>
 
-#include "tile.h"
 #include "threads.h"
+#include "tile.h"
 
 namespace vdgs::raster {
 namespace {
@@ -23,10 +23,9 @@ struct alignas(64) Batch {
   alignas(64) uint16_t touched[kBatch];
 };
 
-void prepare_batch(const Record* records, const uint32_t* entries, int n, int ahead, const BlockOrigins& origins,
+void prepare_batch(const Record* records, const uint32_t* entries, int n, const BlockOrigins& origins,
                    Batch& batch) {
   for (int j = 0; j < n; ++j) {
-    if (j + 12 < ahead) __builtin_prefetch(records + entries[j + 12]);
     const Record& r = records[entries[j]];
     const F16 dx = origins.x - splat(r.mean_x), dy = origins.y - splat(r.mean_y);
     batch.in_reach[j] = static_cast<uint16_t>(bits(squares_in_reach(r, dx, dy, 3.0f)));
@@ -94,19 +93,29 @@ unsigned live_blocks(const TilePixels& px) {
 // Draws entries until they end or all pixels are finished. Returns how many were looked at.
 template <bool with_depth, bool counting>
 uint32_t blend_entries(const Frame& frame, Slab& slab, int tile, TilePixels& px, int64_t& pairs) {
-  const uint32_t begin = slab.tile_begin[static_cast<size_t>(tile)], end = slab.tile_begin[static_cast<size_t>(tile) + 1];
+  const uint32_t begin = slab.tile_begin[tile], end = slab.tile_begin[tile + 1];
   const BlockOrigins origins(frame.grid, tile);
+  const Record* records = slab.records.data();
+  const uint32_t* entries = slab.entries.data();
+  for (uint32_t k = begin; k < std::min(end, begin + kBatch); ++k) __builtin_prefetch(records + entries[k]);
   unsigned live = live_blocks(px);
   Batch batch;
   uint32_t i = begin;
   for (; i < end && live; i += std::min<uint32_t>(kBatch, end - i)) {
     const int n = static_cast<int>(std::min<uint32_t>(kBatch, end - i));
-    prepare_batch(slab.records.data(), slab.entries.data() + i, n, static_cast<int>(std::min<uint32_t>(2 * kBatch, end - i)), origins, batch);
+    prepare_batch(records, entries + i, n, origins, batch);
+    uint32_t prefetched = i + static_cast<uint32_t>(n);
+    const uint32_t prefetch_end = std::min(end, prefetched + kBatch);
     for (unsigned blocks = live; blocks; blocks &= blocks - 1) {
+      // The records of the next batch arrive while this one is blended, a few per block: memory
+      // cannot fetch all of them at once.
+      for (int k = 0; k < kBatch / kTileBlocks && prefetched < prefetch_end; ++k)
+        __builtin_prefetch(records + entries[prefetched++]);
       const int block = __builtin_ctz(blocks);
       const uint64_t chosen = bit_column(batch.in_reach, block);
       if (!chosen) continue;
-      const uint64_t touched = blend_block<with_depth, counting>(batch, chosen, block, px.seen + (i - begin), px, pairs);
+      const uint64_t touched =
+          blend_block<with_depth, counting>(batch, chosen, block, px.seen + (i - begin), px, pairs);
       set_bit_column(batch.touched, block, touched);
       if (!px.live[block]) live &= ~(1u << block);
     }
@@ -143,7 +152,8 @@ void clear_pixels(const TileGrid& grid, int tile, TilePixels& px) {
 }
 
 // The picture, and what the backward pass wants of the pixels.
-void finish_tile(Frame& frame, int tile, const TilePixels& px, const float background[3], const Picture& out) {
+void finish_tile(Frame& frame, int tile, const TilePixels& px, const float background[3],
+                 const Picture& out) {
   const F16 b0 = splat(background[0]), b1 = splat(background[1]), b2 = splat(background[2]);
   for_each_pixel_row(frame.grid, tile, [&](int n, int place, int64_t pixel) {
     const F16 t = load_quads(px.transmittance + place, kLanes);
@@ -155,7 +165,7 @@ void finish_tile(Frame& frame, int tile, const TilePixels& px, const float backg
   });
   const size_t first = static_cast<size_t>(tile) * kTilePixels;
   std::memcpy(frame.transmittance.data() + first, px.transmittance, sizeof px.transmittance);
-  frame.any_stop[static_cast<size_t>(tile)] = px.any_stop;
+  frame.any_stop[tile] = px.any_stop;
   if (px.any_stop) std::memcpy(frame.stop.data() + first, px.stop, sizeof px.stop);
 }
 

@@ -50,14 +50,25 @@ VDGS_INLINE void derive(Sixteen& s, const TileGrid& grid) {
 Record record_of(const Sixteen& s, int k, const float* colour, float depth) {
   const bool finite = std::fabs(colour[0]) + std::fabs(colour[1]) + std::fabs(colour[2]) < __builtin_inff();
   const uint32_t columns = finite ? static_cast<uint32_t>(s.columns[k]) : kNoTiles;
-  return {s.x[k], s.y[k], s.ux[k], s.uy[k], s.vy[k], s.log2_opacity[k], {colour[0], colour[1], colour[2]},
-          depth, s.best_y[k], s.best_x[k], s.opacity[k], columns, static_cast<uint32_t>(s.rows[k]), 0};
+  return {s.x[k],
+          s.y[k],
+          s.ux[k],
+          s.uy[k],
+          s.vy[k],
+          s.log2_opacity[k],
+          {colour[0], colour[1], colour[2]},
+          depth,
+          s.best_y[k],
+          s.best_x[k],
+          s.opacity[k],
+          columns,
+          static_cast<uint32_t>(s.rows[k]),
+          0};
 }
 
 }  // namespace
 
-void make_records(const Splats& splats, const TileGrid& grid, SlabPart& part) {
-  Record* picks = part.picks.reserve(static_cast<size_t>(part.count));
+void make_records(const Splats& splats, const TileGrid& grid, const SlabPart& part, Record* records) {
   Sixteen sixteen = {};
   for (int64_t i = 0; i < part.count; i += kLanes) {
     const int n = static_cast<int>(std::min<int64_t>(kLanes, part.count - i));
@@ -65,7 +76,8 @@ void make_records(const Splats& splats, const TileGrid& grid, SlabPart& part) {
     gather_splats(splats, splat, n, sixteen);
     derive(sixteen, grid);
     for (int k = 0; k < n; ++k)
-      picks[i + k] = record_of(sixteen, k, splats.colours + 3 * static_cast<int64_t>(splat[k]), splats.depths[splat[k]]);
+      records[i + k] =
+          record_of(sixteen, k, splats.colours + 3 * static_cast<int64_t>(splat[k]), splats.depths[splat[k]]);
   }
 }
 

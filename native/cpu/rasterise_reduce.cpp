@@ -16,73 +16,60 @@ void clear(const SplatGradients& out, int64_t begin, int64_t end) {
   if (out.depths) std::memset(out.depths + begin, 0, 4 * n);
 }
 
-// The gradients of a pick, kept where its record was.
-struct alignas(64) PickGradients {
-  float mean[2], conic[3], colour[3], opacity, depth;
-};
-static_assert(sizeof(PickGradients) == sizeof(Record));
+// Adds up the entries of every splat of a part: front to back, as they lie in the tiles.
+template <bool with_depth>
+void add_entries(Slab& slab, const SlabPart& part) {
+  constexpr size_t kStride = n_sums(with_depth);
+  constexpr uint32_t kAhead = 24;
+  alignas(64) static constexpr float kZeros[32] = {};
+  const uint32_t *first = part.first.data(), *where = part.where.data();
+  const uint32_t n_entries = static_cast<uint32_t>(part.n_entries);
+  const uint16_t* touched = slab.touched.data();
+  const float* sums = slab.sums.data();
+  // What was not touched has no sums; to look elsewhere is cheaper than to branch.
+  const auto row = [&](uint32_t k) { return touched[where[k]] ? sums + where[k] * kStride : kZeros; };
+  PickSums* out = slab.pick_sums.data() + part.begin;
+  for (int64_t i = 0; i < part.count; ++i) {
+    if (i + 8 < part.count) __builtin_prefetch(out + part.order[i + 8].pick, 1);
+    F16 total = splat(0.0f);  // its first kStride lanes; the others add up what nobody reads
+    for (uint32_t k = first[i]; k < first[i + 1]; ++k) {
+      if (k + 2 * kAhead < n_entries) {
+        __builtin_prefetch(touched + where[k + 2 * kAhead]);
+        const float* later = row(k + kAhead);
+        __builtin_prefetch(later);
+        __builtin_prefetch(later + kStride - 1);
+      }
+      total = total + loadu(row(k));
+    }
+    store(out[part.order[i].pick].sum, total);
+  }
+}
 
 // With k = log2(e)/2 the exponent is  -(u^2 + v^2) / (2k),  u = ux dx + uy dy,  v = vy dy, and the conic
 // k a = ux^2, k b = ux uy, k c = uy^2 + vy^2. So d/d(mean) = (a dx + b dy, b dx + c dy) =
 // (ux u, uy u + vy v) / k, without the cancellation that dx and dy would bring to a thin splat.
-VDGS_INLINE PickGradients gradients_of(const Record& r, const float* sum) {
+VDGS_INLINE void write_gradients(const Record& r, const float* sum, int64_t i, const SplatGradients& out) {
   constexpr float kScale = 1.0f / kHalfLog2E;
+  out.means[2 * i] = kScale * r.ux * sum[kSumU];
+  out.means[2 * i + 1] = kScale * (r.uy * sum[kSumU] + r.vy * sum[kSumV]);
   // dy = v / vy,  dx = (u - uy/vy v) / ux
   const float y_per_v = 1.0f / r.vy, x_per_u = 1.0f / r.ux, shear = r.uy * y_per_v;
   const float uu = sum[kSumUU], uv = sum[kSumUV], vv = sum[kSumVV];
-  const float xx = (uu - shear * (2.0f * uv - shear * vv)) * x_per_u * x_per_u;
-  const float xy = (uv - shear * vv) * x_per_u * y_per_v;
-  const float yy = vv * y_per_v * y_per_v;
-  return {{kScale * r.ux * sum[kSumU], kScale * (r.uy * sum[kSumU] + r.vy * sum[kSumV])},
-          {-0.5f * xx, -xy, -0.5f * yy},
-          {sum[kSumRed], sum[kSumGreen], sum[kSumBlue]},
-          sum[kSum] / r.opacity,
-          sum[kSumDepth]};
+  out.conics[3 * i] = -0.5f * (uu - shear * (2.0f * uv - shear * vv)) * x_per_u * x_per_u;
+  out.conics[3 * i + 1] = -(uv - shear * vv) * x_per_u * y_per_v;
+  out.conics[3 * i + 2] = -0.5f * vv * y_per_v * y_per_v;
+  out.opacities[i] = sum[kSum] / r.opacity;
+  out.colours[3 * i] = sum[kSumRed];
+  out.colours[3 * i + 1] = sum[kSumGreen];
+  out.colours[3 * i + 2] = sum[kSumBlue];
+  if (out.depths) out.depths[i] = sum[kSumDepth];
 }
 
-// Adds up the entries of every splat of a part, in depth order, as they lie in the tiles.
-template <bool with_depth>
-void add_entries(const Slab& slab, SlabPart& part) {
-  constexpr size_t kStride = n_sums(with_depth);
-  constexpr uint32_t kEntriesAhead = 24;
-  constexpr int64_t kPicksAhead = 8;
-  const uint32_t *first = part.first.data(), *where = part.where.data();
-  const uint32_t n_entries = static_cast<uint32_t>(part.n_entries);
-  const float* sums = slab.sums.data();
-  const DepthKey* order = part.order.data();
-  PickGradients* picks = reinterpret_cast<PickGradients*>(part.picks.data());
-  for (int64_t i = 0; i < part.count; ++i) {
-    if (i + kPicksAhead < part.count) __builtin_prefetch(picks + order[i + kPicksAhead].pick, 1);
-    if (first[i] == first[i + 1]) {
-      picks[order[i].pick] = {};
-      continue;
-    }
-    F16 total = splat(0.0f);  // its first kStride lanes; the others add up what nobody reads
-    for (uint32_t k = first[i]; k < first[i + 1]; ++k) {
-      if (k + kEntriesAhead < n_entries) {
-        const float* later = sums + where[k + kEntriesAhead] * kStride;
-        __builtin_prefetch(later);
-        __builtin_prefetch(later + kStride - 1);
-      }
-      total = total + loadu(sums + where[k] * kStride);
-    }
-    alignas(64) float sum[kLanes];
-    store(sum, total);
-    picks[order[i].pick] = gradients_of(slab.records[static_cast<size_t>(part.rank_begin + i)], sum);
-  }
-}
-
-// Puts the gradients where they belong, in the order of the input.
-void write_gradients(const SlabPart& part, const SplatGradients& out) {
-  const PickGradients* picks = reinterpret_cast<const PickGradients*>(part.picks.data());
-  for (int64_t k = 0; k < part.count; ++k) {
-    const int64_t i = part.splat[static_cast<size_t>(k)];
-    const PickGradients& g = picks[k];
-    std::memcpy(out.means + 2 * i, g.mean, sizeof g.mean);
-    std::memcpy(out.conics + 3 * i, g.conic, sizeof g.conic);
-    std::memcpy(out.colours + 3 * i, g.colour, sizeof g.colour);
-    out.opacities[i] = g.opacity;
-    if (out.depths) out.depths[i] = g.depth;
+void write_part(const Slab& slab, const SlabPart& part, const SplatGradients& out) {
+  for (size_t k = 0; k < static_cast<size_t>(part.count); ++k) {
+    const size_t pick = static_cast<size_t>(part.begin) + k;
+    const Record& record = slab.records[pick];
+    if (record.columns != kNoTiles) write_gradients(record, slab.pick_sums[pick].sum, part.splat[k], out);
   }
 }
 
@@ -93,11 +80,12 @@ void reduce_gradients(Frame& frame, const SplatGradients& out) {
                  [&](int, int64_t begin, int64_t end) { clear(out, begin, end); });
   const auto add = frame.with_depth ? add_entries<true> : add_entries<false>;
   for (int s = 0; s < frame.n_slabs; ++s) {
-    const Slab& slab = *frame.slabs[static_cast<size_t>(s)];
+    Slab& slab = *frame.slabs[s];
+    slab.pick_sums.reserve(static_cast<size_t>(slab.count));
     parallel_for(slab.n_parts, [&](int64_t p) {
-      SlabPart& part = *slab.parts[static_cast<size_t>(p)];
+      const SlabPart& part = *slab.parts[p];
       add(slab, part);
-      write_gradients(part, out);
+      write_part(slab, part, out);
     });
   }
   for (size_t c = 0; c < 3; ++c) {

@@ -87,7 +87,8 @@ constexpr float kNever = 3.402823466e+38f;
 
 // Whether all pixels of a tile are in the image.
 inline bool is_whole(const TileGrid& grid, int tile) {
-  return (tile % grid.columns + 1) * kTileSide <= grid.width && (tile / grid.columns + 1) * kTileSide <= grid.height;
+  return (tile % grid.columns + 1) * kTileSide <= grid.width &&
+         (tile / grid.columns + 1) * kTileSide <= grid.height;
 }
 
 // Where pixel (x, y) of a tile is, block by block.
@@ -99,8 +100,7 @@ template <class Row>
 VDGS_INLINE void for_each_pixel_row(const TileGrid& grid, int tile, const Row& row) {
   const int x0 = tile % grid.columns * kTileSide, y0 = tile / grid.columns * kTileSide;
   const int n = std::min(kTileSide, grid.width - x0), rows = std::min(kTileSide, grid.height - y0);
-  for (int y = 0; y < rows; ++y)
-    row(n, place_in_tile(0, y), static_cast<int64_t>(y0 + y) * grid.width + x0);
+  for (int y = 0; y < rows; ++y) row(n, place_in_tile(0, y), static_cast<int64_t>(y0 + y) * grid.width + x0);
 }
 
 // Rows of pixels, n <= 16 of them, from and to arrays of the image with 1 or 3 channels.
