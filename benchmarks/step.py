@@ -20,8 +20,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import numpy as np
 import psutil
 import torch
-from machine import describe
 
+from stopwatch import describe
 from vdgs.anchors import TRAINED, Anchors
 from vdgs.cameras import Camera
 from vdgs.config import TrainConfig

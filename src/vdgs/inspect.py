@@ -12,17 +12,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
 
 from vdgs.captures.capture import Capture, View
+from vdgs.kernels import native as kernels
 
-#: Points looked at when there are more, fewer where there are many cameras, and points per round.
+#: Points looked at when there are more, and fewer where there are many cameras.
 MOST_POINTS = 200_000
 LEAST_POINTS = 20_000
 MOST_PROJECTIONS = 2e8
-CHUNK = 50_000
 QUANTILES = (5, 25, 50, 75, 95)
 THIN = (3, 5, 10)
 
@@ -94,13 +95,9 @@ def sample_points(points: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
 
 
 def count_views(points: np.ndarray, views: tuple[View, ...]) -> np.ndarray:
-    """V: how many of the views' frusta hold each point [n, 3]; int64 [n]. O(points x views)."""
-    counts = np.zeros(len(points), np.int64)
-    for start in range(0, len(points), CHUNK):
-        chunk = points[start : start + CHUNK]
-        for view in views:
-            counts[start : start + CHUNK] += view.camera.sees(chunk)
-    return counts
+    """V: how many of the views' frusta hold each point [n, 3]; int64 [n]."""
+    counts = kernels.count_views(torch.from_numpy(np.ascontiguousarray(points)), [view.camera for view in views])
+    return counts.numpy().astype(np.int64)
 
 
 def gini(values: np.ndarray) -> float:

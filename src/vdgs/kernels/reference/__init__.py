@@ -1,1 +1,27 @@
-"""Readable torch implementations: the oracle of the tests, and the fallback."""
+"""Readable torch implementations: the oracle of the tests, and what the C++ means."""
+
+from vdgs.kernels.reference.adam import adam_rows
+from vdgs.kernels.reference.cells import cell_centres, cell_keys, contains, group_cells, group_max, morton_order
+from vdgs.kernels.reference.cull import cull
+from vdgs.kernels.reference.decode import decode
+from vdgs.kernels.reference.loss import photometric_loss
+from vdgs.kernels.reference.project import project
+from vdgs.kernels.reference.rasterise import rasterise
+from vdgs.kernels.reference.views import count_views, mark_views
+
+__all__ = [
+    "adam_rows",
+    "cell_centres",
+    "cell_keys",
+    "contains",
+    "count_views",
+    "cull",
+    "decode",
+    "group_cells",
+    "group_max",
+    "mark_views",
+    "morton_order",
+    "photometric_loss",
+    "project",
+    "rasterise",
+]
