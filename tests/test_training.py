@@ -62,7 +62,9 @@ def stage(config: TrainConfig = CONFIG) -> Stage:
 def start(config: TrainConfig = CONFIG):
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-4, 4, (300, 2)), np.zeros((300, 1))], axis=1)
-    anchors, _ = initial_anchors(points, np.full((300, 3), 128, np.uint8), replace(config.anchors, voxel=0.4))
+    anchors, _ = initial_anchors(
+        points, np.full((300, 3), 128, np.uint8), Photographs().cameras, replace(config.anchors, voxel=0.4)
+    )
     generator = torch.Generator().manual_seed(config.seed)
     return start_state(anchors, Decoder.initial(config.anchors.offsets, False, config.anchors.appearance, 8, generator))
 
@@ -185,7 +187,7 @@ def test_a_damaged_model_is_refused(unbroken, tmp_path, damage):
 def test_anchors_start_on_the_voxel_grid():
     points = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [5.0, 5.0, 5.0]])
     colours = np.array([[255, 0, 0], [0, 0, 0], [0, 255, 0]], np.uint8)
-    anchors, voxel = initial_anchors(points, colours, AnchorConfig(voxel=1.0, colour_start=True))
+    anchors, voxel = initial_anchors(points, colours, [], AnchorConfig(voxel=1.0, colour_start=True))
     assert voxel == 1.0
     assert anchors.positions.tolist() == [[0, 0, 0], [5, 5, 5]]
     torch.testing.assert_close(anchors.features[:, :3], torch.tensor([[0.0, -1, -1], [-1, 1, -1]]))
@@ -193,4 +195,4 @@ def test_anchors_start_on_the_voxel_grid():
 
 def test_one_distinct_point_is_too_few():
     with pytest.raises(VdgsError, match="distinct sparse point"):
-        initial_anchors(np.zeros((4, 3)), np.zeros((4, 3), np.uint8), AnchorConfig())
+        initial_anchors(np.zeros((4, 3)), np.zeros((4, 3), np.uint8), [], AnchorConfig())

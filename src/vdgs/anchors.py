@@ -7,7 +7,7 @@ Equations: Scaffold-GS eqs. 3-8; VDGS section III-B.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,12 @@ from safetensors.torch import save_file
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from vdgs.cameras import Camera
 from vdgs.config import AnchorConfig
 from vdgs.decoder import Decoder
 from vdgs.errors import VdgsError
 from vdgs.files import write_atomically
+from vdgs.gaps import gap_points
 from vdgs.kernels.decode_types import FEATURE_SIZE
 
 FORMAT = "vdgs-anchors-1"
@@ -143,13 +145,20 @@ def automatic_voxel(points: np.ndarray) -> float:
     return float(np.median(distances[:, 1]))
 
 
-def initial_anchors(points: np.ndarray, colours: np.ndarray, config: AnchorConfig) -> tuple[Anchors, float]:
+def initial_anchors(
+    points: np.ndarray, colours: np.ndarray, cameras: Sequence[Camera], config: AnchorConfig
+) -> tuple[Anchors, float]:
     """Anchors on the voxel grid of the sparse points [n, 3], and the voxel used.
 
-    Points are rounded to the grid and made unique (Scaffold-GS eq. 3). Log-scales start at the logarithm of
-    the mean distance to the three nearest other anchors, offsets at 0, features at 0 or at the colours.
+    Points are rounded to the grid and made unique (Scaffold-GS eq. 3); so are those that fill gaps seen by the
+    training cameras. Log-scales start at the logarithm of the mean distance to the three nearest other anchors,
+    offsets at 0, features at 0 or at the colours. Raises VdgsError with fewer than two distinct points.
     """
     voxel = config.voxel if config.voxel > 0 else automatic_voxel(points)
+    if config.fill_gaps:
+        gaps = gap_points(points, cameras, voxel)
+        nearest = cKDTree(points).query(gaps, workers=1)[1] if len(gaps) else np.zeros(0, np.int64)
+        points, colours = np.concatenate([points, gaps]), np.concatenate([colours, colours[nearest]])
     cells, owner = np.unique(np.round(points / voxel).astype(np.int64), axis=0, return_inverse=True)
     positions = cells * voxel
     n = len(positions)

@@ -160,7 +160,9 @@ def _continue_or_start(
     run: RunFolder, capture: Capture, config: TrainConfig, console: Console
 ) -> tuple[TrainingState, float]:
     """The newest whole state of the run, or a new one; and the voxel (recomputed: it follows from the capture)."""
-    anchors, voxel = initial_anchors(capture.points, capture.point_colours, config.anchors)
+    anchors, voxel = initial_anchors(
+        capture.points, capture.point_colours, [view.camera for view in capture.train_views], config.anchors
+    )
     saved, complaints = load_newest(run.coarse.checkpoints)
     for complaint in complaints:
         console.print(f"[yellow]note[/] {complaint}")

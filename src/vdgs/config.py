@@ -22,6 +22,8 @@ class AnchorConfig:
     voxel: float = 0.0
     """Edge of the initial voxel grid in units of the ground frame; 0 takes the median nearest-neighbour distance of the
     sparse points."""
+    fill_gaps: bool = True
+    """Also start anchors on ground that cameras see but that holds no sparse points: woods, water, fields (choice)."""
     distance: bool = False
     """Feed the distance between camera and anchor to the decoder too."""
     appearance: int = 0
