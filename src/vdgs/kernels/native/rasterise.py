@@ -73,7 +73,13 @@ class _Rasterise(torch.autograd.Function):
             *rows, back, width, height, image.numpy(), alpha.numpy(), None if depth is None else depth.numpy()
         )
         ctx.set_materialize_grads(False)
-        ctx.frame, ctx.background, ctx.module, ctx.n, ctx.with_depth = frame, back, module, len(depths), with_depth
+        ctx.frame, ctx.background, ctx.module, ctx.n, ctx.with_depth = (
+            frame,
+            back,
+            module,
+            len(depths),
+            with_depth,
+        )
         return image, alpha, depth
 
     @staticmethod
