@@ -105,8 +105,10 @@ class Ours:
         for tensor in self.tensors:
             tensor.grad = None
         start = time.perf_counter()
+        size = self.scene.width, self.scene.height
+        means, conics, colours, opacities, depths = self.tensors
         raster = rasterise(
-            *self.tensors, self.background, self.scene.width, self.scene.height, module=self.module
+            means, conics, colours, opacities, depths, self.background, *size, module=self.module
         )
         middle = time.perf_counter()
         torch.autograd.backward(raster.image, self.gradient)

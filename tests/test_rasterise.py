@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from vdgs.kernels import constants
 from vdgs.kernels.native.module import load, supported
 from vdgs.kernels.native.rasterise import rasterise
 from vdgs.kernels.reference.rasterise import rasterise as reference
@@ -108,6 +109,12 @@ def assert_close(actual: Tensor, exact: Tensor, tolerance: float) -> None:
     assert error <= tolerance * exact.detach().norm().clamp(min=1e-6), (
         f"relative error {error / exact.norm():.2e}"
     )
+
+
+@pytest.mark.parametrize("isa", ISAS)
+def test_constants_are_those_of_python(isa: str) -> None:
+    for name in ("ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN"):
+        assert getattr(load(isa), name) == pytest.approx(getattr(constants, name), rel=1e-6)
 
 
 @pytest.mark.parametrize("isa", ISAS)
