@@ -2,6 +2,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/shared_ptr.h>
 
+#include <cmath>
 #include <vector>
 
 #include "bindings.h"
@@ -61,8 +62,8 @@ std::shared_ptr<Frame> py_forward(Floats means, Floats conics, Floats colours, F
   const Picture out{image.data(), alpha.data(), depth ? depth->data() : nullptr};
   float back[3];
   for (size_t c = 0; c < 3; ++c) back[c] = nb::cast<float>(background[c]);
+  auto frame = take_frame();  // with the GIL held: a fork never finds idle_mutex locked
   const nb::gil_scoped_release released;
-  auto frame = take_frame();
   forward(*frame, splats, back, width, height, out, counting);
   return frame;
 }
@@ -109,6 +110,9 @@ VDGS_BIND(rasterise) {
   nb::class_<Frame>(m, "Frame", "A drawn picture, as its backward pass needs it.")
       .def_prop_ro("seconds", &seconds, "How long each phase took.")
       .def_prop_ro("statistics", &statistics, "Counts of a picture drawn with counting=True.");
+  m.attr("ALPHA_MIN") = std::exp2(kLog2AlphaMin);
+  m.attr("ALPHA_MAX") = kAlphaMax;
+  m.attr("TRANSMITTANCE_MIN") = kTransmittanceMin;
   m.def("rasterise_forward", &py_forward, nb::arg("means"), nb::arg("conics"), nb::arg("colours"),
         nb::arg("opacities"), nb::arg("depths"), nb::arg("background"), nb::arg("width"), nb::arg("height"),
         nb::arg("image"), nb::arg("alpha"), nb::arg("depth").none(), nb::arg("counting") = false);

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from vdgs.kernels.native.module import native
+from vdgs.kernels.native import module as native_module
 from vdgs.kernels.types import Raster
 
 #: The largest picture side: tiles are numbered with 16 bits.
@@ -45,7 +45,9 @@ def rasterise(
     """
     tensors = (means_px, conics, colours, opacities, depths, background)
     _check(tensors, width, height)
-    image, alpha, expected_depth = _Rasterise.apply(*tensors, width, height, depth, module or native())
+    image, alpha, expected_depth = _Rasterise.apply(
+        *tensors, width, height, depth, module or native_module.native()
+    )
     return Raster(image, alpha, expected_depth)
 
 

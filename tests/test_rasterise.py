@@ -1,0 +1,403 @@
+"""The rasteriser: what it draws and how that changes with its input."""
+
+from __future__ import annotations
+
+import gc
+import os
+import threading
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from vdgs.kernels import constants
+from vdgs.kernels.native.module import load, supported
+from vdgs.kernels.native.rasterise import rasterise
+from vdgs.kernels.reference.rasterise import rasterise as reference
+from vdgs.kernels.types import Raster
+
+ISAS = supported()
+NAMES = ("means_px", "conics", "colours", "opacities", "depths", "background")
+
+
+@dataclass(frozen=True)
+class Scene:
+    tensors: tuple[Tensor, ...]
+    width: int
+    height: int
+
+    def to(self, dtype: torch.dtype) -> Scene:
+        tensors = tuple(t.detach().to(dtype).clone().requires_grad_() for t in self.tensors)
+        return Scene(tensors, self.width, self.height)
+
+
+def make_scene(
+    n: int,
+    width: int,
+    height: int,
+    seed: int = 0,
+    size: float = 2.0,
+    spread: float = 0.75,
+    thinness: float = 0.6,
+    opacity: float = 0.0,
+    margin: float = 0.1,
+) -> Scene:
+    """Splats with log-normal sizes around `size` pixels, and opacities of logistic-normal distribution."""
+    g = np.random.default_rng(seed)
+    means = g.uniform(
+        [-margin * width, -margin * height], [(1 + margin) * width, (1 + margin) * height], (n, 2)
+    )
+    sigma = np.exp(g.normal(np.log(size), spread, n))
+    aspect = np.exp(np.abs(g.normal(0, thinness, n)))
+    long, short = sigma * np.sqrt(aspect), sigma / np.sqrt(aspect)
+    angle = g.uniform(0, np.pi, n)
+    cos, sin = np.cos(angle), np.sin(angle)
+    xx = (cos * long) ** 2 + (sin * short) ** 2 + 0.3
+    xy = cos * sin * (long**2 - short**2)
+    yy = (sin * long) ** 2 + (cos * short) ** 2 + 0.3
+    conics = np.stack([yy, -xy, xx], 1) / (xx * yy - xy**2)[:, None]
+    opacities = 1 / (1 + np.exp(-g.normal(opacity, 1.7, n)))
+    arrays = (
+        means,
+        conics,
+        g.uniform(0, 1, (n, 3)),
+        opacities,
+        g.uniform(1, 100, n),
+        np.array([0.2, 0.3, 0.4]),
+    )
+    return Scene(tuple(torch.from_numpy(a).float() for a in arrays), width, height).to(torch.float32)
+
+
+SCENES = {
+    "ordinary": make_scene(400, 61, 47),
+    "dense": make_scene(2500, 45, 39, opacity=2.0),
+    "huge": make_scene(150, 64, 64, size=200.0, opacity=-2.0),
+    "tiny": make_scene(1500, 40, 40, size=0.05),
+    "edge-on": make_scene(300, 50, 70, size=4.0, thinness=2.0),
+    "off-screen": make_scene(300, 20, 20, margin=4.0),
+    "opaque": make_scene(200, 33, 17, size=6.0, opacity=30.0),
+    "empty": make_scene(0, 20, 10),
+    "one pixel": make_scene(30, 1, 1, size=1.0),
+    "one row": make_scene(100, 70, 1),
+}
+
+
+def draw(scene: Scene, isa: str, depth: bool = True) -> Raster:
+    return rasterise(*scene.tensors, scene.width, scene.height, depth=depth, module=load(isa))
+
+
+def weights_of(raster: Raster, seed: int = 1) -> list[Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    # Depths run to 100: their weight is smaller, so that no part of the gradient drowns.
+    return [
+        torch.randn(t.shape, generator=g, dtype=torch.float64) * s
+        for t, s in zip(raster, (1, 1, 0.05), strict=True)
+    ]
+
+
+def loss_of(raster: Raster) -> Tensor:
+    return sum((t * w.to(t.dtype)).sum() for t, w in zip(raster, weights_of(raster), strict=True))
+
+
+def assert_close(actual: Tensor, exact: Tensor, tolerance: float) -> None:
+    """Close in the norm: a pixel at a threshold may go either way, and both are right."""
+    error = (actual.detach().double() - exact.detach()).norm()
+    assert error <= tolerance * exact.detach().norm().clamp(min=1e-6), (
+        f"relative error {error / exact.norm():.2e}"
+    )
+
+
+@pytest.mark.parametrize("isa", ISAS)
+def test_constants_are_those_of_python(isa: str) -> None:
+    for name in ("ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_MIN"):
+        assert getattr(load(isa), name) == pytest.approx(getattr(constants, name), rel=1e-6)
+
+
+@pytest.mark.parametrize("isa", ISAS)
+@pytest.mark.parametrize("name", SCENES)
+def test_picture_and_gradients_equal_the_reference(name: str, isa: str) -> None:
+    exact_scene, scene = SCENES[name].to(torch.float64), SCENES[name].to(torch.float32)
+    exact = reference(*exact_scene.tensors, scene.width, scene.height, depth=True)
+    actual = draw(scene, isa)
+    for a, e in zip(actual, exact, strict=True):
+        assert_close(a, e, 2e-5)
+    loss_of(exact).backward()
+    loss_of(actual).backward()
+    for a, e in zip(scene.tensors, exact_scene.tensors, strict=True):
+        # A mean or conic is known to 6e-8; a splat seen edge-on multiplies that.
+        assert_close(a.grad, e.grad, 2e-3 if name == "edge-on" else 5e-5)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    n=st.integers(0, 120),
+    width=st.integers(1, 70),
+    height=st.integers(1, 70),
+    seed=st.integers(0, 2**20),
+    size=st.sampled_from([0.1, 1.0, 5.0, 60.0]),
+    opacity=st.sampled_from([-4.0, 0.0, 5.0]),
+)
+def test_any_scene_equals_the_reference(
+    n: int, width: int, height: int, seed: int, size: float, opacity: float
+) -> None:
+    scene = make_scene(n, width, height, seed, size=size, opacity=opacity)
+    exact = reference(*scene.to(torch.float64).tensors, width, height, depth=True)
+    for a, e in zip(draw(scene, ISAS[0]), exact, strict=True):
+        assert_close(a, e, 1e-4)
+
+
+@pytest.mark.parametrize("isa", ISAS)
+def test_gradients_equal_finite_differences_in_float64(isa: str) -> None:
+    # Broad, faint splats: no threshold is crossed within a step.
+    scene = make_scene(12, 20, 18, size=30.0, thinness=0.2, opacity=-1.0)
+    loss_of(draw(scene, isa)).backward()
+    exact = scene.to(torch.float64)
+    generator = np.random.default_rng(0)
+    for t, e in zip(scene.tensors, exact.tensors, strict=True):
+        for _ in range(4):
+            direction = torch.from_numpy(generator.normal(size=tuple(t.shape)))
+            direction /= direction.norm()
+            step = 1e-6 * max(1.0, float(e.detach().abs().max())) * direction
+            losses = []
+            for sign in (1, -1):
+                moved = [x.detach() + sign * step if x is e else x.detach() for x in exact.tensors]
+                losses.append(float(loss_of(reference(*moved, scene.width, scene.height, depth=True))))
+            slope = (losses[0] - losses[1]) / (2 * float(step.norm()))
+            assert float((t.grad * direction).sum()) == pytest.approx(
+                slope, rel=2e-3, abs=2e-4 * float(t.grad.norm())
+            )
+
+
+@pytest.mark.parametrize("isa", ISAS)
+@pytest.mark.parametrize("hole", [False, True])
+def test_slabs_change_nothing(isa: str, hole: bool) -> None:
+    """So many entries per tile that the splats come in several slabs, and finished tiles are skipped."""
+    scene = make_scene(12_000, 20, 18, size=1.5, opacity=-2.5)
+    if hole:  # the right half stays open, so that no slab may be left out
+        with torch.no_grad():
+            scene.tensors[0][:, 0] *= 0.4
+    exact_scene, scene = scene.to(torch.float64), scene.to(torch.float32)
+    module, picture = load(isa), [torch.empty(18, 20, 3), torch.empty(18, 20), torch.empty(18, 20)]
+    rows = [t.detach().numpy() for t in scene.tensors[:5]]
+    counted = module.rasterise_forward(
+        *rows, (0.2, 0.3, 0.4), 20, 18, *(p.numpy() for p in picture), counting=True
+    ).statistics
+    assert counted["slabs"] > 1
+    assert counted["sorted"] < 0.9 * counted["candidates"], "what is hidden is not sorted"
+    actual = draw(scene, isa)
+    assert all(torch.equal(a, p) for a, p in zip(actual, picture, strict=True))
+    exact = reference(*exact_scene.tensors, 20, 18, depth=True)
+    loss_of(actual).backward()
+    loss_of(exact).backward()
+    for a, e in zip(actual, exact, strict=True):
+        assert_close(a, e, 5e-5)
+    for a, e in zip(scene.tensors, exact_scene.tensors, strict=True):
+        assert_close(a.grad, e.grad, 2e-4)
+
+
+def everything(scene: Scene, isa: str) -> list[np.ndarray]:
+    scene = scene.to(torch.float32)
+    raster = draw(scene, isa)
+    loss_of(raster).backward()
+    return [t.detach().numpy() for t in raster] + [t.grad.numpy() for t in scene.tensors]
+
+
+@pytest.mark.parametrize("isa", ISAS)
+def test_same_bits_for_any_number_of_threads(isa: str) -> None:
+    module = load(isa)
+    before = module.threads()
+    scene = make_scene(40_000, 90, 70, opacity=1.0)
+    try:
+        results = []
+        for count in (1, 2, 3, 5):
+            module.set_threads(count)
+            results.append(everything(scene, isa))
+    finally:
+        module.set_threads(before)
+    for other in results[1:]:
+        for a, b in zip(results[0], other, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("isa", ISAS)
+def test_several_python_threads_draw_at_once(isa: str) -> None:
+    scenes = [make_scene(3000 + 500 * i, 80 + i, 60, seed=i) for i in range(4)]
+    expected = [everything(s, isa) for s in scenes]
+    failures: list[str] = []
+
+    def work(i: int) -> None:
+        for _ in range(5):
+            for a, b in zip(everything(scenes[i], isa), expected[i], strict=True):
+                if not np.array_equal(a, b):
+                    failures.append(f"scene {i} differs")
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
+    for t in threads:
+        t.start()
+    for t in threads:
+        t.join()
+    assert not failures
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_child_draws_the_same() -> None:
+    scene = make_scene(3000, 80, 60)
+    args = [t.detach() for t in scene.tensors]
+    expected = rasterise(*args, 80, 60).image
+    child = os.fork()
+    if child == 0:
+        same = torch.equal(rasterise(*args, 80, 60).image, expected)
+        os._exit(0 if same else 1)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+@pytest.mark.parametrize("isa", ISAS)
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_rows_that_are_not_finite_are_not_drawn(isa: str, value: float) -> None:
+    scene = make_scene(60, 40, 30)
+    spoiled, kept = [], np.ones(60, bool)
+    for i, (name, t) in enumerate(zip(NAMES, scene.tensors, strict=True)):
+        t = t.detach().clone()
+        if name != "background":
+            t[7 * i].reshape(-1)[-1] = value
+            kept[7 * i] = False
+        spoiled.append(t.requires_grad_())
+    actual = draw(Scene(tuple(spoiled), 40, 30), isa)
+    without = [t.detach()[kept] if len(t) == 60 else t.detach() for t in scene.tensors]
+    expected = rasterise(*without, 40, 30, depth=True, module=load(isa))
+    for a, e in zip(actual, expected, strict=True):
+        assert torch.equal(a, e)
+    loss_of(actual).backward()
+    for t in spoiled[:5]:
+        assert t.grad.isfinite().all()
+        assert not t.grad[~kept].any()
+    twin = reference(*[t.detach().double() for t in spoiled], 40, 30)
+    assert_close(actual.image, twin.image, 1e-5)
+
+
+@pytest.mark.parametrize("isa", ISAS)
+@pytest.mark.parametrize("conic", [(1.0, 1.0, 1.0), (1.0, 2.0, 1.0), (-1.0, 0.0, 1.0), (0.0, 0.0, 0.0)])
+def test_conics_that_are_not_positive_definite_are_not_drawn(isa: str, conic: tuple[float, ...]) -> None:
+    one = [torch.tensor([[5.0, 5.0]]), torch.tensor([conic]), torch.ones(1, 3), torch.ones(1), torch.ones(1)]
+    scene = Scene((*one, torch.zeros(3)), 10, 10).to(torch.float32)
+    raster = draw(scene, isa)
+    assert not raster.image.any()
+    loss_of(raster).backward()
+    assert all(not t.grad.any() for t in scene.tensors[:5])
+
+
+@pytest.mark.parametrize("isa", ISAS)
+@pytest.mark.parametrize("opacity", [0.0, 0.5 / 255, 1.0, 7.0, 1e6])
+def test_opacity_outside_its_range(isa: str, opacity: float) -> None:
+    conic = torch.tensor([[0.02, 0.003, 0.03]])
+    one = (torch.tensor([[9.0, 6.0]]), conic, torch.ones(1, 3), torch.tensor([opacity]), torch.ones(1))
+    scene = Scene((*one, torch.zeros(3)), 30, 20)
+    exact_scene, scene = scene.to(torch.float64), scene.to(torch.float32)
+    exact, actual = reference(*exact_scene.tensors, 30, 20, depth=True), draw(scene, isa)
+    loss_of(exact).backward()
+    loss_of(actual).backward()
+    assert_close(actual.image, exact.image, 1e-5)
+    for a, e in zip(scene.tensors, exact_scene.tensors, strict=True):
+        assert_close(a.grad, e.grad, 1e-4)
+
+
+@pytest.mark.parametrize("isa", ISAS)
+def test_equal_depths_keep_the_order_of_the_rows(isa: str) -> None:
+    n = 40
+    colours = torch.eye(3).repeat(14, 1)[:n]
+    means, conics = torch.full((n, 2), 8.0), torch.tensor([[0.01, 0.0, 0.01]]).repeat(n, 1)
+    args = (means, conics, colours, torch.full((n,), 0.3), torch.full((n,), 5.0), torch.zeros(3))
+    first = draw(Scene(args, 16, 16), isa).image[8, 8]
+    assert first[0] > first[1] > first[2]
+
+
+def test_order_of_the_rows_does_not_matter() -> None:
+    scene = make_scene(500, 50, 40)
+    order = torch.randperm(500, generator=torch.Generator().manual_seed(0))
+    shuffled = [t.detach()[order] if len(t) == 500 else t.detach() for t in scene.tensors]
+    assert torch.equal(rasterise(*shuffled, 50, 40).image, draw(scene, ISAS[0]).image)
+
+
+def test_inputs_may_be_strided() -> None:
+    scene = make_scene(200, 40, 30)
+    strided = [
+        t.detach().t().contiguous().t() if t.dim() == 2 else t.detach().repeat(2)[::1][: len(t)]
+        for t in scene.tensors
+    ]
+    strided[3] = torch.stack([scene.tensors[3].detach()] * 2, dim=1)[:, 0]
+    assert not strided[0].is_contiguous()
+    assert not strided[3].is_contiguous()
+    strided = [t.requires_grad_() for t in strided]
+    raster = rasterise(*strided, 40, 30)
+    assert torch.equal(raster.image, draw(scene, ISAS[0]).image)
+    raster.image.transpose(0, 1).square().sum().backward()
+    draw(scene, ISAS[0]).image.square().sum().backward()
+    for a, b in zip(strided[:4], scene.tensors[:4], strict=True):
+        assert torch.equal(a.grad, b.grad)
+
+
+def test_only_what_is_asked_for_gets_gradients() -> None:
+    scene = make_scene(100, 30, 30)
+    tensors = [t.detach() for t in scene.tensors]
+    assert not rasterise(*tensors, 30, 30).image.requires_grad
+    tensors[2].requires_grad_()
+    raster = rasterise(*tensors, 30, 30)
+    assert raster.depth is None
+    raster.alpha.sum().backward()
+    assert not tensors[2].grad.any(), "alpha does not depend on colours"
+    assert all(t.grad is None for i, t in enumerate(tensors) if i != 2)
+
+
+def test_backward_may_be_repeated_but_not_differentiated() -> None:
+    scene = make_scene(100, 30, 30)
+    raster = draw(scene, ISAS[0])
+    first = torch.autograd.grad(raster.image.square().sum(), scene.tensors[:4], retain_graph=True)
+    again = torch.autograd.grad(raster.image.square().sum(), scene.tensors[:4], retain_graph=True)
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    slope = torch.autograd.grad(raster.image.square().sum(), scene.tensors[0], create_graph=True)[0]
+    with pytest.raises(RuntimeError, match="differentiate twice"):
+        slope.sum().backward()
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (lambda t: t.__setitem__(0, t[0].double()), TypeError, "means_px must be float32"),
+        (
+            lambda t: t.__setitem__(1, t[1][:, :2]),
+            ValueError,
+            r"conics must have shape \[9, 3\], not \[9, 2\]",
+        ),
+        (lambda t: t.__setitem__(3, t[3][:5]), ValueError, r"opacities must have shape \[9\], not \[5\]"),
+        (lambda t: t.__setitem__(5, torch.zeros(4)), ValueError, "background must have shape"),
+    ],
+)
+def test_wrong_tensors_are_named(change, error: type[Exception], message: str) -> None:
+    tensors = [t.detach() for t in make_scene(9, 10, 10).tensors]
+    change(tensors)
+    with pytest.raises(error, match=message):
+        rasterise(*tensors, 10, 10)
+
+
+@pytest.mark.parametrize(("width", "height"), [(0, 5), (5, -1), (2**20, 1)])
+def test_impossible_pictures_are_refused(width: int, height: int) -> None:
+    tensors = [t.detach() for t in make_scene(3, 10, 10).tensors]
+    with pytest.raises(ValueError, match="must be from 1 to"):
+        rasterise(*tensors, width, height)
+
+
+def test_frames_are_reused_across_sizes() -> None:
+    """Memory kept from one picture must not leak into the next."""
+    sizes = [(3000, 90, 60), (50, 10, 10), (3000, 90, 60), (0, 33, 9), (200, 200, 5)]
+    for seed, (n, width, height) in enumerate(sizes):
+        scene = make_scene(n, width, height, seed=seed)
+        fresh = everything(scene, ISAS[0])
+        gc.collect()
+        load(ISAS[0]).drop_idle_frames()
+        for a, b in zip(fresh, everything(scene, ISAS[0]), strict=True):
+            np.testing.assert_array_equal(a, b)
