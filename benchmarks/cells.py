@@ -11,7 +11,8 @@ from types import ModuleType
 
 import torch
 
-from stopwatch import describe, medians_ms
+from machine import describe
+from stopwatch import medians_ms
 from vdgs.kernels.native import cells as native
 from vdgs.kernels.native import module
 from vdgs.kernels.reference import cells as reference

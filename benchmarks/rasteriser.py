@@ -107,9 +107,7 @@ class Ours:
         start = time.perf_counter()
         size = self.scene.width, self.scene.height
         means, conics, colours, opacities, depths = self.tensors
-        raster = rasterise(
-            means, conics, colours, opacities, depths, self.background, *size, module=self.module
-        )
+        raster = rasterise(means, conics, colours, opacities, depths, self.background, *size, module=self.module)
         middle = time.perf_counter()
         torch.autograd.backward(raster.image, self.gradient)
         return middle - start, time.perf_counter() - middle
@@ -148,9 +146,7 @@ class Prototype:
 def build_prototype(source: Path, folder: Path) -> dict[str, Any]:
     """Build the study with its own flags; its modules by instruction set."""
     configure = ["cmake", "-S", str(source), "-B", str(folder), "-DCMAKE_BUILD_TYPE=Release"]
-    subprocess.run(
-        [*configure, f"-DPython_EXECUTABLE={sys.executable}"], check=True, stdout=subprocess.DEVNULL
-    )
+    subprocess.run([*configure, f"-DPython_EXECUTABLE={sys.executable}"], check=True, stdout=subprocess.DEVNULL)
     targets = list(PROTOTYPE_BUILDS.values())
     subprocess.run(
         ["cmake", "--build", str(folder), "-j2", "--target", *targets], check=True, stdout=subprocess.DEVNULL
@@ -178,9 +174,7 @@ class Report:
     ratios: dict[tuple[str, int], list[tuple[float, float]]] = field(default_factory=dict)
     speedups: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
 
-    def measure(
-        self, scene: Scene, name: str, isas: list[str], prototypes: dict[str, Any], repeats: int
-    ) -> None:
+    def measure(self, scene: Scene, name: str, isas: list[str], prototypes: dict[str, Any], repeats: int) -> None:
         for isa in isas:
             one_thread: tuple[float, float] | None = None
             for threads in (1, 2):
@@ -212,9 +206,7 @@ class Report:
         for isa, speedups in self.speedups.items():
             print(f"two threads against one   {isa:<9} {_means(speedups)}")
         for (isa, threads), ratios in self.ratios.items():
-            print(
-                f"prototype / ours          {isa:<9} {threads} thread{'s' * (threads > 1)}  {_means(ratios)}"
-            )
+            print(f"prototype / ours          {isa:<9} {threads} thread{'s' * (threads > 1)}  {_means(ratios)}")
         every = [r for ratios in self.ratios.values() for r in ratios]
         if every:
             print(f"prototype / ours          all       {_means(every)}")
@@ -226,14 +218,10 @@ def _means(pairs: list[tuple[float, float]]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--prototype", type=Path, help="source folder of the study to compare with")
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument(
-        "--isa", nargs="*", default=[i for i in supported() if i != "portable"] or ["portable"]
-    )
+    parser.add_argument("--isa", nargs="*", default=[i for i in supported() if i != "portable"] or ["portable"])
     parser.add_argument("--counts", nargs="*", type=int, default=list(COUNTS), help="numbers of splats")
     arguments = parser.parse_args()
     print(describe())
@@ -246,15 +234,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         prototypes = build_prototype(arguments.prototype, Path(folder)) if arguments.prototype else {}
         beside = "   prototype ms        ratio    " if prototypes else ""
-        print(
-            f"\n{'splats, picture':<20} {'isa':<9} threads  fwd    f+b ms{beside}   pairs, share / speed-up"
-        )
+        print(f"\n{'splats, picture':<20} {'isa':<9} threads  fwd    f+b ms{beside}   pairs, share / speed-up")
         for n in arguments.counts:
             for width, height in SIZES:
                 name = f"{n // 1000}k {width}x{height}"
-                report.measure(
-                    make_scene(n, width, height), name, arguments.isa, prototypes, arguments.repeats
-                )
+                report.measure(make_scene(n, width, height), name, arguments.isa, prototypes, arguments.repeats)
     report.summary()
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import psutil
 import torch
 
-from stopwatch import describe
+from machine import describe
 from vdgs.anchors import TRAINED, Anchors
 from vdgs.cameras import Camera
 from vdgs.config import TrainConfig

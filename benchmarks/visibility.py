@@ -14,7 +14,7 @@ import time
 import numpy as np
 import torch
 
-from stopwatch import describe
+from machine import describe
 from vdgs.cameras import Camera
 from vdgs.kernels.native import module
 from vdgs.kernels.native import views as native

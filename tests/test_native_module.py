@@ -132,9 +132,7 @@ def test_shuffles(isa: str) -> None:
 
     masks = generator.integers(0, 2**16, 64).astype(np.uint16)
     for bit in range(16):
-        assert check.column_of_bits(masks, bit) == sum(
-            ((int(m) >> bit) & 1) << i for i, m in enumerate(masks)
-        )
+        assert check.column_of_bits(masks, bit) == sum(((int(m) >> bit) & 1) << i for i, m in enumerate(masks))
 
     total = elementwise(isa, "hsum", x)
     np.testing.assert_allclose(total, x.sum(), rtol=1e-5, atol=1e-5)

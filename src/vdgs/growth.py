@@ -58,20 +58,8 @@ class Statistics:
         width: int,
         height: int,
     ) -> None:
-        """Count one view.
-
-        `source` [m] is index_in_visible * k + offset; `gradient_px` is the loss by the splats' means in pixels.
-        NDC runs over [-1, 1] across the image, hence the factors width/2 and height/2.
-        """
-        k = self.gradient.shape[1]
-        row = source.long()
-        slot = visible[row // k] * k + row % k  # unique: each offset is drawn once per view
-        norm = torch.hypot(gradient_px[:, 0] * (width / 2), gradient_px[:, 1] * (height / 2))
-        self.gradient.view(-1)[slot] += norm
-        self.drawn.view(-1)[slot] += 1
-        per_visible = torch.zeros(len(visible)).index_add_(0, row // k, opacities)
-        self.opacity[visible] += per_visible
-        self.seen[visible] += 1
+        """Count one view; see `kernels.add_view_statistics`."""
+        kernels.add_view_statistics(visible, source, opacities, gradient_px, width, height, *self.tensors().values())
 
 
 @dataclass(frozen=True)

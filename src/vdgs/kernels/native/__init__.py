@@ -7,10 +7,12 @@ from vdgs.kernels.native.decode import decode
 from vdgs.kernels.native.loss import photometric_loss
 from vdgs.kernels.native.project import project
 from vdgs.kernels.native.rasterise import rasterise
+from vdgs.kernels.native.statistics import add_view_statistics
 from vdgs.kernels.native.views import count_views, mark_views
 
 __all__ = [
     "adam_rows",
+    "add_view_statistics",
     "cell_centres",
     "cell_keys",
     "contains",

@@ -45,9 +45,7 @@ def rasterise(
     """
     tensors = (means_px, conics, colours, opacities, depths, background)
     _check(tensors, width, height)
-    image, alpha, expected_depth = _Rasterise.apply(
-        *tensors, width, height, depth, module or native_module.native()
-    )
+    image, alpha, expected_depth = _Rasterise.apply(*tensors, width, height, depth, module or native_module.native())
     return Raster(image, alpha, expected_depth)
 
 

@@ -7,10 +7,12 @@ from vdgs.kernels.reference.decode import decode
 from vdgs.kernels.reference.loss import photometric_loss
 from vdgs.kernels.reference.project import project
 from vdgs.kernels.reference.rasterise import rasterise
+from vdgs.kernels.reference.statistics import add_view_statistics
 from vdgs.kernels.reference.views import count_views, mark_views
 
 __all__ = [
     "adam_rows",
+    "add_view_statistics",
     "cell_centres",
     "cell_keys",
     "contains",

@@ -1,0 +1,52 @@
+"""Growth's statistics: the native sums equal the twin's, for any number of threads."""
+
+import pytest
+import torch
+
+import vdgs.kernels.native.statistics as native
+import vdgs.kernels.reference.statistics as reference
+from native_choice import every_instruction_set, on_threads, using
+
+
+def view(seed: int, n: int = 3000, k: int = 7):
+    g = torch.Generator().manual_seed(seed)
+    visible = torch.nonzero(torch.rand(n, generator=g) < 0.6)[:, 0]
+    source = torch.nonzero(torch.rand(len(visible) * k, generator=g) < 0.4)[:, 0].int()
+    m = len(source)
+    sums = [torch.rand(n, k, generator=g), torch.rand(n, k, generator=g), torch.rand(n, generator=g), torch.rand(n)]
+    return (visible, source, torch.rand(m, generator=g), torch.randn(m, 2, generator=g), 400, 300), sums
+
+
+@every_instruction_set
+@pytest.mark.parametrize("seed", [0, 1])
+def test_native_equals_twin(instructions, seed):
+    inputs, sums = view(seed)
+    expected = [s.clone() for s in sums]
+    reference.add_view_statistics(*inputs, *expected)
+    results = []
+    for threads in (1, 2, 3):
+        ours = [s.clone() for s in sums]
+        with using(instructions), on_threads(threads):
+            native.add_view_statistics(*inputs, *ours)
+        results.append(ours)
+    for ours in results:
+        for mine, twin, first in zip(ours, expected, results[0], strict=True):
+            torch.testing.assert_close(mine, twin)
+            assert torch.equal(mine, first)
+
+
+@pytest.mark.parametrize("room", [native, reference])
+def test_nothing_drawn_counts_only_the_visible(room):
+    sums = [torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4), torch.zeros(4)]
+    nothing = torch.zeros(0, dtype=torch.int32)
+    room.add_view_statistics(torch.tensor([1, 3]), nothing, torch.zeros(0), torch.zeros(0, 2), 8, 8, *sums)
+    assert [float(s.sum()) for s in sums] == [0, 0, 0, 2]
+
+
+@pytest.mark.parametrize("room", [native, reference])
+def test_a_source_beyond_the_visible_is_refused(room):
+    sums = [torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4), torch.zeros(4)]
+    source = torch.tensor([0, 6], dtype=torch.int32)
+    with pytest.raises(IndexError):
+        room.add_view_statistics(torch.tensor([1, 3]), source, torch.zeros(2), torch.zeros(2, 2), 8, 8, *sums)
+    assert float(sums[3].sum()) == 0
