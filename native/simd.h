@@ -1,7 +1,7 @@
 // Sixteen float lanes, whatever the processor offers: one 512-bit register (AVX-512), two 256-bit
 // ones (AVX2) or four 128-bit ones (any other processor, through the compiler's vector extension).
 //
-// This file and the two that it includes are the only ones that know an instruction set. Everything
+// This file and those that it includes are the only ones that know an instruction set. Everything
 // is a free function on three value types:
 //
 //     F16   sixteen floats           M16   sixteen yes/no           I16   sixteen int32

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import os
 import threading
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from rasterise_scenes import Scene, make_scene
 from vdgs.kernels import constants
 from vdgs.kernels.native.module import load, supported
 from vdgs.kernels.native.rasterise import rasterise
@@ -22,52 +22,6 @@ from vdgs.kernels.types import Raster
 
 ISAS = supported()
 NAMES = ("means_px", "conics", "colours", "opacities", "depths", "background")
-
-
-@dataclass(frozen=True)
-class Scene:
-    tensors: tuple[Tensor, ...]
-    width: int
-    height: int
-
-    def to(self, dtype: torch.dtype) -> Scene:
-        tensors = tuple(t.detach().to(dtype).clone().requires_grad_() for t in self.tensors)
-        return Scene(tensors, self.width, self.height)
-
-
-def make_scene(
-    n: int,
-    width: int,
-    height: int,
-    seed: int = 0,
-    size: float = 2.0,
-    spread: float = 0.75,
-    thinness: float = 0.6,
-    opacity: float = 0.0,
-    margin: float = 0.1,
-) -> Scene:
-    """Splats with log-normal sizes around `size` pixels, and opacities of logistic-normal distribution."""
-    g = np.random.default_rng(seed)
-    means = g.uniform([-margin * width, -margin * height], [(1 + margin) * width, (1 + margin) * height], (n, 2))
-    sigma = np.exp(g.normal(np.log(size), spread, n))
-    aspect = np.exp(np.abs(g.normal(0, thinness, n)))
-    long, short = sigma * np.sqrt(aspect), sigma / np.sqrt(aspect)
-    angle = g.uniform(0, np.pi, n)
-    cos, sin = np.cos(angle), np.sin(angle)
-    xx = (cos * long) ** 2 + (sin * short) ** 2 + 0.3
-    xy = cos * sin * (long**2 - short**2)
-    yy = (sin * long) ** 2 + (cos * short) ** 2 + 0.3
-    conics = np.stack([yy, -xy, xx], 1) / (xx * yy - xy**2)[:, None]
-    opacities = 1 / (1 + np.exp(-g.normal(opacity, 1.7, n)))
-    arrays = (
-        means,
-        conics,
-        g.uniform(0, 1, (n, 3)),
-        opacities,
-        g.uniform(1, 100, n),
-        np.array([0.2, 0.3, 0.4]),
-    )
-    return Scene(tuple(torch.from_numpy(a).float() for a in arrays), width, height).to(torch.float32)
 
 
 SCENES = {
@@ -92,7 +46,8 @@ def weights_of(raster: Raster, seed: int = 1) -> list[Tensor]:
     g = torch.Generator().manual_seed(seed)
     # Depths run to 100: their weight is smaller, so that no part of the gradient drowns.
     return [
-        torch.randn(t.shape, generator=g, dtype=torch.float64) * s for t, s in zip(raster, (1, 1, 0.05), strict=True)
+        torch.randn(t.shape, generator=g, dtype=torch.float64) * s
+        for t, s in zip(raster, (1, 1, 0.05), strict=True)
     ]
 
 
@@ -103,7 +58,9 @@ def loss_of(raster: Raster) -> Tensor:
 def assert_close(actual: Tensor, exact: Tensor, tolerance: float) -> None:
     """Close in the norm: a pixel at a threshold may go either way, and both are right."""
     error = (actual.detach().double() - exact.detach()).norm()
-    assert error <= tolerance * exact.detach().norm().clamp(min=1e-6), f"relative error {error / exact.norm():.2e}"
+    assert error <= tolerance * exact.detach().norm().clamp(min=1e-6), (
+        f"relative error {error / exact.norm():.2e}"
+    )
 
 
 @pytest.mark.parametrize("isa", ISAS)
@@ -162,7 +119,9 @@ def test_gradients_equal_finite_differences_in_float64(isa: str) -> None:
                 moved = [x.detach() + sign * step if x is e else x.detach() for x in exact.tensors]
                 losses.append(float(loss_of(reference(*moved, scene.width, scene.height, depth=True))))
             slope = (losses[0] - losses[1]) / (2 * float(step.norm()))
-            assert float((t.grad * direction).sum()) == pytest.approx(slope, rel=2e-3, abs=2e-4 * float(t.grad.norm()))
+            assert float((t.grad * direction).sum()) == pytest.approx(
+                slope, rel=2e-3, abs=2e-4 * float(t.grad.norm())
+            )
 
 
 @pytest.mark.parametrize("isa", ISAS)
@@ -319,7 +278,8 @@ def test_order_of_the_rows_does_not_matter() -> None:
 def test_inputs_may_be_strided() -> None:
     scene = make_scene(200, 40, 30)
     strided = [
-        t.detach().t().contiguous().t() if t.dim() == 2 else t.detach().repeat(2)[::1][: len(t)] for t in scene.tensors
+        t.detach().t().contiguous().t() if t.dim() == 2 else t.detach().repeat(2)[::1][: len(t)]
+        for t in scene.tensors
     ]
     strided[3] = torch.stack([scene.tensors[3].detach()] * 2, dim=1)[:, 0]
     assert not strided[0].is_contiguous()

@@ -1,0 +1,57 @@
+"""Random splats for the tests of the rasteriser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Scene:
+    tensors: tuple[Tensor, ...]
+    width: int
+    height: int
+
+    def to(self, dtype: torch.dtype) -> Scene:
+        tensors = tuple(t.detach().to(dtype).clone().requires_grad_() for t in self.tensors)
+        return Scene(tensors, self.width, self.height)
+
+
+def make_scene(
+    n: int,
+    width: int,
+    height: int,
+    seed: int = 0,
+    size: float = 2.0,
+    spread: float = 0.75,
+    thinness: float = 0.6,
+    opacity: float = 0.0,
+    margin: float = 0.1,
+) -> Scene:
+    """Splats with log-normal sizes around `size` pixels, and opacities of logistic-normal distribution."""
+    g = np.random.default_rng(seed)
+    means = g.uniform(
+        [-margin * width, -margin * height], [(1 + margin) * width, (1 + margin) * height], (n, 2)
+    )
+    sigma = np.exp(g.normal(np.log(size), spread, n))
+    aspect = np.exp(np.abs(g.normal(0, thinness, n)))
+    long, short = sigma * np.sqrt(aspect), sigma / np.sqrt(aspect)
+    angle = g.uniform(0, np.pi, n)
+    cos, sin = np.cos(angle), np.sin(angle)
+    xx = (cos * long) ** 2 + (sin * short) ** 2 + 0.3
+    xy = cos * sin * (long**2 - short**2)
+    yy = (sin * long) ** 2 + (cos * short) ** 2 + 0.3
+    conics = np.stack([yy, -xy, xx], 1) / (xx * yy - xy**2)[:, None]
+    opacities = 1 / (1 + np.exp(-g.normal(opacity, 1.7, n)))
+    arrays = (
+        means,
+        conics,
+        g.uniform(0, 1, (n, 3)),
+        opacities,
+        g.uniform(1, 100, n),
+        np.array([0.2, 0.3, 0.4]),
+    )
+    return Scene(tuple(torch.from_numpy(a).float() for a in arrays), width, height).to(torch.float32)
