@@ -13,14 +13,9 @@
 #include "simd_math.h"
 #endif
 
-namespace vdgs {
+#include "image_formation.h"
 
-// Repeated in src/vdgs/kernels/constants.py, where they are explained; a test compares the two.
-constexpr float kAlphaMin = 1.0f / 255.0f;
-constexpr float kAlphaMax = 0.999f;
-constexpr float kTransmittanceMin = 1e-4f;
-constexpr float kDilationPx2 = 0.3f;
-constexpr float kFrustumMargin = 1.3f;
+namespace vdgs {
 
 // The operations of simd.h for a plain float.
 VDGS_FN float fma(float a, float b, float c) { return a * b + c; }

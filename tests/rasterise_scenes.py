@@ -33,9 +33,7 @@ def make_scene(
 ) -> Scene:
     """Splats with log-normal sizes around `size` pixels, and opacities of logistic-normal distribution."""
     g = np.random.default_rng(seed)
-    means = g.uniform(
-        [-margin * width, -margin * height], [(1 + margin) * width, (1 + margin) * height], (n, 2)
-    )
+    means = g.uniform([-margin * width, -margin * height], [(1 + margin) * width, (1 + margin) * height], (n, 2))
     sigma = np.exp(g.normal(np.log(size), spread, n))
     aspect = np.exp(np.abs(g.normal(0, thinness, n)))
     long, short = sigma * np.sqrt(aspect), sigma / np.sqrt(aspect)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import inspect
 import os
 import threading
 
@@ -46,8 +47,7 @@ def weights_of(raster: Raster, seed: int = 1) -> list[Tensor]:
     g = torch.Generator().manual_seed(seed)
     # Depths run to 100: their weight is smaller, so that no part of the gradient drowns.
     return [
-        torch.randn(t.shape, generator=g, dtype=torch.float64) * s
-        for t, s in zip(raster, (1, 1, 0.05), strict=True)
+        torch.randn(t.shape, generator=g, dtype=torch.float64) * s for t, s in zip(raster, (1, 1, 0.05), strict=True)
     ]
 
 
@@ -58,9 +58,7 @@ def loss_of(raster: Raster) -> Tensor:
 def assert_close(actual: Tensor, exact: Tensor, tolerance: float) -> None:
     """Close in the norm: a pixel at a threshold may go either way, and both are right."""
     error = (actual.detach().double() - exact.detach()).norm()
-    assert error <= tolerance * exact.detach().norm().clamp(min=1e-6), (
-        f"relative error {error / exact.norm():.2e}"
-    )
+    assert error <= tolerance * exact.detach().norm().clamp(min=1e-6), f"relative error {error / exact.norm():.2e}"
 
 
 @pytest.mark.parametrize("isa", ISAS)
@@ -119,9 +117,7 @@ def test_gradients_equal_finite_differences_in_float64(isa: str) -> None:
                 moved = [x.detach() + sign * step if x is e else x.detach() for x in exact.tensors]
                 losses.append(float(loss_of(reference(*moved, scene.width, scene.height, depth=True))))
             slope = (losses[0] - losses[1]) / (2 * float(step.norm()))
-            assert float((t.grad * direction).sum()) == pytest.approx(
-                slope, rel=2e-3, abs=2e-4 * float(t.grad.norm())
-            )
+            assert float((t.grad * direction).sum()) == pytest.approx(slope, rel=2e-3, abs=2e-4 * float(t.grad.norm()))
 
 
 @pytest.mark.parametrize("isa", ISAS)
@@ -278,8 +274,7 @@ def test_order_of_the_rows_does_not_matter() -> None:
 def test_inputs_may_be_strided() -> None:
     scene = make_scene(200, 40, 30)
     strided = [
-        t.detach().t().contiguous().t() if t.dim() == 2 else t.detach().repeat(2)[::1][: len(t)]
-        for t in scene.tensors
+        t.detach().t().contiguous().t() if t.dim() == 2 else t.detach().repeat(2)[::1][: len(t)] for t in scene.tensors
     ]
     strided[3] = torch.stack([scene.tensors[3].detach()] * 2, dim=1)[:, 0]
     assert not strided[0].is_contiguous()
@@ -333,7 +328,7 @@ def test_wrong_tensors_are_named(change, error: type[Exception], message: str) -
     tensors = [t.detach() for t in make_scene(9, 10, 10).tensors]
     change(tensors)
     with pytest.raises(error, match=message):
-        rasterise(*tensors, 10, 10)
+        inspect.unwrap(rasterise)(*tensors, 10, 10)  # without the run-time types of the tests
 
 
 @pytest.mark.parametrize(("width", "height"), [(0, 5), (5, -1), (2**20, 1)])

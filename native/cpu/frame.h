@@ -7,14 +7,11 @@
 #include <vector>
 
 #include "buffer.h"
+#include "image_formation.h"
 #include "rasterise.h"
 
 namespace vdgs::raster {
 
-// Constants of the image formation model; src/vdgs/kernels/constants.py states them for Python.
-constexpr float kAlphaMax = 0.999f;
-constexpr float kTransmittanceMin = 1e-4f;
-constexpr float kLog2AlphaMin = -7.994353436858858f;  // log2(1/255)
 // exp(-q/2) = 2^(-kHalfLog2E q)
 constexpr float kHalfLog2E = 0.72134752044448170f;
 

@@ -110,9 +110,9 @@ VDGS_BIND(rasterise) {
   nb::class_<Frame>(m, "Frame", "A drawn picture, as its backward pass needs it.")
       .def_prop_ro("seconds", &seconds, "How long each phase took.")
       .def_prop_ro("statistics", &statistics, "Counts of a picture drawn with counting=True.");
-  m.attr("ALPHA_MIN") = std::exp2(kLog2AlphaMin);
-  m.attr("ALPHA_MAX") = kAlphaMax;
-  m.attr("TRANSMITTANCE_MIN") = kTransmittanceMin;
+  m.attr("ALPHA_MIN") = std::exp2(vdgs::kLog2AlphaMin);
+  m.attr("ALPHA_MAX") = vdgs::kAlphaMax;
+  m.attr("TRANSMITTANCE_MIN") = vdgs::kTransmittanceMin;
   m.def("rasterise_forward", &py_forward, nb::arg("means"), nb::arg("conics"), nb::arg("colours"),
         nb::arg("opacities"), nb::arg("depths"), nb::arg("background"), nb::arg("width"), nb::arg("height"),
         nb::arg("image"), nb::arg("alpha"), nb::arg("depth").none(), nb::arg("counting") = false);

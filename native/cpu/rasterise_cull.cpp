@@ -20,7 +20,7 @@ VDGS_INLINE int cull_sixteen(F16 x, F16 y, F16 a, F16 b, F16 c, F16 opacity, F16
   const M16 finite = lt(abs(x) + abs(y), infinity) & lt(abs(depth), infinity) & lt(opacity, infinity) &
                      lt(ac + b * b, infinity);
   valid = valid & finite & gt(a, splat(0.0f)) & gt(c, splat(0.0f)) & gt(det + rounding, splat(0.0f)) &
-          ge(opacity, splat(1.0f / 255.0f));
+          ge(opacity, splat(kAlphaMin));
   if (none(valid)) return 0;
 
   const F16 certain = det - rounding;
