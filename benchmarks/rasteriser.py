@@ -2,6 +2,7 @@
 
     python benchmarks/rasteriser.py
     python benchmarks/rasteriser.py --prototype DIR     beside the feasibility study in DIR, interleaved
+    python benchmarks/rasteriser.py --run RUN           test views of a trained run instead of the nine scenes
 
 Times are medians in milliseconds of the public function, autograd included, from tensors to gradients;
 the study is timed from arrays to arrays. Repetitions alternate, so that a busy machine slows both alike:
@@ -21,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ from vdgs.kernels.native.rasterise import rasterise
 
 COUNTS = (20_000, 200_000, 1_000_000)
 SIZES = ((400, 300), (800, 600), (1600, 1200))
+THREADS = (1, 2)
 PROTOTYPE_BUILDS = {"avx512": "splat_native", "avx2": "splat_v3"}
 
 
@@ -74,9 +76,6 @@ def make_scene(n: int, width: int, height: int) -> Scene:
     gradient = np.random.default_rng(1).normal(size=(height, width, 3))
     arrays = (means, conics, colours, opacities, depths, np.array([0.2, 0.3, 0.4]), gradient)
     return Scene(width, height, *(a.astype(np.float32) for a in arrays))
-
-
-Draw = Callable[[Scene], Any]
 
 
 @dataclass
@@ -143,6 +142,27 @@ class Prototype:
         return middle - start, time.perf_counter() - middle
 
 
+def scenes_of_run(run: Path, views: int) -> list[tuple[str, Scene]]:
+    """What the first test views of a trained run draw."""
+    from vdgs.evaluation.of_run import open_run
+    from vdgs.render import decode_visible, gather_visible
+
+    opened, scenes = open_run(run), []
+    for view in opened.capture.test_views[:views]:
+        camera = view.camera
+        visible = gather_visible(opened.model.anchors, camera)
+        with torch.no_grad():
+            splats = decode_visible(visible.anchors, opened.model.decoder.for_image(None), camera)
+        rows = (splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths)
+        gradient = np.random.default_rng(1).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
+        background = np.array(opened.model.background, np.float32)
+        means, conics, colours, opacities, depths = (row.numpy() for row in rows)
+        size = camera.width, camera.height
+        scene = Scene(*size, means, conics, colours, opacities, depths, background, gradient)
+        scenes.append((f"{len(rows[0]) // 1000}k {camera.width}x{camera.height}", scene))
+    return scenes
+
+
 def build_prototype(source: Path, folder: Path) -> dict[str, Any]:
     """Build the study with its own flags; its modules by instruction set."""
     configure = ["cmake", "-S", str(source), "-B", str(folder), "-DCMAKE_BUILD_TYPE=Release"]
@@ -176,27 +196,28 @@ class Report:
 
     def measure(self, scene: Scene, name: str, isas: list[str], prototypes: dict[str, Any], repeats: int) -> None:
         for isa in isas:
-            one_thread: tuple[float, float] | None = None
-            for threads in (1, 2):
-                ours, mine = Ours(isa, scene, threads), Timing()
-                other = Prototype(prototypes[isa], scene, threads) if isa in prototypes else None
-                theirs = Timing()
-                for _ in range(repeats + 1):
-                    mine.add(*ours.run())
-                    if other:
-                        theirs.add(*other.run())
-                forward, both = mine.median()
+            ours = {threads: Ours(isa, scene, threads) for threads in THREADS}
+            others = {t: Prototype(prototypes[isa], scene, t) for t in THREADS} if isa in prototypes else {}
+            mine, theirs = ({threads: Timing() for threads in THREADS} for _ in range(2))
+            for _ in range(repeats + 1):
+                for threads in THREADS:
+                    mine[threads].add(*ours[threads].run())
+                    if others:
+                        theirs[threads].add(*others[threads].run())
+            pairs = ours[1].pairs()
+            for threads in THREADS:
+                forward, both = mine[threads].median()
                 line = f"{name:<20} {isa:<9} {threads}   {forward:7.1f} {both:7.1f}"
-                if other:
-                    f, b = theirs.median()
+                if others:
+                    f, b = theirs[threads].median()
                     self.ratios.setdefault((isa, threads), []).append((f / forward, b / both))
                     line += f"   {f:7.1f} {b:7.1f}   {f / forward:5.2f} {b / both:5.2f}"
-                if one_thread is None:
-                    one_thread = (forward, both)
-                    pairs = ours.pairs() / (1e-3 * forward)
-                    line += f"   {pairs / 1e9:5.2f} G/s  {pairs / self.limits[isa]:4.0%}"
+                if threads == 1:
+                    rate = pairs / (1e-3 * forward)
+                    line += f"   {rate / 1e9:5.2f} G/s  {rate / self.limits[isa]:4.0%}"
                 else:
-                    speedup = (one_thread[0] / forward, one_thread[1] / both)
+                    alone = mine[1].median()
+                    speedup = (alone[0] / forward, alone[1] / both)
                     self.speedups.setdefault(isa, []).append(speedup)
                     line += f"   x {speedup[0]:.2f} {speedup[1]:.2f}"
                 print(line, flush=True)
@@ -217,9 +238,19 @@ def _means(pairs: list[tuple[float, float]]) -> str:
     return "  ".join(f"{geometric_mean(c):.2f} ({min(c):.2f})" for c in columns)
 
 
+def _scenes(arguments: argparse.Namespace) -> Iterator[tuple[str, Scene]]:
+    if arguments.run:
+        yield from scenes_of_run(arguments.run, views=3)
+        return
+    for n in arguments.counts:
+        for width, height in SIZES:
+            yield f"{n // 1000}k {width}x{height}", make_scene(n, width, height)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--prototype", type=Path, help="source folder of the study to compare with")
+    parser.add_argument("--run", type=Path, help="a trained run whose first test views are drawn")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--isa", nargs="*", default=[i for i in supported() if i != "portable"] or ["portable"])
     parser.add_argument("--counts", nargs="*", type=int, default=list(COUNTS), help="numbers of splats")
@@ -235,10 +266,8 @@ def main() -> None:
         prototypes = build_prototype(arguments.prototype, Path(folder)) if arguments.prototype else {}
         beside = "   prototype ms        ratio    " if prototypes else ""
         print(f"\n{'splats, picture':<20} {'isa':<9} threads  fwd    f+b ms{beside}   pairs, share / speed-up")
-        for n in arguments.counts:
-            for width, height in SIZES:
-                name = f"{n // 1000}k {width}x{height}"
-                report.measure(make_scene(n, width, height), name, arguments.isa, prototypes, arguments.repeats)
+        for name, scene in _scenes(arguments):
+            report.measure(scene, name, arguments.isa, prototypes, arguments.repeats)
     report.summary()
 
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from vdgs.config import PRESETS, TrainConfig, differences, to_dict, validate
+from vdgs.config import PRESETS, TrainConfig, differences, to_dict, validate, with_iterations
 from vdgs.errors import RunError
 from vdgs.run import RunFolder, StageFolder
 
@@ -68,5 +68,11 @@ def test_presets_are_valid():
 
 
 def test_validation_names_each_problem():
-    bad = TrainConfig(iterations=0, resolutions=((0.5, 2),))
+    bad = TrainConfig(iterations=-1, resolutions=((0.5, 2),))
     assert len(validate(bad)) == 2
+
+
+def test_automatic_iterations_follow_the_number_of_photographs():
+    automatic = TrainConfig(iterations=0)
+    assert [with_iterations(automatic, views).iterations for views in (5, 145, 9000)] == [3000, 14_500, 30_000]
+    assert with_iterations(TrainConfig(iterations=7), 9000).iterations == 7

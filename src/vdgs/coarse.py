@@ -22,7 +22,7 @@ from vdgs.captures.images import ImageCache
 from vdgs.captures.loading import load_capture
 from vdgs.captures.options import CaptureOptions
 from vdgs.checkpoints import load_newest, save_state
-from vdgs.config import TrainConfig, to_dict, validate
+from vdgs.config import TrainConfig, to_dict, validate, with_iterations
 from vdgs.decoder import Decoder
 from vdgs.errors import RunError, TrainingDiverged, VdgsError
 from vdgs.files import write_json
@@ -64,6 +64,7 @@ def train_coarse(
     if problems:
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
     capture = load_capture(capture_path, capture_options)
+    config = with_iterations(config, len(capture.train_views))
     run = RunFolder(output)
     with run.locked():
         run.begin(run_settings(capture_path, capture_options, config))

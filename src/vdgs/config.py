@@ -7,7 +7,7 @@ The defaults are the paper's (preset `paper`); `PRESETS` holds the others.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 PresetName = Literal["paper", "laptop"]
@@ -101,7 +101,8 @@ class TrainConfig:
     """One stage of training."""
 
     iterations: int = 100_000
-    """Number of steps, one photograph each."""
+    """Number of steps, one photograph each; 0 takes a hundred for each training photograph, but at least 3000 and at
+    most 30 000 (choice: few photographs are soon learnt by heart, many need their time)."""
     resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
     """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
     seed: int = 0
@@ -116,10 +117,22 @@ class TrainConfig:
     """The loss."""
 
 
+#: How `iterations = 0` follows from the number of training photographs.
+ITERATIONS_PER_VIEW, FEWEST_ITERATIONS, MOST_ITERATIONS = 100, 3_000, 30_000
+
+
+def with_iterations(config: TrainConfig, training_views: int) -> TrainConfig:
+    """The settings with `iterations = 0` replaced by what the number of training photographs asks for."""
+    if config.iterations:
+        return config
+    wanted = ITERATIONS_PER_VIEW * training_views
+    return replace(config, iterations=min(max(wanted, FEWEST_ITERATIONS), MOST_ITERATIONS))
+
+
 PRESETS: dict[str, TrainConfig] = {
     "paper": TrainConfig(),
     "laptop": TrainConfig(
-        iterations=8_000,
+        iterations=0,
         resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
         growth=GrowthConfig(statistics_from=300, start=500, until=0.6),
     ),
@@ -156,8 +169,8 @@ def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> l
 def validate(config: TrainConfig) -> list[str]:
     """What is wrong with the settings, one sentence each; empty if nothing is."""
     growth, problems = config.growth, []
-    if config.iterations < 1:
-        problems.append(f"iterations is {config.iterations}; it must be at least 1")
+    if config.iterations < 0:
+        problems.append(f"iterations is {config.iterations}; it must be at least 1, or 0 for automatic")
     if not config.resolutions or config.resolutions[0][0] != 0.0:
         problems.append("resolutions must begin at share 0.0")
     if any(factor < 1 for _, factor in config.resolutions):
