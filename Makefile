@@ -33,10 +33,10 @@ demo: setup
 	rm -rf $(DEMO)
 	$(BIN)/vdgs synth $(DEMO)/capture
 	$(BIN)/vdgs inspect $(DEMO)/capture --output $(DEMO)/inspect
-	$(BIN)/vdgs coarse $(DEMO)/capture --output $(DEMO)/run --preset laptop --iterations 4000
+	$(BIN)/vdgs coarse $(DEMO)/capture --output $(DEMO)/run --preset laptop
 	$(BIN)/vdgs eval $(DEMO)/run
 	@echo
-	@echo "the place from above:  $(DEMO)/inspect/coverage.png"
+	@echo "the place from above:  $(DEMO)/inspect/visibility_map.png"
 	@echo "test views:            $(DEMO)/run/evaluation/contact_sheet.png"
 	@echo "metrics:               $(DEMO)/run/evaluation/metrics.json"
 	@echo "model:                 $(DEMO)/run/coarse/model.safetensors"
