@@ -3,7 +3,8 @@
     python benchmarks/step.py [--threads 2] [--visible 20000]
 
 A random anchor scene seen from above, in which all anchors are visible, with about half of the opacities positive
-(what a fresh decoder gives). Prints the median of each phase, and the memory that an anchor costs.
+(what a fresh decoder gives). Prints the median of each phase. Memory is the slope of the peak resident size of fresh
+processes over the number of anchors: of those in view, with all that a step makes of them, and of those out of view.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from __future__ import annotations
 import argparse
 import os
 import statistics as stats
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -18,7 +21,6 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numpy as np
-import psutil
 import torch
 
 from machine import describe
@@ -29,14 +31,16 @@ from vdgs.decoder import Decoder
 from vdgs.kernels import native as kernels
 from vdgs.kernels.native.module import set_threads
 from vdgs.optimiser import rates_at
+from vdgs.progress import peak_memory_bytes
 from vdgs.render import decode_visible, draw, gather_visible
 from vdgs.training import start_state
 
 PHASES = ("cull", "decode", "rasterise", "loss", "backward", "adam", "statistics")
 
 
-def scene(visible: int, width: int, height: int) -> tuple[Anchors, Camera]:
-    """Anchors on a bumpy ground that fills the view, one voxel apart, Gaussians about as large as their spacing."""
+def scene(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Anchors, Camera]:
+    """Anchors on a bumpy ground that fills the view, one voxel apart, Gaussians about as large as their spacing;
+    `hidden` more of them lie far outside the view."""
     rng = np.random.default_rng(0)
     focal, altitude = 1.2 * width, 20.0
     extent = np.array([width, height]) / focal * altitude
@@ -44,6 +48,8 @@ def scene(visible: int, width: int, height: int) -> tuple[Anchors, Camera]:
     points = np.column_stack([ground, rng.normal(0, 0.2, visible)])
     points = points[np.lexsort(np.floor(points[:, :2] / (extent / 16)).T)]
     spacing = float(np.sqrt(extent.prod() / visible))
+    points = np.concatenate([points, points[rng.integers(0, visible, hidden)] + [1000.0, 0.0, 0.0]])
+    visible += hidden
     g = torch.Generator().manual_seed(0)
     anchors = Anchors(
         positions=torch.from_numpy(points.astype(np.float32)),
@@ -88,25 +94,42 @@ def one_step(
     return len(visible.rows), len(splats.opacities)
 
 
-def measure(visible: int, width: int, height: int, repeats: int) -> None:
-    process = psutil.Process()
-    before = process.memory_info().rss
-    anchors, camera = scene(visible, width, height)
+def prepare(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Any, Camera, torch.Tensor]:
+    anchors, camera = scene(visible, width, height, hidden)
     state = start_state(anchors, Decoder.initial(10, False, 0, 1, torch.Generator().manual_seed(0)))
     target = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+    return state, camera, target
+
+
+def measure(visible: int, width: int, height: int, repeats: int) -> None:
+    state, camera, target = prepare(visible, width, height)
     times: dict[str, list[float]] = {phase: [] for phase in PHASES}
-    peak = before
     for step in range(1, repeats + 4):
         seen, splats = one_step(state, camera, target, step, times)
-        peak = max(peak, process.memory_info().rss)
     medians = {phase: stats.median(values[3:]) for phase, values in times.items()}
     total = stats.median(sum(step) for step in zip(*(values[3:] for values in times.values()), strict=True))
     parts = "  ".join(f"{phase} {value:.1f}" for phase, value in medians.items())
-    print(
-        f"{width}x{height}  {seen} visible anchors, {splats} splats: {total:.1f} ms a step   ({parts})",
-        flush=True,
-    )
-    print(f"    memory: {(peak - before) / visible:.0f} B an anchor (growth of the process, image buffers included)")
+    print(f"{width}x{height}  {seen} visible anchors, {splats} splats: {total:.1f} ms a step   ({parts})", flush=True)
+
+
+def peak_bytes(visible: int, hidden: int) -> int:
+    """Peak resident size of a fresh process that makes three steps."""
+    asked = [sys.executable, __file__, "--peak", str(visible), str(hidden)]
+    return int(subprocess.run(asked, check=True, capture_output=True, text=True).stdout)
+
+
+def print_peak(visible: int, hidden: int) -> None:
+    state, camera, target = prepare(visible, 400, 300, hidden)
+    for step in range(1, 4):
+        one_step(state, camera, target, step, {phase: [] for phase in PHASES})
+    print(peak_memory_bytes())
+
+
+def report_memory(step: int = 100_000) -> None:
+    base = peak_bytes(step, 0)
+    in_view = (peak_bytes(2 * step, 0) - base) / step
+    out_of_view = (peak_bytes(step, 4 * step) - base) / (4 * step)
+    print(f"memory: {in_view:.0f} B for each anchor in view, {out_of_view:.0f} B for each out of view")
 
 
 def main() -> None:
@@ -114,12 +137,17 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--visible", type=int, default=20_000)
     parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--peak", type=int, nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
+    if arguments.peak:
+        print_peak(*arguments.peak)
+        return
     set_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
     for width, height in ((400, 300), (800, 600)):
         measure(arguments.visible, width, height, arguments.repeats)
+    report_memory()
 
 
 if __name__ == "__main__":
