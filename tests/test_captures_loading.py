@@ -200,6 +200,16 @@ def test_strays_among_the_points_are_dropped(tmp_path, scene):
 # ------------------------------------------------------------------------------------------------ splits
 
 
+def test_validation_leaves_the_test_photographs_out(folder, scene):
+    names = sorted(scene.cameras)
+    tested = {view.name for view in load_capture(folder, up(test_every=4)).test_views}
+    validation = load_capture(folder, up(test_every=4, validation=True))
+    assert tested.isdisjoint(view.name for view in validation.views)
+    kept = [name for name in names if name not in tested]
+    assert [view.name for view in validation.test_views] == kept[::4]
+    assert len(validation.views) == len(kept)
+
+
 def test_test_lists_and_every_nth(folder, scene, tmp_path):
     listed = tmp_path / "test.txt"
     listed.write_text("# held out\nframe_002.jpg\n\nframe_007\n")

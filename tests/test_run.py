@@ -74,5 +74,5 @@ def test_validation_names_each_problem():
 
 def test_automatic_iterations_follow_the_number_of_photographs():
     automatic = TrainConfig(iterations=0)
-    assert [with_iterations(automatic, views).iterations for views in (5, 145, 9000)] == [3000, 14_500, 30_000]
+    assert [with_iterations(automatic, views).iterations for views in (5, 145, 9000)] == [3000, 8700, 30_000]
     assert with_iterations(TrainConfig(iterations=7), 9000).iterations == 7

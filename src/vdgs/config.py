@@ -101,7 +101,7 @@ class TrainConfig:
     """One stage of training."""
 
     iterations: int = 100_000
-    """Number of steps, one photograph each; 0 takes a hundred for each training photograph, but at least 3000 and at
+    """Number of steps, one photograph each; 0 takes sixty for each training photograph, but at least 3000 and at
     most 30 000 (choice: few photographs are soon learnt by heart, many need their time)."""
     resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
     """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
@@ -118,7 +118,7 @@ class TrainConfig:
 
 
 #: How `iterations = 0` follows from the number of training photographs.
-ITERATIONS_PER_VIEW, FEWEST_ITERATIONS, MOST_ITERATIONS = 100, 3_000, 30_000
+ITERATIONS_PER_VIEW, FEWEST_ITERATIONS, MOST_ITERATIONS = 60, 3_000, 30_000
 
 
 def with_iterations(config: TrainConfig, training_views: int) -> TrainConfig:
@@ -134,7 +134,7 @@ PRESETS: dict[str, TrainConfig] = {
     "laptop": TrainConfig(
         iterations=0,
         resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
-        growth=GrowthConfig(statistics_from=300, start=500, until=0.6),
+        growth=GrowthConfig(statistics_from=300, start=500, until=0.6, threshold=1e-4),
     ),
 }
 

@@ -25,6 +25,9 @@ class CaptureOptions:
     split: SplitMode = "auto"
     """auto: the capture's own split or test list where there is one, else every n-th;
     explicit: insist on it; every: always every n-th."""
+    validation: bool = False
+    """Leave the test photographs out altogether and test on every n-th training photograph instead: for choosing
+    settings without looking at the test set."""
     up: UpAxis = "auto"
     """Which axis of the capture's own world points up. auto: georeference, GPS, or estimated."""
     gps: Path | None = None

@@ -41,13 +41,17 @@ def choose_splits(
         )
     else:
         splits = ["test" if index % options.test_every == 0 else "train" for index in range(len(views))]
+    chosen = [replace(view, split=split) for view, split in zip(views, splits, strict=True)]
+    if options.validation:
+        kept = [view for view in chosen if view.split == "train"]
+        chosen = [replace(v, split="train" if i % options.test_every else "test") for i, v in enumerate(kept)]
     for side in ("train", "test"):
-        if side not in splits:
+        if side not in {view.split for view in chosen}:
             raise CaptureError(
                 f"{root}: no photograph is left to {side} on ({len(views)} in all). Check --test-list, "
                 "--split and --max-images; at least two photographs are needed."
             )
-    return [replace(view, split=split) for view, split in zip(views, splits, strict=True)]
+    return chosen
 
 
 def _listed(file: Path, views: list[View]) -> set[str]:
