@@ -193,6 +193,16 @@ def test_anchors_start_on_the_voxel_grid():
     torch.testing.assert_close(anchors.features[:, :3], torch.tensor([[0.0, -1, -1], [-1, 1, -1]]))
 
 
+def test_points_far_from_all_others_start_no_anchor():
+    ground = np.random.default_rng(0).uniform(-5, 5, (500, 3)) * [1, 1, 0.02]
+    deep = np.array([[0.0, 0.0, -300.0], [0.1, 0.0, -300.0]])
+    points, colours = np.concatenate([ground, deep]), np.zeros((502, 3), np.uint8)
+    kept, _ = initial_anchors(points, colours, [], AnchorConfig(voxel=0.1))
+    assert float(kept.positions[:, 2].min()) > -1
+    everything, _ = initial_anchors(points, colours, [], AnchorConfig(voxel=0.1, outlier_distance=0.0))
+    assert float(everything.positions[:, 2].min()) == pytest.approx(-300)
+
+
 def test_one_distinct_point_is_too_few():
     with pytest.raises(VdgsError, match="distinct sparse point"):
         initial_anchors(np.zeros((4, 3)), np.zeros((4, 3), np.uint8), [], AnchorConfig())

@@ -29,6 +29,8 @@ from vdgs.gaps import gap_points
 from vdgs.kernels.decode_types import FEATURE_SIZE
 
 FORMAT = "vdgs-anchors-1"
+#: An outlier is known by its distance to this neighbour: small clusters of false matches are outliers too.
+OUTLIER_NEIGHBOUR = 4
 
 #: The tensors of an anchor that training moves, in the order in which they are saved.
 TRAINED = ("features", "offsets", "log_scales")
@@ -145,6 +147,15 @@ def automatic_voxel(points: np.ndarray) -> float:
     return float(np.median(distances[:, 1]))
 
 
+def inliers(points: np.ndarray, factor: float) -> np.ndarray:
+    """Which points [n, 3] have their fourth nearest neighbour within `factor` times the median such distance."""
+    if factor <= 0 or len(points) <= OUTLIER_NEIGHBOUR:
+        return np.ones(len(points), bool)
+    distances, _ = cKDTree(points).query(points, k=[OUTLIER_NEIGHBOUR + 1], workers=1)
+    limit = factor * np.median(distances)
+    return distances[:, 0] <= limit if limit > 0 else np.ones(len(points), bool)
+
+
 def initial_anchors(
     points: np.ndarray, colours: np.ndarray, cameras: Sequence[Camera], config: AnchorConfig
 ) -> tuple[Anchors, float]:
@@ -155,6 +166,8 @@ def initial_anchors(
     offsets at 0, features at 0 or at the colours. Raises VdgsError with fewer than two distinct points.
     """
     voxel = config.voxel if config.voxel > 0 else automatic_voxel(points)
+    kept = inliers(points, config.outlier_distance)
+    points, colours = points[kept], colours[kept]
     if config.fill_gaps:
         gaps = gap_points(points, cameras, voxel)
         nearest = cKDTree(points).query(gaps, workers=1)[1] if len(gaps) else np.zeros(0, np.int64)

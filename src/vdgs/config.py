@@ -22,6 +22,9 @@ class AnchorConfig:
     voxel: float = 0.0
     """Edge of the initial voxel grid in units of the ground frame; 0 takes the median nearest-neighbour distance of the
     sparse points."""
+    outlier_distance: float = 30.0
+    """Sparse points start no anchor where their fourth neighbour is this many times farther than the median one's; 0
+    keeps all (choice: a few points deep below the ground become a backdrop that every camera sees through it)."""
     fill_gaps: bool = True
     """Also start anchors on ground that cameras see but that holds no sparse points: woods, water, fields (choice)."""
     distance: bool = False
