@@ -2,7 +2,7 @@
 
 PYTHON ?= python3
 VENV   ?= .venv
-DEMO   ?= demo
+DEMO    = demo
 BIN     = $(VENV)/bin
 STAMP   = $(VENV)/.installed
 SOURCES = $(wildcard native/*.h native/*.cpp native/cpu/*.h native/cpu/*.cpp) CMakeLists.txt pyproject.toml constraints.txt

@@ -4,6 +4,7 @@ import json
 
 import pytest
 import torch
+from safetensors import SafetensorError
 
 from vdgs.checkpoints import SavedState, load_newest, remove_leftovers, save_state
 from vdgs.errors import VdgsError
@@ -77,7 +78,7 @@ def test_a_refusing_disk_is_reported_and_loses_nothing(tmp_path, monkeypatch):
     save_state(tmp_path, state(1))
 
     def full(*_args, **_kwargs):
-        raise OSError(28, "No space left on device")
+        raise SafetensorError("No space left on device")  # what safetensors makes of the system's error
 
     monkeypatch.setattr("vdgs.checkpoints.save_file", full)
     with pytest.raises(VdgsError, match=r"No space left.*continues"):

@@ -7,8 +7,9 @@ Equations: Scaffold-GS eqs. 3-8; VDGS section III-B.
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,9 @@ from vdgs.kernels.decode_types import FEATURE_SIZE
 FORMAT = "vdgs-anchors-1"
 #: An outlier is known by its distance to this neighbour: small clusters of false matches are outliers too.
 OUTLIER_NEIGHBOUR = 4
+
+#: What to do about a model that cannot be used.
+REBUILD = "Delete it and run the command that trained it again: it is rebuilt from the last saved state."
 
 #: The tensors of an anchor that training moves, in the order in which they are saved.
 TRAINED = ("features", "offsets", "log_scales")
@@ -77,7 +81,9 @@ class AnchorModel:
         """Write one safetensors file, atomically."""
         tensors = {f"anchors.{k}": v.contiguous() for k, v in self.anchors.tensors().items()}
         tensors |= {f"decoder.{k}": v.detach().contiguous() for k, v in self.decoder.tensors().items()}
-        facts = {"voxel": self.voxel, "background": self.background, "facts": dict(self.facts)}
+        facts = {
+            "voxel": self.voxel, "background": self.background, "facts": dict(self.facts), "crc32": _checksum(tensors),
+        }  # fmt: skip
         header = {FORMAT: json.dumps(facts)}  # a single key: several would be written in an order that varies
         write_atomically(path, lambda temporary: save_file(tensors, temporary, metadata=header))
 
@@ -93,11 +99,13 @@ class AnchorModel:
                 {name.removeprefix("decoder."): t for name, t in tensors.items() if name.startswith("decoder.")}
             )
             known = json.loads(header[FORMAT])
+            if known["crc32"] != _checksum(tensors):
+                raise ValueError("its checksum does not agree")
             red, green, blue = (float(value) for value in known["background"])
             model = AnchorModel(anchors, decoder, float(known["voxel"]), (red, green, blue), known["facts"])
             model.check()
         except (KeyError, ValueError, TypeError) as error:
-            raise VdgsError(f"{path}: is damaged or incomplete ({error}). Restore it or train again.") from error
+            raise VdgsError(f"{path}: is damaged or incomplete ({error}). {REBUILD}") from error
         return model
 
     def check(self) -> None:
@@ -117,8 +125,13 @@ class AnchorModel:
                 raise ValueError(f"{name} holds numbers that are not finite")
         self.decoder.check(k)
 
-    def with_anchors(self, anchors: Anchors) -> AnchorModel:
-        return replace(self, anchors=anchors)
+
+def _checksum(tensors: Mapping[str, Tensor]) -> int:
+    """CRC-32 over the bytes of all tensors, in the order of their names."""
+    crc = 0
+    for name in sorted(tensors):
+        crc = zlib.crc32(tensors[name].contiguous().numpy().tobytes(), crc)
+    return crc
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -129,7 +142,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     except FileNotFoundError as error:
         raise VdgsError(f"{path}: is not there. Train first, or point to the right run.") from error
     except (OSError, SafetensorError, ValueError) as error:
-        raise VdgsError(f"{path}: cannot be read ({error}). It is damaged; restore it or train again.") from error
+        raise VdgsError(f"{path}: cannot be read ({error}). {REBUILD}") from error
 
 
 def automatic_voxel(points: np.ndarray) -> float:

@@ -63,6 +63,14 @@ def load_newest(folder: Path) -> tuple[SavedState | None, list[str]]:
     return None, complaints
 
 
+def discard_after(folder: Path, iteration: int) -> None:
+    """Delete states beyond `iteration`: damaged ones, which would count among those that are kept."""
+    for sidecar in folder.glob("*.json"):
+        if sidecar.stem.isdecimal() and int(sidecar.stem) > iteration:
+            sidecar.unlink()
+            sidecar.with_suffix(".safetensors").unlink(missing_ok=True)
+
+
 def _read(sidecar: Path) -> SavedState:
     facts = json.loads(sidecar.read_text(encoding="utf-8"))
     path = sidecar.with_suffix(".safetensors")

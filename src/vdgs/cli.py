@@ -57,6 +57,9 @@ def _run(verb: str, arguments: list[str]) -> int:
         return 130
     except BrokenPipeError:
         return 1
+    except OSError as error:  # a disk that is full, a folder that cannot be written: no news from a traceback
+        print(f"vdgs {verb}: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":

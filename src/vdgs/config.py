@@ -172,6 +172,12 @@ def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> l
 def validate(config: TrainConfig) -> list[str]:
     """What is wrong with the settings, one sentence each; empty if nothing is."""
     growth, problems = config.growth, []
+    if config.seed < 0 or config.anchors.appearance < 0 or config.anchors.voxel < 0:
+        problems.append("seed, anchors.appearance and anchors.voxel must not be negative")
+    if 0 < config.anchors.outlier_distance < 2:
+        problems.append("anchors.outlier_distance below 2 would drop ordinary points; give more, or 0 to keep all")
+    if growth.coarsest_cell <= 0 or growth.threshold < 0:
+        problems.append("growth.coarsest_cell must be positive and growth.threshold not negative")
     if config.iterations < 0:
         problems.append(f"iterations is {config.iterations}; it must be at least 1, or 0 for automatic")
     if not config.resolutions or config.resolutions[0][0] != 0.0:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+from safetensors import SafetensorError
 
 from vdgs.errors import VdgsError
 
@@ -17,18 +20,20 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
     Raises VdgsError, with the file and the remedy, when the disk refuses (full, read-only, ...);
     what stood at `path` before is then untouched.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         write(temporary)
         with temporary.open("rb") as handle:
             os.fsync(handle.fileno())
         os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
+    except (OSError, SafetensorError) as error:  # safetensors hides the system's error in one of its own
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        why = getattr(error, "strerror", None) or error
         raise VdgsError(
-            f"{path}: cannot be written ({error.strerror or error}). Free some space or choose another "
-            "folder, then run the same command again: it continues from the last good state."
+            f"{path}: cannot be written ({why}). Free some space or choose another folder, then run the same "
+            "command again: it continues from the last good state."
         ) from error
     except BaseException:
         temporary.unlink(missing_ok=True)

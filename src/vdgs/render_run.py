@@ -8,10 +8,11 @@ import matplotlib
 import numpy as np
 from rich.console import Console
 from rich.progress import track
-from torch import Tensor
 
 from vdgs import render_paths
 from vdgs.cameras import Camera
+from vdgs.errors import VdgsError
+from vdgs.evaluation.metrics import to_8bit
 from vdgs.evaluation.of_run import TrainedRun, open_run
 from vdgs.evaluation.saving import file_stems, write_png
 from vdgs.render import render, render_values
@@ -24,12 +25,19 @@ SLIDES_PER_SECOND = 2.0
 
 def render_run(asked: RenderArguments, console: Console) -> None:
     """Render what was asked for. Raises VdgsError for an unusable path, codec or output."""
+    if min(asked.width, asked.fps, asked.seconds) < 0:
+        raise VdgsError("--width, --fps and --seconds must not be negative")
     run = open_run(asked.run)
     named, fps = _cameras(asked, run)
     if asked.width:
         named = [(name, camera.resized(asked.width, _height(camera, asked.width))) for name, camera in named]
     frames = _frames(asked.kind, run, named, console)
     if asked.output.suffix:
+        sizes = {(camera.width, camera.height) for _, camera in named}
+        if len(sizes) > 1:
+            raise VdgsError(
+                f"{asked.output}: a film needs frames of one size, and these views have {len(sizes)}. Give a folder."
+            )
         with VideoWriter(asked.output, fps) as film:
             for _, frame in frames:
                 film.write(frame)
@@ -70,7 +78,7 @@ def _frames(
     span: tuple[float, float] | None = None if counts is None else (0.0, float(counts.max()))
     for name, camera in track(named, "rendering", console=console, disable=not console.is_terminal):
         if kind == "image":
-            yield name, to_uint8(render(run.model, camera).image)
+            yield name, to_8bit(render(run.model, camera).image.numpy())
             continue
         if counts is not None:
             values = render_values(run.model, counts, camera).numpy()
@@ -87,11 +95,6 @@ def _span(values: np.ndarray) -> tuple[float, float]:
     """The 1 to 99 % range of the first frame, used for all, so that colours do not flicker."""
     seen = values[np.isfinite(values)]
     return (float(np.quantile(seen, 0.01)), float(np.quantile(seen, 0.99))) if seen.size else (0.0, 1.0)
-
-
-def to_uint8(image: Tensor) -> np.ndarray:
-    """[h, w, 3] in [0, 1] to 8 bits, rounded."""
-    return (image.clamp(0, 1) * 255 + 0.5).byte().numpy()
 
 
 def coloured(values: np.ndarray, span: tuple[float, float]) -> np.ndarray:

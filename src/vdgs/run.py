@@ -82,6 +82,10 @@ class RunFolder:
         return self.path / "config.yaml"
 
     @property
+    def capture_file(self) -> Path:
+        return self.path / "capture.json"
+
+    @property
     def coarse(self) -> StageFolder:
         return StageFolder(self.path / "coarse")
 
@@ -105,7 +109,11 @@ class RunFolder:
             return
         if self.path.exists() and not self.path.is_dir():
             raise RunError(f"{self.path}: is a file. Choose a folder for --output.")
-        strangers = [p.name for p in self.path.iterdir() if p.name != ".lock"] if self.path.exists() else []
+        strangers = (
+            [p.name for p in self.path.iterdir() if p.name != ".lock" and p.suffix != ".tmp"]
+            if self.path.exists()
+            else []
+        )
         if strangers:
             raise RunError(
                 f"{self.path}: holds other files ({', '.join(sorted(strangers)[:3])}) and no config.yaml. "
@@ -140,7 +148,7 @@ class RunFolder:
         with handle:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
+            except BlockingIOError as error:
                 raise RunError(
                     f"{self.path}: another vdgs process works on this run. Wait for it or stop it."
                 ) from error
@@ -152,5 +160,9 @@ def _commit() -> str | None:
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists() or not (root / "native").exists():
         return None
-    found = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    command = ["git", "-C", str(root), "rev-parse", "HEAD"]
+    try:
+        found = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError:  # no git on this machine
+        return None
     return found.stdout.strip() or None

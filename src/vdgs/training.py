@@ -57,7 +57,9 @@ class TrainingState:
     loss: float = math.nan
     best_loss: float = math.inf
     psnr: float = math.nan
+    #: Time spent and largest memory used so far, over all processes that worked on this state.
     seconds: float = 0.0
+    peak_memory_bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     if state.iteration % REORDER_INTERVAL == 0:
         reorder(state)
     l1, ssim = float(photometric.l1), float(photometric.ssim)
-    _smooth(state, value, raster.image.detach(), target)
+    _smooth(state, value, raster.image.detach(), target, mask)
     return StepReport(value, l1, ssim, len(visible.rows), len(splats.opacities), grown, pruned)
 
 
@@ -207,12 +209,14 @@ def mean_colour(images: TrainingImages, count: int, downscale: int, at_most: int
     return red, green, blue
 
 
-def _smooth(state: TrainingState, loss: float, image: Tensor, target: Tensor) -> None:
+def _smooth(state: TrainingState, loss: float, image: Tensor, target: Tensor, mask: Tensor | None) -> None:
     """Update the smoothed loss and, every tenth step, PSNR (for people and for the divergence check)."""
     state.loss = _moving(state.loss, loss, 0.98)
     if state.iteration % PSNR_INTERVAL == 0:
-        error = float(torch.mean((image.clamp(0, 1) - target.float() / 255.0) ** 2))
-        state.psnr = _moving(state.psnr, -10.0 * math.log10(max(error, 1e-10)), 0.9)
+        squared = (image.clamp(0, 1) - target.float() / 255.0) ** 2
+        counted = squared if mask is None else squared[mask > 0]
+        if counted.numel():
+            state.psnr = _moving(state.psnr, -10.0 * math.log10(max(float(counted.mean()), 1e-10)), 0.9)
     if state.iteration > 100:
         state.best_loss = min(state.best_loss, state.loss)
         if state.loss > 0.3 and state.loss > 4 * state.best_loss:
@@ -259,7 +263,7 @@ def to_saved(state: TrainingState) -> SavedState:
         tensors |= {f"first.{group}.{k}": v for k, v in moments.first.items()}
         tensors |= {f"second.{group}.{k}": v for k, v in moments.second.items()}
     facts = {"loss": repr(state.loss), "best_loss": repr(state.best_loss), "psnr": repr(state.psnr),
-             "seconds": state.seconds}  # fmt: skip
+             "seconds": state.seconds, "peak_memory_bytes": state.peak_memory_bytes}  # fmt: skip
     return SavedState(state.iteration, facts, tensors)
 
 
@@ -280,4 +284,5 @@ def from_saved(saved: SavedState) -> TrainingState:
     state.iteration = saved.iteration
     state.loss, state.best_loss = float(saved.facts["loss"]), float(saved.facts["best_loss"])
     state.psnr, state.seconds = float(saved.facts["psnr"]), float(saved.facts["seconds"])
+    state.peak_memory_bytes = int(saved.facts["peak_memory_bytes"])
     return state

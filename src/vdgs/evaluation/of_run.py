@@ -13,6 +13,7 @@ from torch import Tensor
 
 from vdgs.anchors import AnchorModel
 from vdgs.captures.capture import Capture, View
+from vdgs.captures.facts import refuse_another_capture
 from vdgs.captures.images import ImageCache
 from vdgs.captures.loading import load_capture
 from vdgs.captures.options import CaptureOptions
@@ -55,7 +56,9 @@ def open_run(path: Path) -> TrainedRun:
             "again: it continues from the last saved state."
         )
     capture = load_capture(root, options_from(settings, folder.config_file))
-    return TrainedRun(folder, capture, AnchorModel.load(model_path), model_path, folder.coarse.status())
+    model = AnchorModel.load(model_path)
+    refuse_another_capture(model_path, model.facts.get("capture", {}), capture)
+    return TrainedRun(folder, capture, model, model_path, folder.coarse.status())
 
 
 def options_from(settings: dict[str, Any], source: Path) -> CaptureOptions:
@@ -70,6 +73,8 @@ def options_from(settings: dict[str, Any], source: Path) -> CaptureOptions:
 
 def evaluate_run(path: Path, lpips_weights: Path | None, bins: int, console: Console) -> None:
     """Measure a run's test views; writes RUN/evaluation and prints a table."""
+    if bins < 1:
+        raise RunError(f"--bins is {bins}; it must be at least 1")
     run = open_run(path)
     views = run.capture.test_views
     counts = run.views_of_anchors().float()
