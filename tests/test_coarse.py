@@ -10,7 +10,9 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import pytest
+import torch
 
 from captures_support import tiny_scene, write_colmap
 from vdgs.anchors import AnchorModel
@@ -201,7 +203,7 @@ def test_a_capture_that_changed_is_refused(capture, unbroken, tmp_path, change):
         assert cv2.imwrite(str(photograph), cv2.imread(str(photograph)) // 2)
     else:
         write_colmap(other, tiny_scene(points=300))
-    with pytest.raises(VdgsError, match="is not the capture that.*changed"):
+    with pytest.raises(VdgsError, match=r"is not the capture that.*changed"):
         open_run(run)
     done = finish(other, run)
     assert done.returncode == 1
