@@ -38,13 +38,8 @@ def save_state(folder: Path, state: SavedState) -> None:
     write_atomically(
         path, lambda temporary: save_file({k: v.contiguous() for k, v in state.tensors.items()}, temporary)
     )
-    data = path.read_bytes()
-    sidecar = {
-        "iteration": state.iteration,
-        "bytes": len(data),
-        "crc32": zlib.crc32(data),
-        "facts": dict(state.facts),
-    }
+    size, crc = _size_and_crc(path)
+    sidecar = {"iteration": state.iteration, "bytes": size, "crc32": crc, "facts": dict(state.facts)}
     write_json(path.with_suffix(".json"), sidecar)
     for old in sorted(folder.glob("*.json"))[:-KEPT]:
         old.unlink()
@@ -61,6 +56,15 @@ def load_newest(folder: Path) -> tuple[SavedState | None, list[str]]:
         except (OSError, ValueError, KeyError, TypeError) as error:
             complaints.append(f"{sidecar.with_suffix('.safetensors')}: is damaged ({error}); using the state before it")
     return None, complaints
+
+
+def _size_and_crc(path: Path) -> tuple[int, int]:
+    """Bytes and CRC-32 of a file, read piece by piece: states are large."""
+    size = crc = 0
+    with path.open("rb") as file:
+        while piece := file.read(1 << 20):
+            size, crc = size + len(piece), zlib.crc32(piece, crc)
+    return size, crc
 
 
 def discard_after(folder: Path, iteration: int) -> None:

@@ -27,16 +27,15 @@ class Moments:
             {name: torch.zeros_like(p) for name, p in parameters.items()},
         )
 
-    def rebuilt(self, added: int, kept: Tensor) -> Moments:
-        """For anchors: `added` rows without history appended, then only the `kept` rows."""
+    def rebuild(self, added: int, kept: Tensor) -> None:
+        """For anchors: append `added` rows without history, then keep only the `kept` rows (mask or order).
 
-        def change(t: Tensor) -> Tensor:
-            return torch.cat([t, t.new_zeros(added, *t.shape[1:])])[kept]
-
-        return Moments(
-            {name: change(t) for name, t in self.first.items()},
-            {name: change(t) for name, t in self.second.items()},
-        )
+        Tensor by tensor, so that no more than one is there twice.
+        """
+        for tensors in (self.first, self.second):
+            for name in list(tensors):
+                before = tensors.pop(name)
+                tensors[name] = torch.cat([before, before.new_zeros(added, *before.shape[1:])])[kept]
 
 
 @dataclass

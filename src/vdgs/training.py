@@ -176,7 +176,7 @@ def grow(state: TrainingState, stage: Stage) -> tuple[int, int]:
     kept = torch.cat([decision.kept, torch.ones(added, dtype=torch.bool)])
     state.anchors = state.anchors.extended(decision.added).select(kept)
     state.statistics = state.statistics.extended(added).select(kept)
-    state.optimiser.anchors = state.optimiser.anchors.rebuilt(added, kept)
+    state.optimiser.anchors.rebuild(added, kept)
     return added, decision.pruned
 
 
@@ -185,7 +185,7 @@ def reorder(state: TrainingState) -> None:
     order = kernels.morton_order(state.anchors.positions)
     state.anchors = state.anchors.select(order)
     state.statistics = state.statistics.select(order)
-    state.optimiser.anchors = state.optimiser.anchors.rebuilt(0, order)
+    state.optimiser.anchors.rebuild(0, order)
 
 
 def _background(stage: Stage, iteration: int) -> Tensor:
