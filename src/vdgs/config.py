@@ -7,6 +7,8 @@ The defaults are the paper's (preset `paper`); `PRESETS` holds the others.
 from __future__ import annotations
 
 import dataclasses
+import typing
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -84,6 +86,29 @@ class GrowthConfig:
 
 
 @dataclass(frozen=True)
+class CompensationConfig:
+    """Compensated anchor growth: gradients of places that few cameras see are remembered and added (eqs. 8-10)."""
+
+    enabled: bool = True
+    """Off: plain growth (the paper's "w/o Anchor Generation")."""
+    t_low: float = 0.20
+    """T_low: an anchor is of low visibility (the set L) when fewer than this share of the cameras of a growth cycle
+    hold it in their frustum."""
+    t_low_quantile: float = 0.0
+    """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on a
+    large scene nearly every anchor is below a fixed share)."""
+    beta_g: float = 2.0
+    """beta_g: weight of a cycle's mean gradient in the cache g."""
+    gamma: float = 0.9
+    """gamma: decay of the cache g from cycle to cycle."""
+    gate: Literal["scaled", "literal"] = "scaled"
+    """How often an offset of low visibility must be drawn before it is judged: `scaled` takes T_low times the gate of
+    the others, at least twice (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
+    cap: float = 0.0
+    """Greatest value of g; 0 for none. Without it a statistic that is fed steadily grows to 21 times its size."""
+
+
+@dataclass(frozen=True)
 class LossConfig:
     """What training minimises."""
 
@@ -101,7 +126,7 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """One stage of training."""
+    """Training of the coarse stage."""
 
     iterations: int = 100_000
     """Number of steps, one photograph each; 0 takes sixty for each training photograph, but at least 3000 and at
@@ -118,26 +143,144 @@ class TrainConfig:
     """Growth and pruning of anchors."""
     loss: LossConfig = field(default_factory=LossConfig)
     """The loss."""
+    compensation: CompensationConfig = field(default_factory=lambda: CompensationConfig(enabled=False))
+    """Compensated growth already in this stage (choice: only blocks have it; the ablation without blocks needs it)."""
 
 
-#: How `iterations = 0` follows from the number of training photographs.
-ITERATIONS_PER_VIEW, FEWEST_ITERATIONS, MOST_ITERATIONS = 60, 3_000, 30_000
+@dataclass(frozen=True)
+class PartitionConfig:
+    """How the scene is cut into blocks (eq. 5 and what follows it)."""
+
+    blocks: int | Literal["auto"] = 8
+    """K, the number of blocks; `auto` follows from anchors, cameras and --block-memory-gb."""
+    blocking: bool = True
+    """Off: one block that holds the whole scene (the paper's "w/o Blocking")."""
+    lambda_vis: float = 1.0
+    """lambda_vis: weight of visibility beside place in the clustering (paper: 0.7 to 1.3); 0 is purely spatial."""
+    balanced: bool = False
+    """Blocks of about equally many anchors (choice; plain k-means leaves them several times apart)."""
+    expansion: float = 0.4
+    """A block is widened by this share of the radius of a disc of its area."""
+    block_memory_gb: float = 4.0
+    """Memory that one block may take in training; only `--blocks auto` looks at it."""
+
+
+@dataclass(frozen=True)
+class AssignmentConfig:
+    """Which cameras train which block (eqs. 6-7)."""
+
+    mode: Literal["coverage", "literal", "leave_one_out", "frustum"] = "coverage"
+    """`coverage`: share of the drawn pixels that the block alone draws alike (choice). `literal`: eq. 7 as printed,
+    where pixels empty in both renders count too. `leave_one_out`: 1 - SSIM of the scene without the block.
+    `frustum`: share of the block's anchors that the camera holds (needs no renders)."""
+    tau: float = 0.05
+    """tau: pixels differ when the mean absolute difference of their channels is above this (choice; not in the
+    paper)."""
+    threshold: float = 0.45
+    """Share of pixels (or, for `frustum`, of anchors) above which a camera is assigned."""
+    threshold_leave_one_out: float = 0.05
+    """The same for `leave_one_out` (peers: 0.05 to 0.12)."""
+    min_cameras: int = 100
+    """Each block is topped up with the cameras that show it best to at least this many, as far as any show it; 0 leaves
+    it as it is."""
+    longest_side_px: int = 320
+    """Size at which the renders are compared."""
+
+
+@dataclass(frozen=True)
+class BlockConfig:
+    """Training of each block from the coarse anchors of its place. Loss and seed are those of the coarse stage."""
+
+    iterations: int = 50_000
+    """Steps for each block; 0 takes thirty for each of its photographs, at least 1500 and at most 15 000 (choice)."""
+    scale_iterations: float = 1.0
+    """Factor on the steps and on the start of statistics and growth, for scenes smaller than the paper's."""
+    resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
+    """Resolution schedule, as in the coarse stage."""
+    offset_rate: float = 0.4
+    """The rates of the coarse stage start again, those of offsets times this."""
+    scale_rate: float = 0.8
+    """... and those of log-scales times this."""
+    ring: Literal["frozen", "ramp", "free"] = "frozen"
+    """Anchors between core and widened boundary: `frozen` are drawn and never move (choice for "gradients at the
+    boundary are suppressed"); `ramp` move less the farther out they are; `free` as those of the core."""
+    context: bool = True
+    """Draw the anchors outside the block too, frozen. Off: what the block's cameras see there is empty."""
+    growth: GrowthConfig = field(default_factory=lambda: GrowthConfig(start=1000))
+    """Growth and pruning of anchors."""
+    compensation: CompensationConfig = field(default_factory=CompensationConfig)
+    """Compensated growth (eqs. 8-10)."""
+
+
+@dataclass(frozen=True)
+class MergeConfig:
+    """How trained blocks become one scene."""
+
+    rule: Literal["owner", "best_seen"] = "owner"
+    """Whose anchors stay at a place: `owner`: those of the block whose core it is, or is nearest. `best_seen`: those of
+    the block whose cameras see it most, among the blocks that reach it (needs --block.ring ramp or free)."""
+
+
+@dataclass(frozen=True)
+class MethodConfig:
+    """Everything that the result of a run depends on, but for the capture."""
+
+    training: TrainConfig = field(default_factory=TrainConfig)
+    """The coarse stage."""
+    partition: PartitionConfig = field(default_factory=PartitionConfig)
+    """The cut into blocks."""
+    assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
+    """Cameras of each block."""
+    block: BlockConfig = field(default_factory=BlockConfig)
+    """Block training."""
+    merge: MergeConfig = field(default_factory=MergeConfig)
+    """The merge."""
+
+
+#: How `iterations = 0` follows from the number of training photographs: steps for each, least, most.
+COARSE_STEPS, BLOCK_STEPS = (60, 3_000, 30_000), (30, 1_500, 15_000)
 
 
 def with_iterations(config: TrainConfig, training_views: int) -> TrainConfig:
     """The settings with `iterations = 0` replaced by what the number of training photographs asks for."""
-    if config.iterations:
-        return config
-    wanted = ITERATIONS_PER_VIEW * training_views
-    return replace(config, iterations=min(max(wanted, FEWEST_ITERATIONS), MOST_ITERATIONS))
+    return replace(config, iterations=config.iterations or _steps(training_views, *COARSE_STEPS))
 
 
-PRESETS: dict[str, TrainConfig] = {
-    "paper": TrainConfig(),
-    "laptop": TrainConfig(
-        iterations=0,
-        resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
-        growth=GrowthConfig(statistics_from=300, start=500, until=0.6, threshold=1e-4),
+def block_training(config: MethodConfig, views: int) -> TrainConfig:
+    """The settings of the training loop for one block with so many photographs."""
+    block, scale = config.block, config.block.scale_iterations
+    rates = config.training.rates
+    return replace(
+        config.training,
+        iterations=max(1, round(scale * (block.iterations or _steps(views, *BLOCK_STEPS)))),
+        resolutions=block.resolutions,
+        rates=replace(
+            rates,
+            offsets=(block.offset_rate * rates.offsets[0], block.offset_rate * rates.offsets[1]),
+            log_scales=(block.scale_rate * rates.log_scales[0], block.scale_rate * rates.log_scales[1]),
+        ),
+        growth=replace(
+            block.growth,
+            statistics_from=round(scale * block.growth.statistics_from),
+            start=round(scale * block.growth.start),
+        ),
+        compensation=block.compensation,
+    )
+
+
+def _steps(views: int, per_view: int, least: int, most: int) -> int:
+    return min(max(per_view * views, least), most)
+
+
+PRESETS: dict[str, MethodConfig] = {
+    "paper": MethodConfig(),
+    "laptop": MethodConfig(
+        training=TrainConfig(
+            iterations=0,
+            resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
+            growth=GrowthConfig(statistics_from=300, start=500, until=0.6, threshold=1e-4),
+        ),
+        block=BlockConfig(iterations=0, growth=GrowthConfig(statistics_from=100, start=300, threshold=1e-4)),
     ),
 }
 
@@ -169,30 +312,25 @@ def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> l
     return lines
 
 
-def validate(config: TrainConfig) -> list[str]:
-    """What is wrong with the settings, one sentence each; empty if nothing is."""
-    growth, problems = config.growth, []
-    if config.seed < 0 or config.anchors.appearance < 0 or config.anchors.voxel < 0:
-        problems.append("seed, anchors.appearance and anchors.voxel must not be negative")
-    if 0 < config.anchors.outlier_distance < 2:
-        problems.append("anchors.outlier_distance below 2 would drop ordinary points; give more, or 0 to keep all")
-    if growth.coarsest_cell <= 0 or growth.threshold < 0:
-        problems.append("growth.coarsest_cell must be positive and growth.threshold not negative")
-    if config.iterations < 0:
-        problems.append(f"iterations is {config.iterations}; it must be at least 1, or 0 for automatic")
-    if not config.resolutions or config.resolutions[0][0] != 0.0:
-        problems.append("resolutions must begin at share 0.0")
-    if any(factor < 1 for _, factor in config.resolutions):
-        problems.append("resolutions: factors are whole numbers of at least 1")
-    if [share for share, _ in config.resolutions] != sorted({share for share, _ in config.resolutions}):
-        problems.append("resolutions: shares must ascend")
-    if not 1 <= config.anchors.offsets <= 32:
-        problems.append(f"anchors.offsets is {config.anchors.offsets}; 1 to 32 are possible")
-    if growth.interval < 1 or growth.levels < 0:
-        problems.append("growth.interval must be at least 1 and growth.levels at least 0")
-    if not 0.0 <= config.loss.ssim_weight <= 1.0:
-        problems.append(f"loss.ssim_weight is {config.loss.ssim_weight}; it lies between 0 and 1")
-    for rate in dataclasses.fields(config.rates):
-        if min(getattr(config.rates, rate.name)) <= 0:
-            problems.append(f"rates.{rate.name} must be positive")
-    return problems
+def from_dict(kind: type, values: Mapping[str, Any], where: str = "settings") -> Any:
+    """The inverse of `to_dict` for a config class: what is not named keeps its default.
+
+    Raises ValueError, naming the setting, for one that the class does not have or of another shape.
+    """
+    hints = typing.get_type_hints(kind)
+    unknown = sorted(values.keys() - hints.keys())
+    if unknown:
+        raise ValueError(f"{where} has no {unknown[0]!r}")
+    taken = {}
+    for name, value in values.items():
+        hint = hints[name]
+        if dataclasses.is_dataclass(hint):
+            if not isinstance(value, Mapping):
+                raise ValueError(f"{where}.{name} is {value!r}, not a group of settings")
+            value = from_dict(typing.cast(type, hint), value, f"{where}.{name}")
+        taken[name] = _frozen(value)
+    return kind(**taken)
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(_frozen(item) for item in value) if isinstance(value, list) else value

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import shutil
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -51,11 +52,27 @@ class StageFolder:
         return status
 
     def set_status(self, state: str, **facts: Any) -> None:
-        """`state` is running, stopped, done or failed."""
-        write_json(self.status_file, {"state": state, **facts})
+        """`state` is queued, running, stopped, done or failed. The stage's key stays as `claim` wrote it."""
+        key = {"key": self.status()["key"]} if self.status_file.exists() and "key" in self.status() else {}
+        write_json(self.status_file, {"state": state, **facts, **key})
 
-    def is_done(self) -> bool:
-        return self.status()["state"] == "done" and self.model.exists()
+    def claim(self, key: str) -> None:
+        """Say for which settings (`stages.py`) this folder works from now on; what is there for others is deleted."""
+        if self.path.exists() and self.status().get("key", key) != key:
+            shutil.rmtree(self.path)
+        self.path.mkdir(parents=True, exist_ok=True)
+        write_json(self.status_file, {**self.status(), "key": key})
+
+    def is_done(self, key: str | None = None) -> bool:
+        """Trained to the end, for the settings of `key` where one is given."""
+        status = self.status()
+        return status["state"] == "done" and self.model.exists() and key in (None, status.get("key"))
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold this stage for this process; RunError if another one works on it."""
+        with _lock(self.path, fcntl.LOCK_EX):
+            yield
 
     def cut_log(self, iteration: int) -> None:
         """Drop log lines after `iteration` (and a half-written last one), so that a continued run repeats none."""
@@ -88,6 +105,21 @@ class RunFolder:
     @property
     def coarse(self) -> StageFolder:
         return StageFolder(self.path / "coarse")
+
+    def block(self, index: int) -> StageFolder:
+        return StageFolder(self.path / "blocks" / f"{index:02d}")
+
+    @property
+    def visibility(self) -> Path:
+        return self.path / "visibility"
+
+    @property
+    def partition(self) -> Path:
+        return self.path / "partition"
+
+    @property
+    def merged(self) -> StageFolder:
+        return StageFolder(self.path / "merged")
 
     @property
     def evaluation(self) -> Path:
@@ -138,21 +170,28 @@ class RunFolder:
         return settings
 
     @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Hold the run for this process; RunError if another one works on it."""
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            handle = (self.path / ".lock").open("w")
-        except OSError as error:
-            raise RunError(f"{self.path}: cannot be written ({error.strerror}). Choose another --output.") from error
-        with handle:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise RunError(
-                    f"{self.path}: another vdgs process works on this run. Wait for it or stop it."
-                ) from error
+    def locked(self, shared: bool = False) -> Iterator[None]:
+        """Hold the run for this process, or share it with others that do (blocks are trained side by side).
+
+        RunError if another process stands in the way.
+        """
+        with _lock(self.path, fcntl.LOCK_SH if shared else fcntl.LOCK_EX):
             yield
+
+
+@contextmanager
+def _lock(folder: Path, kind: int) -> Iterator[None]:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = (folder / ".lock").open("w")
+    except OSError as error:
+        raise RunError(f"{folder}: cannot be written ({error.strerror}). Choose another --output.") from error
+    with handle:
+        try:
+            fcntl.flock(handle, kind | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RunError(f"{folder}: another vdgs process works on this run. Wait for it or stop it.") from error
+        yield
 
 
 def _commit() -> str | None:

@@ -1,0 +1,41 @@
+"""Which settings each stage of a run depends on, so that a change invalidates exactly what depends on it.
+
+Every stage has a key: a digest of its own settings and of the keys of the stages before it. A finished stage is
+skipped while its key is the one that it was finished with.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import Any
+
+#: Each stage with the sections of config.yaml that it depends on and the stages it builds on.
+DEPENDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "coarse": (("capture", "training"), ()),
+    "partition": (("partition",), ("coarse",)),
+    "assignment": (("assignment",), ("partition",)),
+    "blocks": (("block",), ("assignment",)),
+    "merge": (("merge",), ("blocks",)),
+}
+
+
+@dataclass(frozen=True)
+class StageKeys:
+    """The key of every stage of a run."""
+
+    coarse: str
+    partition: str
+    assignment: str
+    blocks: str
+    merge: str
+
+
+def stage_keys(settings: dict[str, Any]) -> StageKeys:
+    """Keys from the sections of config.yaml."""
+    keys: dict[str, str] = {}
+    for stage, (sections, before) in DEPENDS.items():
+        content = [[name, settings[name]] for name in sections] + [keys[name] for name in before]
+        keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+    return StageKeys(**keys)
