@@ -144,7 +144,7 @@ class Prototype:
 
 def scenes_of_run(run: Path, views: int) -> list[tuple[str, Scene]]:
     """What the first test views of a trained run draw."""
-    from vdgs.evaluation.of_run import open_run
+    from vdgs.stages.opening import open_run
     from vdgs.render import decode_visible, gather_visible
 
     opened, scenes = open_run(run), []

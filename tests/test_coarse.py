@@ -17,7 +17,7 @@ import torch
 from captures_support import tiny_scene, write_colmap
 from vdgs.anchors import AnchorModel
 from vdgs.errors import VdgsError
-from vdgs.evaluation.of_run import open_run
+from vdgs.stages.opening import open_run
 
 SETTINGS = (
     "--preset", "laptop", "--iterations", "1500", "--save-every", "50", "--anchors.offsets", "3", "--up", "z",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int64
@@ -13,6 +13,10 @@ from vdgs.cameras import Camera
 from vdgs.kernels import native as kernels
 from vdgs.kernels.decode_types import Splats
 from vdgs.kernels.types import Raster
+
+
+#: What the rasteriser reads of splats.
+DRAWN = ("means_px", "conics", "depths", "colours", "opacities")
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,12 @@ def draw(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: 
         splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths,
         background, camera.width, camera.height, depth=depth,
     )  # fmt: skip
+
+
+def beside(first: Splats, second: Splats) -> Splats:
+    """Both drawn together; `source` and `volumes` stay those of the first alone."""
+    joined = {n: torch.cat([getattr(first, n), getattr(second, n)]) for n in DRAWN}
+    return replace(first, **joined)
 
 
 @torch.no_grad()

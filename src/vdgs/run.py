@@ -6,7 +6,7 @@ import fcntl
 import json
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +15,13 @@ from typing import Any
 import yaml
 
 from vdgs import __version__
-from vdgs.config import differences
+from vdgs.config import MethodConfig, differences, from_dict, to_dict
 from vdgs.errors import RunError
 from vdgs.files import read_json, write_json, write_text
+from vdgs.stages.keys import StageKeys, stage_keys
+
+#: The parts of config.yaml.
+SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
 
 
 @dataclass(frozen=True)
@@ -59,9 +63,21 @@ class StageFolder:
     def claim(self, key: str) -> None:
         """Say for which settings (`stages.py`) this folder works from now on; what is there for others is deleted."""
         if self.path.exists() and self.status().get("key", key) != key:
-            shutil.rmtree(self.path)
+            self.remove()
         self.path.mkdir(parents=True, exist_ok=True)
         write_json(self.status_file, {**self.status(), "key": key})
+
+    def remove(self) -> None:
+        """Delete what is here, but for the lock that a process may hold."""
+        for stale in self.path.iterdir():
+            if stale.is_dir():
+                shutil.rmtree(stale)
+            elif stale.name != ".lock":
+                stale.unlink()
+
+    def holds_work(self) -> bool:
+        """Something was trained here."""
+        return self.model.exists() or any(self.checkpoints.glob("*.json"))
 
     def is_done(self, key: str | None = None) -> bool:
         """Trained to the end, for the settings of `key` where one is given."""
@@ -109,6 +125,9 @@ class RunFolder:
     def block(self, index: int) -> StageFolder:
         return StageFolder(self.path / "blocks" / f"{index:02d}")
 
+    def block_folders(self) -> list[StageFolder]:
+        return [StageFolder(path) for path in sorted((self.path / "blocks").glob("[0-9]*"))]
+
     @property
     def visibility(self) -> Path:
         return self.path / "visibility"
@@ -116,6 +135,14 @@ class RunFolder:
     @property
     def partition(self) -> Path:
         return self.path / "partition"
+
+    def partition_facts(self) -> dict[str, Any]:
+        """What partition.json says; empty if the scene is not cut yet."""
+        file = self.partition / "partition.json"
+        facts = read_json(file) if file.exists() else {}
+        if not isinstance(facts, dict):
+            raise RunError(f"{file}: is damaged. Delete it and run: vdgs partition {self.path}")
+        return facts
 
     @property
     def merged(self) -> StageFolder:
@@ -125,13 +152,15 @@ class RunFolder:
     def evaluation(self) -> Path:
         return self.path / "evaluation"
 
-    def begin(self, settings: dict[str, Any]) -> None:
-        """Write the settings of a new run, or check that they are those of the run that is there.
+    def begin(self, settings: dict[str, Any], checked: Sequence[str] = SECTIONS) -> None:
+        """Write the settings of a new run, or check that those of the run that is there are the same.
 
-        Raises RunError with the differences if they are not, and if the folder holds something else.
+        Only the sections named in `checked` are compared. Raises RunError with the differences if they are not the
+        same, and if the folder holds something else.
         """
         if self.config_file.exists():
-            changed = differences(self.settings(), settings)
+            old = self.settings()
+            changed = differences({s: old[s] for s in checked}, {s: settings[s] for s in checked})
             if changed:
                 raise RunError(
                     f"{self.config_file}: this run was started with other settings:\n  "
@@ -151,14 +180,43 @@ class RunFolder:
                 f"{self.path}: holds other files ({', '.join(sorted(strangers)[:3])}) and no config.yaml. "
                 "Choose an empty or a new folder for --output."
             )
+        self._write(settings)
+
+    def change(self, settings: dict[str, Any], redo: bool) -> list[str]:
+        """Give a run other settings; returns what changed, one line each.
+
+        Raises RunError, with the differences, if trained work depends on what changed, unless `redo` allows to
+        lose it. Stages delete what was made for other settings when they next run (`StageFolder.claim`).
+        """
+        old = self.settings()
+        changed = differences(old, settings)
+        if not changed:
+            return []
+        before, after = stage_keys(old), stage_keys(settings)
+        lost = []
+        if before.coarse != after.coarse and self.coarse.holds_work():
+            lost.append("the coarse model")
+        blocks = [folder for folder in self.block_folders() if folder.holds_work()]
+        if before.blocks != after.blocks and blocks:
+            lost.append(f"{len(blocks)} blocks" if len(blocks) > 1 else "a block")
+        if lost and not redo:
+            raise RunError(
+                f"{self.config_file}: other settings than this run has:\n  " + "\n  ".join(changed)
+                + f"\nThey make {' and '.join(lost)} useless. Add --redo to train that again, give the old settings to "
+                "continue, or take another --output."
+            )  # fmt: skip
+        self._write(settings)
+        return changed
+
+    def _write(self, settings: dict[str, Any]) -> None:
         header = {"vdgs": {"version": __version__, "commit": _commit()}}
         write_text(self.config_file, yaml.safe_dump(header | settings, sort_keys=False, allow_unicode=True))
 
     def settings(self) -> dict[str, Any]:
-        """The settings of the run, without the header that says which version wrote them."""
+        """The settings of the run, every section whole, without the header that says which version wrote them."""
         if not self.config_file.exists():
             raise RunError(
-                f"{self.path}: is not a run folder (no config.yaml). Train first: vdgs coarse CAPTURE --output RUN"
+                f"{self.path}: is not a run folder (no config.yaml). Train first: vdgs run CAPTURE --output RUN"
             )
         try:
             settings = yaml.safe_load(self.config_file.read_text(encoding="utf-8"))
@@ -167,7 +225,21 @@ class RunFolder:
         if not isinstance(settings, dict) or not {"capture", "training"} <= settings.keys():
             raise RunError(f"{self.config_file}: is damaged or not of a vdgs run (no `capture` and `training`)")
         settings.pop("vdgs", None)
-        return settings
+        capture = settings.pop("capture")
+        try:
+            return {"capture": capture} | to_dict(from_dict(MethodConfig, settings))
+        except (ValueError, TypeError) as error:
+            raise RunError(f"{self.config_file}: holds settings that this version does not know ({error})") from error
+
+    def method(self) -> MethodConfig:
+        """The settings of the run but for the capture."""
+        settings = self.settings()
+        settings.pop("capture")
+        return from_dict(MethodConfig, settings)
+
+    def keys(self) -> StageKeys:
+        """The key of every stage, for the settings that config.yaml holds."""
+        return stage_keys(self.settings())
 
     @contextmanager
     def locked(self, shared: bool = False) -> Iterator[None]:

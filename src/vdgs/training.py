@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -19,13 +19,16 @@ from torch import Tensor
 from vdgs.anchors import TRAINED, Anchors
 from vdgs.cameras import Camera
 from vdgs.checkpoints import SavedState
+from vdgs.compensation import Compensated, Compensation, begin_cycle, low_visibility, update_cache
 from vdgs.config import TrainConfig
 from vdgs.decoder import Decoder
 from vdgs.errors import TrainingDiverged
-from vdgs.growth import Statistics, decide
+from vdgs.growth import Statistics, cycle_facts, decide
 from vdgs.kernels import native as kernels
+from vdgs.kernels.decode_types import Splats
 from vdgs.optimiser import Moments, Optimiser, rates_at
-from vdgs.render import decode_visible, draw, gather_visible
+from vdgs.render import beside, decode_visible, draw, gather_visible
+from vdgs.visibility import share_in_cycle
 
 #: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
 REFERENCE_HEIGHT = 10.0
@@ -53,6 +56,8 @@ class TrainingState:
     decoder: Decoder
     statistics: Statistics
     optimiser: Optimiser
+    #: Remembered gradients of compensated growth; None where growth is plain.
+    compensation: Compensation | None = None
     #: Smoothed loss, the smallest it has been, smoothed PSNR of training views.
     loss: float = math.nan
     best_loss: float = math.inf
@@ -74,6 +79,16 @@ class Stage:
     camera_height: float
     #: Colour behind the scene.
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    #: A block leaves the decoder as it is.
+    frozen_decoder: bool = False
+    #: Anchors that are drawn and never move: ring and context of a block.
+    surroundings: Anchors | None = None
+    #: Which places [p, 3] may get new anchors; None: all.
+    may_hold: Callable[[Tensor], Tensor] | None = None
+    #: How far the anchors at places [p, 3] move, from 0 to 1 of a full step; None: all of it.
+    mobility: Callable[[Tensor], Tensor] | None = None
+    #: Which training image of the whole capture each view is (for its appearance); None: the same number.
+    appearance_of: Sequence[int] | None = None
 
 
 @dataclass(frozen=True)
@@ -87,13 +102,18 @@ class StepReport:
     splats: int
     grown: int | None = None
     pruned: int | None = None
+    #: What a growth decision saw and did.
+    cycle: dict[str, Any] = field(default_factory=dict)
 
 
-def start_state(anchors: Anchors, decoder: Decoder) -> TrainingState:
+def start_state(anchors: Anchors, decoder: Decoder, stage: Stage) -> TrainingState:
+    """A state before the first step. The anchors' tensors are moved in place: give copies of what must stay."""
     n, k = len(anchors), anchors.offsets.shape[1]
     for tensor in decoder.tensors().values():
-        tensor.requires_grad_(True)
-    return TrainingState(0, anchors, decoder, Statistics.zeros(n, k), Optimiser.start(anchors, decoder))
+        tensor.requires_grad_(not stage.frozen_decoder)
+    compensation = Compensation.zeros(n, k) if stage.config.compensation.enabled else None
+    optimiser = Optimiser.start(anchors, decoder)
+    return TrainingState(0, anchors, decoder, Statistics.zeros(n, k), optimiser, compensation)
 
 
 def view_at(iteration: int, count: int, seed: int) -> int:
@@ -126,9 +146,10 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
 
     visible = gather_visible(state.anchors, camera)
     leaves = {name: getattr(visible.anchors, name).requires_grad_(True) for name in TRAINED}
-    splats = decode_visible(visible.anchors, state.decoder.for_image(view), camera)
+    weights = state.decoder.for_image(view if stage.appearance_of is None else stage.appearance_of[view])
+    splats = decode_visible(visible.anchors, weights, camera)
     splats.means_px.retain_grad()
-    raster = draw(splats, camera, _background(stage, iteration))
+    raster = draw(_with_surroundings(splats, stage, weights, camera), camera, _background(stage, iteration))
     photometric = kernels.photometric_loss(raster.image, target, mask, ssim_weight=config.loss.ssim_weight)
     loss = photometric.loss
     if config.loss.volume_weight and len(splats.volumes):
@@ -139,13 +160,7 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
     if loss.requires_grad:
         loss.backward()
-
-    rates = rates_at(config.rates, iteration / config.iterations)
-    gradients = {name: leaf.grad for name, leaf in leaves.items()}
-    finite = state.optimiser.update_anchors(state.anchors, visible.rows, gradients, rates, iteration + 1)
-    finite &= state.optimiser.update_decoder(state.decoder, rates, iteration + 1)
-    if not finite:
-        raise TrainingDiverged(f"A gradient is not a finite number at iteration {iteration + 1}.")
+    _move(state, stage, visible.rows, leaves)
 
     growing = iteration + 1 <= config.growth.until * config.iterations
     if growing and iteration + 1 > config.growth.statistics_from and splats.means_px.grad is not None:
@@ -158,26 +173,87 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
             camera.height,
         )
     state.iteration += 1
-    grown = pruned = None
+    report = StepReport(value, float(photometric.l1), float(photometric.ssim), len(visible.rows), len(splats.opacities))
     if growing and state.iteration >= config.growth.start and state.iteration % config.growth.interval == 0:
-        grown, pruned = grow(state, stage)
+        report = replace(report, **grow(state, stage))
     if state.iteration % REORDER_INTERVAL == 0:
         reorder(state)
-    l1, ssim = float(photometric.l1), float(photometric.ssim)
     _smooth(state, value, raster.image.detach(), target, mask)
-    return StepReport(value, l1, ssim, len(visible.rows), len(splats.opacities), grown, pruned)
+    return report
 
 
-def grow(state: TrainingState, stage: Stage) -> tuple[int, int]:
-    """Add and remove anchors with their moments and statistics; returns how many of each."""
-    generator = torch.Generator().manual_seed(stage.config.seed * 1_000_003 + state.iteration)
-    decision = decide(state.anchors, state.statistics, stage.voxel, stage.config.growth, generator)
+def _with_surroundings(splats: Splats, stage: Stage, weights, camera: Camera) -> Splats:  # type: ignore[no-untyped-def]
+    """The splats, and those of the frozen anchors around a block: drawn, but out of autograd's sight."""
+    if stage.surroundings is None or not len(stage.surroundings):
+        return splats
+    with torch.no_grad():
+        around = decode_visible(gather_visible(stage.surroundings, camera).anchors, weights, camera)
+    return beside(splats, around)
+
+
+def _move(state: TrainingState, stage: Stage, rows: Tensor, leaves: dict[str, Tensor]) -> None:
+    """One step of Adam for the visible anchors (`leaves` hold their values before it) and the decoder."""
+    config, step = stage.config, state.iteration + 1
+    rates = rates_at(config.rates, state.iteration / config.iterations)
+    gradients = {name: leaf.grad for name, leaf in leaves.items()}
+    finite = state.optimiser.update_anchors(state.anchors, rows, gradients, rates, step)
+    finite &= state.optimiser.update_decoder(state.decoder, rates, step)
+    if not finite:
+        raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")
+    if stage.mobility is not None and len(rows):
+        share = stage.mobility(state.anchors.positions[rows])
+        for name, leaf in leaves.items():
+            before, tensor = leaf.detach(), getattr(state.anchors, name)
+            part = share.reshape(-1, *[1] * (before.ndim - 1))
+            tensor[rows] = torch.where(part < 1, before + part * (tensor[rows] - before), tensor[rows])
+
+
+def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:
+    """Add and remove anchors with their moments and statistics. Returns what StepReport says of it."""
+    config = stage.config
+    generator = torch.Generator().manual_seed(config.seed * 1_000_003 + state.iteration)
+    compensated, seen = _compensate(state, stage)
+    decision = decide(
+        state.anchors, state.statistics, stage.voxel, config.growth, generator,
+        compensated=compensated,
+        surroundings=None if stage.surroundings is None else stage.surroundings.positions,
+        may_hold=stage.may_hold,
+    )  # fmt: skip
     added = len(decision.added)
     kept = torch.cat([decision.kept, torch.ones(added, dtype=torch.bool)])
     state.anchors = state.anchors.extended(decision.added).select(kept)
     state.statistics = state.statistics.extended(added).select(kept)
     state.optimiser.anchors.rebuild(added, kept)
-    return added, decision.pruned
+    if state.compensation is not None:
+        state.compensation = state.compensation.extended(added).select(kept)
+        begin_cycle(state.compensation, state.statistics)
+    return {"grown": added, "pruned": decision.pruned, "cycle": cycle_facts(decision, compensated) | seen}
+
+
+def _compensate(state: TrainingState, stage: Stage) -> tuple[Compensated | None, dict[str, Any]]:
+    """Close a growth cycle of compensated growth (eqs. 8-10): who is in L, and what is added for them."""
+    if state.compensation is None:
+        return None, {}
+    config = stage.config
+    cameras = [stage.images.camera(view) for view in views_in_cycle(state.iteration, stage)]
+    share = share_in_cycle(state.anchors.positions, cameras)
+    low, threshold = low_visibility(share, config.compensation)
+    update_cache(state.compensation, state.statistics, low, config.compensation)
+    compensated = state.compensation.compensated(low, threshold, config.growth, config.compensation)
+    return compensated, {"cycle_cameras": len(cameras), "t_low": threshold}
+
+
+def views_in_cycle(iteration: int, stage: Stage) -> list[int]:
+    """The views, each once, that were used in the growth cycle which ends after `iteration` steps.
+
+    A cycle lasts from one growth decision to the next; the first one starts with the statistics.
+    """
+    growth = stage.config.growth
+    begin = iteration - growth.interval
+    if begin < growth.start:
+        begin = min(growth.statistics_from, begin)
+    used = range(max(begin, 0), iteration)
+    return sorted({view_at(each, stage.image_count, stage.config.seed) for each in used})
 
 
 def reorder(state: TrainingState) -> None:
@@ -185,6 +261,8 @@ def reorder(state: TrainingState) -> None:
     order = kernels.morton_order(state.anchors.positions)
     state.anchors = state.anchors.select(order)
     state.statistics = state.statistics.select(order)
+    if state.compensation is not None:
+        state.compensation = state.compensation.select(order)
     state.optimiser.anchors.rebuild(0, order)
 
 
@@ -262,12 +340,14 @@ def to_saved(state: TrainingState) -> SavedState:
     for group, moments in (("anchors", state.optimiser.anchors), ("decoder", state.optimiser.decoder)):
         tensors |= {f"first.{group}.{k}": v for k, v in moments.first.items()}
         tensors |= {f"second.{group}.{k}": v for k, v in moments.second.items()}
+    if state.compensation is not None:
+        tensors |= {f"compensation.{k}": v for k, v in state.compensation.tensors().items()}
     facts = {"loss": repr(state.loss), "best_loss": repr(state.best_loss), "psnr": repr(state.psnr),
              "seconds": state.seconds, "peak_memory_bytes": state.peak_memory_bytes}  # fmt: skip
     return SavedState(state.iteration, facts, tensors)
 
 
-def from_saved(saved: SavedState) -> TrainingState:
+def from_saved(saved: SavedState, stage: Stage) -> TrainingState:
     """The inverse of `to_saved`, bit for bit. Raises KeyError if a tensor is missing."""
 
     def part(prefix: str) -> dict[str, Tensor]:
@@ -275,12 +355,14 @@ def from_saved(saved: SavedState) -> TrainingState:
 
     anchors = Anchors(**part("anchors."))
     decoder = Decoder.from_tensors(part("decoder."))
-    state = start_state(anchors, decoder)
+    state = start_state(anchors, decoder, stage)
     state.statistics = Statistics(**part("statistics."))
     state.optimiser = Optimiser(
         Moments(part("first.anchors."), part("second.anchors.")),
         Moments(part("first.decoder."), part("second.decoder.")),
     )
+    if state.compensation is not None:
+        state.compensation = Compensation(**part("compensation."))
     state.iteration = saved.iteration
     state.loss, state.best_loss = float(saved.facts["loss"]), float(saved.facts["best_loss"])
     state.psnr, state.seconds = float(saved.facts["psnr"]), float(saved.facts["seconds"])

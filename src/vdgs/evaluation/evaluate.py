@@ -49,6 +49,8 @@ class RenderedView(Protocol):
 class ModelFacts:
     """What the evaluation reports of the model but cannot measure itself; None is unknown."""
 
+    #: "coarse" or "merged".
+    model: str | None = None
     n_anchors: int | None = None
     model_bytes: int | None = None
     train_seconds: float | None = None

@@ -2,85 +2,44 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Int32
 from rich.console import Console
-from torch import Tensor
 
 from vdgs.anchors import AnchorModel
-from vdgs.captures.capture import Capture, View
-from vdgs.captures.facts import refuse_another_capture
+from vdgs.cameras import Camera
+from vdgs.captures.capture import View
 from vdgs.captures.images import ImageCache
-from vdgs.captures.loading import load_capture
-from vdgs.captures.options import CaptureOptions
 from vdgs.errors import RunError
 from vdgs.evaluation.evaluate import EvaluationSettings, ModelFacts, evaluate
 from vdgs.evaluation.lpips import load_lpips
-from vdgs.kernels import native as kernels
 from vdgs.render import render, render_values
-from vdgs.run import RunFolder
+from vdgs.stages.opening import ModelName, TrainedRun, open_run
+from vdgs.visibility import views_of
 
 #: Photographs kept decoded during an evaluation, which needs one at a time.
 EVALUATION_IMAGES_BYTES = 256_000_000
 
 
-@dataclass(frozen=True)
-class TrainedRun:
-    """A run opened for looking at it: its capture as it was trained on, and its model."""
+def evaluate_run(
+    path: Path, lpips_weights: Path | None, bins: int, console: Console, which: ModelName = "best"
+) -> TrainedRun:
+    """Measure a model of a run on the test views and print a table.
 
-    folder: RunFolder
-    capture: Capture
-    model: AnchorModel
-    model_path: Path
-    status: dict[str, Any]
-
-    def views_of_anchors(self) -> Int32[Tensor, " n"]:
-        """V_i: how many training cameras hold each anchor in their frustum."""
-        return kernels.count_views(self.model.anchors.positions, [view.camera for view in self.capture.train_views])
-
-
-def open_run(path: Path) -> TrainedRun:
-    """Open a run. Raises RunError if it is none or not trained, CaptureError if its photographs are gone."""
-    folder = RunFolder(path)
-    settings = dict(folder.settings()["capture"])
-    root = Path(settings.pop("path"))
-    model_path = folder.coarse.model
-    if not model_path.exists():
-        status = folder.coarse.status()
-        raise RunError(
-            f"{path}: has no trained model yet (coarse stage: {status['state']}). Run the same `vdgs coarse` command "
-            "again: it continues from the last saved state."
-        )
-    capture = load_capture(root, options_from(settings, folder.config_file))
-    model = AnchorModel.load(model_path)
-    refuse_another_capture(model_path, model.facts.get("capture", {}), capture)
-    return TrainedRun(folder, capture, model, model_path, folder.coarse.status())
-
-
-def options_from(settings: dict[str, Any], source: Path) -> CaptureOptions:
-    """CaptureOptions from the plain values of config.yaml. Raises RunError on unknown settings."""
-    paths = {"gps", "georef", "test_list", "undistorted_folder"}
-    values: Any = {name: Path(v) if name in paths and v is not None else v for name, v in settings.items()}
-    try:
-        return CaptureOptions(**values)
-    except TypeError as error:
-        raise RunError(f"{source}: holds capture settings that this version does not know ({error})") from error
-
-
-def evaluate_run(path: Path, lpips_weights: Path | None, bins: int, console: Console) -> None:
-    """Measure a run's test views; writes RUN/evaluation and prints a table."""
+    Writes RUN/evaluation; RUN/coarse/evaluation for the coarse model of a run that has a merged one too, or if the
+    coarse model was asked for by name.
+    """
     if bins < 1:
         raise RunError(f"--bins is {bins}; it must be at least 1")
-    run = open_run(path)
+    run = open_run(path, which)
+    output = run.folder.coarse.path / "evaluation" if which == "coarse" else run.folder.evaluation
     views = run.capture.test_views
-    counts = run.views_of_anchors().float()
     index = {view.name: i for i, view in enumerate(views)}
     lpips, note = load_lpips(lpips_weights)
     facts = ModelFacts(
+        model=run.name,
         n_anchors=len(run.model.anchors),
         model_bytes=run.model_path.stat().st_size,
         train_seconds=run.status.get("seconds"),
@@ -96,8 +55,8 @@ def evaluate_run(path: Path, lpips_weights: Path | None, bins: int, console: Con
             views,
             load_image=lambda view: images.get(index[view.name]).image.numpy(),
             render=lambda camera: render(run.model, camera),
-            output=run.folder.evaluation,
-            visibility_map=lambda camera: render_values(run.model, counts, camera).numpy(),
+            output=output,
+            visibility_map=visibility_map(run),
             lpips=lpips,
             lpips_note=note,
             load_mask=load_mask,
@@ -105,4 +64,16 @@ def evaluate_run(path: Path, lpips_weights: Path | None, bins: int, console: Con
             settings=EvaluationSettings(visibility_bins=bins),
             console=console,
         )
-    console.print(f"pictures and figures: {run.folder.evaluation}", highlight=False)
+    console.print(f"pictures and figures: {output}", highlight=False)
+    return run
+
+
+def visibility_map(run: TrainedRun) -> Callable[[Camera], np.ndarray]:
+    """V at each pixel of a view, drawn with the coarse model whatever model is measured.
+
+    So the same pixels are compared between the models of a run.
+    """
+    model = run.model if run.name == "coarse" else AnchorModel.load(run.folder.coarse.model)
+    cameras = [view.camera for view in run.capture.train_views]
+    counts = views_of(model.anchors.positions, cameras).float()
+    return lambda camera: render_values(model, counts, camera).numpy()

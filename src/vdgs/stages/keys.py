@@ -36,6 +36,8 @@ def stage_keys(settings: dict[str, Any]) -> StageKeys:
     """Keys from the sections of config.yaml."""
     keys: dict[str, str] = {}
     for stage, (sections, before) in DEPENDS.items():
-        content = [[name, settings[name]] for name in sections] + [keys[name] for name in before]
+        # Where the capture lies is not what it is: a capture that moved keeps its results.
+        own = {name: {k: v for k, v in settings[name].items() if (name, k) != ("capture", "path")} for name in sections}
+        content = [own, *(keys[name] for name in before)]
         keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
     return StageKeys(**keys)

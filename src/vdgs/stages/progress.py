@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import resource
-import sys
 import time
 from collections import deque
 from typing import Any, TextIO
@@ -24,12 +22,6 @@ LOG_INTERVAL = 50
 PLAIN_SECONDS = 15.0
 #: What TensorBoard shows.
 BOARD = ("loss", "l1", "ssim", "psnr_smoothed", "anchors", "splats")
-
-
-def peak_memory_bytes() -> int:
-    """Largest resident size of this process so far."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return int(peak if sys.platform == "darwin" else peak * 1024)
 
 
 class TrainingProgress:
@@ -74,6 +66,14 @@ class TrainingProgress:
         (then, first), (now, last) = self._recent[0], self._recent[-1]
         return (last - first) / (now - then) if now > then else 0.0
 
+    def facts(self, state: TrainingState) -> dict[str, Any]:
+        """Where training stands, for status.json."""
+        return {
+            "iteration": state.iteration, "iterations": self._config.iterations, "anchors": len(state.anchors),
+            "psnr_training": None if math.isnan(state.psnr) else state.psnr, "seconds": round(state.seconds, 1),
+            "seconds_left": round(self._seconds_left(state)), "peak_memory_bytes": state.peak_memory_bytes,
+        }  # fmt: skip
+
     def flush(self) -> None:
         self._log.flush()
 
@@ -84,8 +84,11 @@ class TrainingProgress:
             f"{len(state.anchors):,} anchors  {self.speed():.1f} it/s  {memory:.1f} GB"
         )
 
+    def _seconds_left(self, state: TrainingState) -> float:
+        return (self._config.iterations - state.iteration) / max(self.speed(), 1e-3)
+
     def _time_left(self, state: TrainingState) -> str:
-        seconds = int((self._config.iterations - state.iteration) / max(self.speed(), 1e-9))
+        seconds = int(self._seconds_left(state))
         return f"{seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 
     def _write(self, state: TrainingState, report: StepReport) -> None:
@@ -96,6 +99,7 @@ class TrainingProgress:
             "downscale": downscale_at(state.iteration - 1, self._config),
             "grown": report.grown, "pruned": report.pruned, "seconds": round(state.seconds, 3),
             "iterations_per_second": round(self.speed(), 3), "memory_bytes": self._process.memory_info().rss,
+            **report.cycle,
         }  # fmt: skip
         self._log.write(json.dumps(record) + "\n")
         if self._board is not None:

@@ -1,0 +1,187 @@
+"""Block training (section III-B): one block, from the coarse anchors of its place, with its own cameras.
+
+The decoder is frozen, so that blocks stay of one scene. What lies around the block's core is drawn and never moves:
+the ring out to its widened boundary and, as context, all else that its cameras see (choice: else every pixel that no
+anchor covers would push the anchors at the boundary to fill the hole).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import shapely
+import torch
+from jaxtyping import Bool, Float, Int64
+from rich.console import Console
+from torch import Tensor
+
+from vdgs import __version__
+from vdgs.anchors import AnchorModel, Anchors
+from vdgs.cameras import Camera
+from vdgs.captures.capture import Capture
+from vdgs.captures.facts import capture_facts
+from vdgs.captures.images import ImageCache
+from vdgs.config import BlockConfig, block_training
+from vdgs.errors import RunError
+from vdgs.kernels import native as kernels
+from vdgs.partition.assignment import load_scores
+from vdgs.partition.blocks import Block, Blocks, load_blocks
+from vdgs.run import RunFolder, StageFolder
+from vdgs.run_options import WatchOptions
+from vdgs.stages.coarse import camera_height, image_budget, note_without_growth
+from vdgs.stages.opening import open_run
+from vdgs.stages.watching import continue_or_start, finish, train_watched
+from vdgs.training import Stage, start_state
+
+#: Cells on each side of the table of the ramp.
+RAMP_CELLS = 512
+
+
+@dataclass(frozen=True)
+class BlockAnchors:
+    """The coarse anchors as one block sees them."""
+
+    #: What training moves.
+    own: Anchors
+    #: What is drawn and never moves.
+    surroundings: Anchors
+
+
+def train_block(path: Path, index: int, options: WatchOptions, console: Console) -> None:
+    """Train, or continue, one block of a run; nothing if it is finished.
+
+    Works beside other blocks of the run, in this or in other processes. Raises RunError if the run is not cut into
+    blocks or has no such block, and what training raises (see `train_watched`).
+    """
+    options.check()
+    run = RunFolder(path)
+    with run.locked(shared=True):
+        blocks = blocks_of(run)
+        if not 0 <= index < len(blocks):
+            raise RunError(f"{path}: has blocks 0 to {len(blocks) - 1}; there is no block {index}")
+        folder, key = run.block(index), run.keys().blocks
+        with folder.locked():
+            if folder.is_done(key):
+                console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
+                return
+            folder.claim(key)
+            _train(run, index, blocks, options, console)
+
+
+def blocks_of(run: RunFolder) -> Blocks:
+    """The blocks of a run, with cameras. Raises RunError unless they were made with the run's settings."""
+    facts, keys = run.partition_facts(), run.keys()
+    if (facts.get("key"), facts.get("assignment_key")) != (keys.partition, keys.assignment):
+        raise RunError(f"{run.path}: is not cut into blocks yet, or with other settings. Run: vdgs partition {run.path}")
+    return load_blocks(run.partition / "blocks.geojson")
+
+
+def views_of_block(run: RunFolder, capture: Capture, index: int) -> list[int]:
+    """Which training views, by number, serve a block."""
+    _, _, assignment = load_scores(run.partition / "scores.npz")
+    if len(assignment.cameras) != len(capture.train_views):
+        raise RunError(f"{run.partition / 'scores.npz'}: is of another capture. Run: vdgs partition {run.path}")
+    return [int(view) for view in np.flatnonzero(assignment.cameras[:, index])]
+
+
+def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, console: Console) -> None:
+    opened, folder, method = open_run(run.path, "coarse"), run.block(index), run.method()
+    capture, coarse = opened.capture, opened.model
+    chosen = views_of_block(run, capture, index)
+    views = [capture.train_views[i] for i in chosen]
+    facts = {"capture": capture_facts(capture), "version": __version__, "block": index, "views": len(views)}
+    split = split_anchors(coarse.anchors, blocks, index, [view.camera for view in views], method.block)
+    if not views or not len(split.own):
+        _keep_coarse(folder, coarse, split, facts, len(views), console)
+        return
+    config = block_training(method, len(views))
+    note_without_growth(config, console)
+    factors = tuple(sorted({factor for _, factor in config.resolutions}))
+    with ImageCache(views, image_budget(options), downscales=factors) as images:
+        stage = Stage(
+            config, images, len(views), coarse.voxel, camera_height(capture), coarse.background,
+            frozen_decoder=True, surroundings=split.surroundings,
+            may_hold=holds(blocks, index, method.block), mobility=ramp(blocks.items[index], method.block),
+            appearance_of=chosen,
+        )  # fmt: skip
+        state = continue_or_start(folder, stage, lambda: start_state(split.own, coarse.decoder, stage), console)
+        console.print(
+            f"block {index}: {len(views)} of {len(capture.train_views)} training views, {len(split.own):,} anchors of "
+            f"its own, {len(split.surroundings):,} around it, {config.iterations:,} iterations",
+            highlight=False,
+        )
+        train_watched(folder, state, stage, options, console)
+    model = AnchorModel(state.anchors, state.decoder, coarse.voxel, coarse.background, facts | {"iterations": state.iteration})
+    finish(folder, state, model, console)
+
+
+def _keep_coarse(
+    folder: StageFolder, coarse: AnchorModel, split: BlockAnchors, facts: dict, views: int, console: Console
+) -> None:  # fmt: skip
+    """A block that cannot be trained keeps what the coarse model has there, and says why."""
+    why = "no camera sees it" if not views else "it holds no anchor"
+    AnchorModel(split.own, coarse.decoder, coarse.voxel, coarse.background, facts | {"iterations": 0}).save(folder.model)
+    folder.set_status("done", iteration=0, iterations=0, anchors=len(split.own), seconds=0.0, why=why)
+    console.print(f"[yellow]note[/] block {facts['block']} stays as the coarse model has it: {why}", highlight=False)
+
+
+def places(positions: Float[Tensor, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    """x and y of anchors, in the precision in which places have owners."""
+    return positions[:, :2].double().numpy()
+
+
+def split_anchors(
+    anchors: Anchors, blocks: Blocks, index: int, cameras: Sequence[Camera], config: BlockConfig
+) -> BlockAnchors:
+    """What a block moves and what it only draws.
+
+    Own are the anchors that the block owns (with a ring that is not frozen: that it reaches). Around it are those that
+    one of its cameras may draw: the ring and, with `config.context`, everything else.
+    """
+    place = places(anchors.positions)
+    core, reached = blocks.owner(place) == index, blocks.reaches(index, place)
+    own = core if config.ring == "frozen" else reached
+    around = torch.from_numpy(~own if config.context else reached & ~own)
+    drawn = torch.zeros(len(anchors), dtype=torch.bool)
+    for camera in cameras:
+        drawn[kernels.cull(anchors.positions, anchors.log_scales, camera)] = True
+    return BlockAnchors(anchors.select(torch.from_numpy(own)), anchors.select(around & drawn))
+
+
+def holds(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor]:
+    """Which places may get new anchors: those of which the merge keeps what stands there."""
+
+    def inside(positions: Float[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
+        place = places(positions)
+        kept = blocks.owner(place) == index if config.ring == "frozen" else blocks.reaches(index, place)
+        return torch.from_numpy(kept)
+
+    return inside
+
+
+def ramp(block: Block, config: BlockConfig) -> Callable[[Tensor], Tensor] | None:
+    """How far anchors move in a ring that is a ramp: 1 in the core, falling linearly to 0 at the widened boundary.
+
+    Read from a table over the block, since it is asked in every step.
+    """
+    if config.ring != "ramp":
+        return None
+    low, high = np.array(block.expanded.bounds[:2]), np.array(block.expanded.bounds[2:])
+    centres = (np.indices((RAMP_CELLS, RAMP_CELLS)).reshape(2, -1).T + 0.5) / RAMP_CELLS * (high - low) + low
+    points = shapely.points(centres)
+    inwards, outwards = shapely.distance(block.core, points), shapely.distance(block.expanded.exterior, points)
+    share = np.where(shapely.contains(block.expanded, points), outwards / np.maximum(inwards + outwards, 1e-12), 0.0)
+    table = torch.from_numpy(np.where(inwards > 0, share, 1.0).astype(np.float32).reshape(RAMP_CELLS, RAMP_CELLS))
+    origin, cell = torch.from_numpy(low), torch.from_numpy((high - low) / RAMP_CELLS)
+
+    def mobility(positions: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
+        cells: Int64[Tensor, "p 2"] = ((positions[:, :2].double() - origin) / cell).floor().long()
+        inside = ((cells >= 0) & (cells < RAMP_CELLS)).all(1)
+        cells = cells.clamp(0, RAMP_CELLS - 1)
+        # A place beyond the table that the block owns (the nearest core) moves as the core does.
+        return torch.where(inside, table[cells[:, 0], cells[:, 1]], torch.ones(()))
+
+    return mobility

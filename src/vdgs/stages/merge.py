@@ -1,0 +1,70 @@
+"""Trained blocks become one scene (end of section III-B)."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from rich.console import Console
+
+from vdgs.anchors import AnchorModel
+from vdgs.errors import RunError
+from vdgs.memory import forget_peak, peak_memory_bytes
+from vdgs.merging import merge
+from vdgs.run import RunFolder
+from vdgs.stages.block import blocks_of, views_of_block
+from vdgs.stages.opening import open_run
+
+
+def merge_run(path: Path, incomplete: bool, console: Console) -> None:
+    """Merge the blocks of a run into RUN/merged; nothing if they are merged already.
+
+    Raises RunError if a block is missing or failed, unless `incomplete`: the coarse anchors then stand in for it.
+    """
+    run = RunFolder(path)
+    with run.locked():
+        key, keys = run.keys().merge, run.keys()
+        blocks = blocks_of(run)
+        done = [run.block(index).is_done(keys.blocks) for index in range(len(blocks))]
+        status = run.merged.status()
+        if run.merged.is_done(key) and status.get("blocks_trained") == sum(done):
+            console.print(f"{run.merged.model}: already merged; nothing to do", highlight=False)
+            return
+        if not all(done) and not incomplete:
+            _refuse(run, done)
+        forget_peak()
+        began = time.monotonic()
+        opened = open_run(path, "coarse")
+        capture, coarse = opened.capture, opened.model
+        cameras = [
+            [capture.train_views[i].camera for i in views_of_block(run, capture, index)] for index in range(len(blocks))
+        ]
+        trained = [AnchorModel.load(run.block(i).model) if whole else None for i, whole in enumerate(done)]
+        merged, facts = merge(coarse, trained, blocks, cameras, run.method().merge, allow_missing=incomplete)
+        run.merged.claim(key)
+        merged.save(run.merged.model)
+        trained_in = [run.block(i).status() for i, whole in enumerate(done) if whole]
+        run.merged.set_status(
+            "done", anchors=len(merged.anchors), blocks_trained=sum(done), blocks=facts,
+            seconds=opened.status.get("seconds", 0.0) + sum(each.get("seconds", 0.0) for each in trained_in),
+            iterations=opened.status.get("iteration", 0) + sum(each.get("iteration", 0) for each in trained_in),
+            peak_memory_bytes=max(each.get("peak_memory_bytes") or 0 for each in [opened.status, *trained_in]),
+            merge_seconds=time.monotonic() - began, merge_peak_memory_bytes=peak_memory_bytes(),
+        )  # fmt: skip
+    console.print(
+        f"merged {sum(done)} of {len(blocks)} blocks: {len(coarse.anchors):,} coarse anchors became "
+        f"{len(merged.anchors):,}\nmodel: {run.merged.model}",
+        highlight=False,
+    )
+
+
+def _refuse(run: RunFolder, done: list[bool]) -> None:
+    lines = []
+    for index, whole in enumerate(done):
+        if not whole:
+            status = run.block(index).status()
+            lines.append(f"block {index} is {status['state']}" + (f": {status['why']}" if status.get("why") else ""))
+    raise RunError(
+        f"{run.path}: not all blocks are trained:\n  " + "\n  ".join(lines)
+        + f"\nTrain them with `vdgs train {run.path}`, or give --incomplete to let the coarse model stand in for them."
+    )  # fmt: skip

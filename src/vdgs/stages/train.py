@@ -1,0 +1,88 @@
+"""All blocks of a run, several at once, each in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import psutil
+from rich.console import Console
+
+from vdgs.errors import RunError
+from vdgs.executors.local import Job, default_jobs, run_jobs
+from vdgs.partition.blocks import Blocks
+from vdgs.run import RunFolder
+from vdgs.run_options import WatchOptions
+from vdgs.stages.block import blocks_of
+from vdgs.stages.watching import Stopped
+
+#: Rough memory of a process that trains a block: what is imported, and each anchor that it may hold once it has grown.
+PROCESS_BYTES, ANCHOR_BYTES, GROWTH = 400_000_000, 2_500, 2.0
+
+
+def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console) -> None:
+    """Train, or continue, all blocks of a run that are not finished.
+
+    `jobs` processes at once; 0 takes as many as cores and memory allow. Raises RunError if a block failed (the others
+    are trained first), Stopped after Ctrl-C or SIGTERM (every block saved).
+    """
+    options.check()
+    run = RunFolder(path)
+    with run.locked(shared=True):
+        blocks, key = blocks_of(run), run.keys().blocks
+        _remove_beyond(run, len(blocks))
+        left = [index for index in range(len(blocks)) if not run.block(index).is_done(key)]
+        if not left:
+            console.print(f"{path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
+            return
+        free = psutil.virtual_memory().available
+        at_once, threads = default_jobs(len(left), psutil.cpu_count() or 1, free, _block_bytes(run, blocks))
+        if jobs:
+            at_once, threads = min(jobs, len(left)), max(1, (psutil.cpu_count() or 1) // min(jobs, len(left)))
+        budget = options.image_memory_gb or free / 4e9
+        console.print(
+            f"{len(left)} of {len(blocks)} blocks to train, {at_once} at once with {threads} thread(s) each",
+            highlight=False,
+        )
+        began = time.monotonic()
+        for index in left:
+            run.block(index).claim(key)
+            run.block(index).set_status("queued")
+        commands = [_job(run, index, threads, budget / at_once, options) for index in left]
+        outcomes = run_jobs(commands, at_once=at_once, retries=2, console=console)
+    if any(outcome.state == "stopped" for outcome in outcomes):
+        raise Stopped("Stopped; every block that was training is saved. The same command continues.")
+    failed = [outcome for outcome in outcomes if outcome.state != "done"]
+    if failed:
+        raise RunError(
+            f"{path}: {len(failed)} of {len(blocks)} blocks failed:\n  "
+            + "\n  ".join(f"block {outcome.index}: {outcome.why}" for outcome in failed)
+            + f"\nTheir output is in {path}/blocks/NN/output.log. The same command tries them again."
+        )
+    console.print(f"blocks trained in {(time.monotonic() - began) / 60:.1f} min", highlight=False)
+
+
+def _job(run: RunFolder, index: int, threads: int, image_gb: float, options: WatchOptions) -> Job:
+    command = [
+        sys.executable, "-m", "vdgs.cli", "train", str(run.path), "--block", str(index), "--threads", str(threads),
+        "--image-memory-gb", f"{image_gb:.3f}", "--save-every", str(options.save_every),
+    ]  # fmt: skip
+    if options.tensorboard:
+        command.append("--tensorboard")
+    return Job(index, run.block(index), command, dict(os.environ))
+
+
+def _remove_beyond(run: RunFolder, count: int) -> None:
+    """Delete blocks of an earlier cut into more of them."""
+    for folder in run.block_folders():
+        if int(folder.path.name) >= count:
+            folder.remove()
+
+
+def _block_bytes(run: RunFolder, blocks: Blocks) -> int:
+    """Memory that the largest block may need, from its anchors, those around it and its photographs."""
+    largest = max(each["anchors"] for each in run.partition_facts()["blocks"])
+    everything = sum(each["anchors"] for each in run.partition_facts()["blocks"])
+    return int(PROCESS_BYTES + ANCHOR_BYTES * GROWTH * largest + 300 * everything)
