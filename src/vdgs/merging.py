@@ -1,8 +1,7 @@
 """Trained blocks become one scene: every place takes its anchors from exactly one block.
 
-The owner of a place depends on x and y alone (`Blocks.owner`), so merging is a selection: no anchor is changed, averaged
-or added. A block's training moves, grows and prunes only what its cameras see; where they see nothing, its anchors are
-the coarse ones still, and so is the merged scene.
+Merging is a selection by place: no anchor is changed, averaged or added. A block's training moves, grows and prunes
+only what its cameras see; where they see nothing, its anchors are the coarse ones still, and so is the merged scene.
 
 Symbols: V_i, the number of cameras that hold anchor i in their frustum (section III-B of the paper).
 """
@@ -40,8 +39,8 @@ def merge(
     unseen (kept, but in the frustum of none of the block's cameras).
 
     A trained model holds the anchors that its block was free to move: those that it owns, and those of its ring unless
-    that was frozen. The result keeps, block after block and in their order, the anchors of each block at the places that
-    the rule gives to it. With `allow_missing` the coarse anchors stand in at places whose owner is None.
+    that was frozen. The result keeps, block after block and in their order, the anchors of each block at the places
+    that the rule gives to it. With `allow_missing` the coarse anchors stand in at places whose owner is None.
     Memory: one copy of the merged anchors beside the trained ones.
 
     Raises VdgsError for a missing block (unless allowed), and for a block that was not trained from `coarse`.

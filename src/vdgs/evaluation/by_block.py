@@ -1,23 +1,23 @@
 """Quality by block, and what the seams between blocks cost.
 
-Every pixel of a test view is labelled with the block that owns the place it shows. PSNR is then pooled by block, and the
-error near the borders of the labels is held against the error elsewhere. Borders may happen to lie in places that are
-hard anyway, so the coarse model, which has no seams, is measured on the same pixels. Nothing is kept but sums: one pass,
-memory bounded whatever the number of test views.
+Every pixel of a test view is labelled with the block that owns the place it shows. PSNR is then pooled by block, and
+the error near the borders of the labels is held against the error elsewhere. Borders may happen to lie in places that
+are hard anyway, so the coarse model, which has no seams, is measured on the same pixels. Nothing is kept but sums: one
+pass, memory bounded whatever the number of test views.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int16
-from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.evaluation.metrics import psnr_of
+from vdgs.kernels.types import Raster
 from vdgs.partition.blocks import Blocks
 
 #: Pixels this near to a change of label belong to the border.
@@ -30,18 +30,7 @@ LEAST_SHARE = 0.005
 NOTHING = -1
 
 
-class DrawnView(Protocol):
-    """What a renderer returns when asked for depth (`vdgs.kernels.types.Raster`)."""
-
-    @property
-    def image(self) -> Float[Tensor, "h w 3"]: ...
-    @property
-    def alpha(self) -> Float[Tensor, "h w"]: ...
-    @property
-    def depth(self) -> Float[Tensor, "h w"] | None: ...
-
-
-def label_map(drawn: DrawnView, camera: Camera, blocks: Blocks) -> Int16[np.ndarray, "h w"]:
+def label_map(drawn: Raster, camera: Camera, blocks: Blocks) -> Int16[np.ndarray, "h w"]:
     """The block that owns what each pixel shows, NOTHING where alpha is at most one half.
 
     The place is the centre of the pixel at the expected depth (the drawn depth divided by alpha).
@@ -147,7 +136,7 @@ class SeamMetrics:
         errors: Mapping[str, Float[np.ndarray, "h w"]],
         mask: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
-        """Count one view: errors `mae_coarse`, `mae_merged` (absolute), `mse_coarse`, `mse_merged` (squared) per pixel."""
+        """Count one view: absolute errors `mae_coarse`, `mae_merged`, squared `mse_coarse`, `mse_merged`."""
         drawn = labels >= 0 if mask is None else mask & (labels >= 0)
         at_border = border_pixels(labels)
         for place, where in enumerate((drawn & at_border, drawn & ~at_border)):

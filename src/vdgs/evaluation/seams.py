@@ -1,8 +1,7 @@
 """Evaluate what the cut into blocks gained and what its seams cost, with pictures of the worst places to look.
 
-    OUTPUT/
-      by_block.json       PSNR of each block: coarse, trained alone, merged; errors at borders against elsewhere
-      seams/NAME.png      coarse | merged | merged with the borders of blocks | error, where borders show most
+OUTPUT/by_block.json    PSNR of each block: coarse, trained alone, merged; errors at borders against elsewhere
+OUTPUT/seams/NAME.png   coarse | merged | merged with the borders of blocks | error, where borders show most
 """
 
 from __future__ import annotations
@@ -28,16 +27,15 @@ from vdgs.evaluation import pictures, saving
 from vdgs.evaluation.by_block import (
     BORDER_PX,
     BlockMetrics,
-    DrawnView,
     SeamMetrics,
     blocks_shown,
     border_lines,
     border_pixels,
     label_map,
 )
-from vdgs.evaluation.evaluate import RenderedView
 from vdgs.evaluation.metrics import masked_mean, psnr_of, squared_error, to_8bit
 from vdgs.evaluation.tables import shown
+from vdgs.kernels.types import Raster
 from vdgs.partition.blocks import Blocks
 
 #: Renders that are measured by block: without blocks, the block as it was trained, all blocks together.
@@ -59,7 +57,12 @@ class SeamView:
     reference: UInt8[np.ndarray, "h w 3"]
     mask: Bool[np.ndarray, "h w"] | None
     labels: Int16[np.ndarray, "h w"]
-    border_pixels: int
+    #: Pixels near a border, those that the mask drops left out.
+    border: Bool[np.ndarray, "h w"]
+
+    @property
+    def border_pixels(self) -> int:
+        return int(np.count_nonzero(self.border))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +71,9 @@ class _Inputs:
 
     load_image: Callable[[View], UInt8[np.ndarray, "h w 3"]]
     load_mask: Callable[[View], Bool[np.ndarray, "h w"] | None]
-    render_coarse: Callable[[Camera], RenderedView]
-    render_merged: Callable[[Camera], DrawnView]
-    render_block: Callable[[int, Camera], RenderedView | None]
+    render_coarse: Callable[[Camera], Raster]
+    render_merged: Callable[[Camera], Raster]
+    render_block: Callable[[int, Camera], Raster | None]
     blocks: Blocks
 
 
@@ -88,9 +91,9 @@ def evaluate_blocks(
     views: Sequence[View],
     load_image: Callable[[View], UInt8[np.ndarray, "h w 3"]],
     load_mask: Callable[[View], Bool[np.ndarray, "h w"] | None],
-    render_coarse: Callable[[Camera], RenderedView],
-    render_merged: Callable[[Camera], DrawnView],
-    render_block: Callable[[int, Camera], RenderedView | None],
+    render_coarse: Callable[[Camera], Raster],
+    render_merged: Callable[[Camera], Raster],
+    render_block: Callable[[int, Camera], Raster | None],
     blocks: Blocks,
     output: Path,
 ) -> dict[str, Any]:
@@ -134,7 +137,7 @@ def _measure(view: View, stem: str, inputs: _Inputs, gathered: _Gathered) -> Non
     errors["mae_merged"] = pictures.absolute_error(merged, reference)
     gathered.seams.add(labels, errors, mask)
     kept = border_pixels(labels) if mask is None else border_pixels(labels) & mask
-    seen = SeamView(view.name, stem, coarse, merged, reference, mask, labels, int(kept.sum()))
+    seen = SeamView(view.name, stem, coarse, merged, reference, mask, labels, kept)
     best = sorted([*gathered.worth_seeing, seen], key=lambda each: -each.border_pixels)
     gathered.worth_seeing = [each for each in best[:SEAM_VIEWS] if each.border_pixels]
     gathered.views.append(
@@ -164,7 +167,7 @@ def _alone(
     return errors
 
 
-def _eight_bits(rendered: RenderedView) -> UInt8[np.ndarray, "h w 3"]:
+def _eight_bits(rendered: Raster) -> UInt8[np.ndarray, "h w 3"]:
     return to_8bit(rendered.image.detach().cpu().numpy())
 
 
@@ -175,19 +178,21 @@ def seam_picture(view: SeamView) -> Image.Image:
     error = pictures.absolute_error(view.merged, view.reference)
     if view.mask is not None:
         error = np.where(view.mask, error, np.nan)
-    figures = [
-        f"{psnr_of(masked_mean(squared_error(image, view.reference), view.mask)):.2f} dB"
-        for image in (view.coarse, view.merged)
-    ]
     panels = [
-        pictures.Panel(pictures.resize(view.coarse, size), "coarse", figures[0]),
-        pictures.Panel(pictures.resize(view.merged, size), "merged", figures[1]),
+        pictures.Panel(pictures.resize(view.coarse, size), "coarse", _caption(view.coarse, view)),
+        pictures.Panel(pictures.resize(view.merged, size), "merged", _caption(view.merged, view)),
         pictures.Panel(with_borders(view.merged, view.labels, size), "borders of blocks"),
         pictures.Panel(
             pictures.resize(pictures.colourise(error, pictures.ERROR_LIMIT), size), "absolute error of merged"
         ),
     ]
     return pictures.row_of_panels(panels, view.name, pictures.ERROR_LIMIT)
+
+
+def _caption(image: UInt8[np.ndarray, "h w 3"], view: SeamView) -> str:
+    errors = squared_error(image, view.reference)
+    near = _psnr_within(errors, view.border)
+    return f"{psnr_of(masked_mean(errors, view.mask)):.2f} dB, near borders {shown(near, '{:.2f}')}"
 
 
 def with_borders(
