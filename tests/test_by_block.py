@@ -71,6 +71,14 @@ def test_labels_are_those_of_the_places_seen(camera: Camera, alpha: float):
     assert len(set(expected)) > 1
 
 
+def test_a_pixel_shows_what_lies_at_its_centre():
+    quarter = 0.25 * 4.0 / 60.0  # of a pixel, on the ground
+    camera = camera_above(-quarter, quarter)
+    labels = label_map(plane_depth(camera), camera, quadrants())
+    right, top = np.arange(64) >= 32, np.arange(48) < 24
+    assert (labels == 2 * right[None, :] + top[:, None]).all()
+
+
 def test_the_sky_has_no_label():
     camera = CAMERAS[2]
     drawn = plane_depth(camera)

@@ -173,6 +173,16 @@ def test_coarse_anchors_stand_in_for_a_missing_block(config: MergeConfig):
     assert sorted(rows(others)) == sorted(stood_in)  # nobody else gives there
 
 
+def test_a_missing_block_is_given_nothing_of_others():
+    """However many of its cameras see its ring: it has no anchors there, and a hole would be left."""
+    blocks, coarse = quadrants(), scattered(500)
+    trained: list[AnchorModel | None] = [part(coarse, blocks.reaches(i, places(coarse))) for i in range(4)]
+    trained[2] = None
+    cameras = [[camera_above(0, 0, 8.0)] * (3 if i == 2 else 1) for i in range(4)]
+    merged, _ = merge(coarse, trained, blocks, cameras, BEST_SEEN, allow_missing=True)
+    assert sorted(rows(merged.anchors)) == sorted(rows(coarse.anchors))
+
+
 def test_all_blocks_missing_is_the_coarse_scene():
     coarse = scattered()
     merged, facts = merge(coarse, [None] * 4, quadrants(), NO_CAMERAS, OWNER, allow_missing=True)
