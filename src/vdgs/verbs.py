@@ -282,8 +282,10 @@ def train(arguments: list[str]) -> None:
     asked = tyro.cli(TrainArguments, args=arguments, prog="vdgs train", default=default)
     _change(run, replace(method, block=asked.settings), asked.redo)
     if asked.block is not None:
+        from vdgs.executors.parent import stop_when_parent_dies
         from vdgs.stages.block import train_block
 
+        stop_when_parent_dies()
         _use_threads(asked.threads)
         train_block(asked.run, asked.block, asked.watching, _console())
     else:

@@ -1,29 +1,34 @@
 """The scene cut into blocks, and cameras for each: visibility, partition, assignment (section III-B).
 
-RUN/visibility/  visibility.json, map.png
-RUN/partition/   blocks.geojson (ground frame), blocks_wgs84.geojson (if georeferenced), scores.npz,
-                 partition.json, blocks.png, block_facts.png, scores.png
+    RUN/visibility/  visibility.json, map.png
+    RUN/partition/   blocks.geojson (ground frame), blocks_wgs84.geojson (if georeferenced), scores.npz,
+                     partition.json, blocks.png, block_facts.png, scores.png
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 from rich.console import Console
 from rich.progress import Progress
 
+from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
-from vdgs.config import MethodConfig
+from vdgs.config import AssignmentConfig, PartitionConfig
 from vdgs.evaluation.saving import write_json
+from vdgs.files import read_json
 from vdgs.memory import forget_peak, peak_memory_bytes
 from vdgs.partition import figures
-from vdgs.partition.assignment import Assignment, assign, assignment_table, block_rows, load_scores, save_scores
+from vdgs.partition.assignment import Assignment, assign
+from vdgs.partition.assignment_tables import assignment_rows, assignment_table
 from vdgs.partition.blocks import Blocks, load_blocks, save_blocks, save_blocks_wgs84
 from vdgs.partition.cut import choose_block_count, cut_scene
+from vdgs.partition.saving import save_scores
 from vdgs.partition.scores import Scores, score_matrix
 from vdgs.run import RunFolder
 from vdgs.stages.block import places
@@ -31,21 +36,37 @@ from vdgs.stages.opening import TrainedRun, open_run
 from vdgs.visibility import imbalance
 
 
+@dataclass(frozen=True)
+class _Scene:
+    """What is cut: the coarse anchors and who sees them."""
+
+    opened: TrainedRun
+    positions: Float[np.ndarray, "n 3"]
+    views: Int[np.ndarray, " n"]
+    cameras: list[Camera]
+
+    @staticmethod
+    def of(run: RunFolder) -> _Scene:
+        opened = open_run(run.path, "coarse")
+        cameras = [view.camera for view in opened.capture.train_views]
+        positions = opened.model.anchors.positions.numpy()
+        return _Scene(opened, positions, opened.views_of_anchors().numpy(), cameras)
+
+
 def measure_visibility(run: RunFolder, console: Console) -> None:
     """V_i of every anchor: its distribution and a map from above. Skipped where it is there for this coarse model."""
     file, key = run.visibility / "visibility.json", run.keys().coarse
-    if read_facts(file).get("key") == key:
+    if file.exists() and read_json(file).get("key") == key:
         console.print(f"{file}: already there; nothing to do", highlight=False)
         return
     with run.locked():
-        opened = open_run(run.path, "coarse")
-        seen = opened.views_of_anchors().numpy()
-        facts = asdict(imbalance(seen))
+        scene = _Scene.of(run)
+        facts = asdict(imbalance(scene.views))
+        run.visibility.mkdir(exist_ok=True)
         figures.draw_visibility_map(
-            run.visibility / "map.png", opened.model.anchors.positions.numpy(), seen, train_cameras(opened.capture),
-            unit(opened.capture),
-        )  # fmt: skip
-        write_json(file, {"key": key, "anchors": len(seen), "training_views": len(opened.capture.train_views), **facts})
+            run.visibility / "map.png", scene.positions, scene.views, scene.cameras, unit(scene.opened.capture)
+        )
+        write_json(file, {"key": key, "anchors": len(scene.views), "training_views": len(scene.cameras), **facts})
     quantiles = ", ".join(f"{share} %: {value:g}" for share, value in facts["quantiles"].items())
     console.print(
         f"cameras that see an anchor (V), by quantile: {quantiles}; Gini {facts['gini']:.2f}\n"
@@ -60,49 +81,99 @@ def partition_run(run: RunFolder, console: Console) -> None:
     Raises RunError without a coarse model.
     """
     keys, before = run.keys(), run.partition_facts()
-    if (before.get("key"), before.get("assignment_key")) == (keys.partition, keys.assignment):
+    cut = before.get("key") == keys.partition
+    if cut and before.get("assignment_key") == keys.assignment:
         console.print(f"{run.partition}: already cut; nothing to do", highlight=False)
         return
     with run.locked():
         forget_peak()
-        began = time.monotonic()
-        opened, method = open_run(run.path, "coarse"), run.method()
-        positions, seen = opened.model.anchors.positions.numpy(), opened.views_of_anchors().numpy()
-        if before.get("key") == keys.partition:
-            blocks, warnings = load_blocks(run.partition / "blocks.geojson"), list(before.get("warnings", []))
+        began, method, scene = time.monotonic(), run.method(), _Scene.of(run)
+        if cut:
+            blocks, warnings = load_blocks(run.partition / "blocks.geojson"), list(before["warnings"])
         else:
-            blocks, warnings = _cut(opened, positions, seen, method, console)
-        with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
-            task = bar.add_task("assigning cameras")
-            scores = score_matrix(
-                opened.model, blocks, train_cameras(opened.capture), method.assignment,
-                lambda done, total: bar.update(task, completed=done, total=total),
-            )  # fmt: skip
+            blocks, warnings = _cut(scene, method.partition, method.training.seed)
+        scores = _score(scene, blocks, method.assignment, console)
         assignment = assign(scores, method.assignment)
-        for warning in warnings + assignment.complaints:
-            console.print(f"[yellow]note[/] {warning}", highlight=False)
-        _write(run, opened, blocks, scores, assignment, method, seen, warnings)
-        facts = run.partition_facts()
-        seconds, peak = time.monotonic() - began, peak_memory_bytes()
-        write_json(
-            run.partition / "partition.json",
-            facts | {"seconds": seconds, "peak_memory_bytes": peak, "key": keys.partition, "assignment_key": keys.assignment},
-        )  # fmt: skip
-    console.print(assignment_table(facts["blocks"]))
+        for note in warnings + assignment.complaints:
+            console.print(f"[yellow]note[/] {note}", highlight=False)
+        rows = assignment_rows(blocks, scene.positions, scene.views, assignment)
+        _save(run.partition, scene, blocks, scores, assignment, rows)
+        spatial = _spatial(scene, method.partition, method.training.seed, len(blocks))
+        _draw(run.partition, scene, blocks, scores, assignment, method.partition, spatial)
+        facts = {
+            "key": keys.partition, "assignment_key": keys.assignment, "lambda_vis": method.partition.lambda_vis,
+            "warnings": warnings, "complaints": assignment.complaints, "blocks": rows,
+            "spatial": _facts_of_cut(scene, spatial),
+            "seconds": time.monotonic() - began, "peak_memory_bytes": peak_memory_bytes(),
+        }  # fmt: skip
+        write_json(run.partition / "partition.json", facts)  # last: where it stands, the rest is complete
+    console.print(assignment_table(rows))
     console.print(f"figures: {run.partition / 'blocks.png'} and beside it", highlight=False)
-
-
-def read_facts(file: Any) -> dict[str, Any]:
-    from vdgs.files import read_json
-
-    facts = read_json(file) if file.exists() else {}
-    return facts if isinstance(facts, dict) else {}
-
-
-def train_cameras(capture: Capture) -> list[Any]:
-    return [view.camera for view in capture.train_views]
 
 
 def unit(capture: Capture) -> str:
     """What one unit of the ground frame is called."""
     return "m" if capture.ground.metric else "units"
+
+
+def _cut(scene: _Scene, config: PartitionConfig, seed: int) -> tuple[Blocks, list[str]]:
+    camera = scene.cameras[0]
+    count = choose_block_count(len(scene.views), len(scene.cameras), camera.width * camera.height, config)
+    return cut_scene(scene.positions, scene.views, replace(config, blocks=count), seed)
+
+
+def _spatial(scene: _Scene, config: PartitionConfig, seed: int, count: int) -> Blocks:
+    """The cut that place alone would give, to compare with."""
+    return cut_scene(scene.positions, scene.views, replace(config, blocks=count, lambda_vis=0.0), seed)[0]
+
+
+def _score(scene: _Scene, blocks: Blocks, config: AssignmentConfig, console: Console) -> Scores:
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("assigning cameras")
+        return score_matrix(
+            scene.opened.model, blocks, scene.cameras, config,
+            lambda done, total: bar.update(task, completed=done, total=total),
+        )  # fmt: skip
+
+
+def _facts_of_cut(scene: _Scene, blocks: Blocks) -> list[dict[str, Any]]:
+    """Anchors, area and visibility of each block of a cut."""
+    owner = blocks.owner(places(scene.opened.model.anchors.positions))
+    return [
+        {
+            "block": index, "anchors_core": int((owner == index).sum()), "area": float(block.core.area),
+            "mean_v": float(scene.views[owner == index].mean()) if (owner == index).any() else None,
+            "std_v": float(scene.views[owner == index].std()) if (owner == index).any() else None,
+        }
+        for index, block in enumerate(blocks.items)
+    ]  # fmt: skip
+
+
+def _save(
+    folder: Path, scene: _Scene, blocks: Blocks, scores: Scores, assignment: Assignment, rows: list[dict[str, Any]]
+) -> None:  # fmt: skip
+    """The files that later stages read, and the place of the blocks on Earth where it is known."""
+    (folder / "partition.json").unlink(missing_ok=True)
+    save_blocks(folder / "blocks.geojson", blocks, rows)
+    ground = scene.opened.capture.ground
+    if ground.origin_geo is not None:
+        save_blocks_wgs84(folder / "blocks_wgs84.geojson", blocks, rows, ground)
+    save_scores(
+        folder / "scores.npz", [view.name for view in scene.opened.capture.train_views], scores, assignment
+    )  # fmt: skip
+
+
+def _draw(
+    folder: Path, scene: _Scene, blocks: Blocks, scores: Scores, assignment: Assignment, config: PartitionConfig,
+    spatial: Blocks,
+) -> None:  # fmt: skip
+    compare = spatial if config.lambda_vis and len(blocks) > 1 else None
+    figures.draw_blocks(
+        folder / "blocks.png", scene.positions, scene.views, blocks, scene.cameras, assignment.cameras,
+        unit(scene.opened.capture), compare, config.lambda_vis,
+    )  # fmt: skip
+    figures.draw_block_facts(
+        folder / "block_facts.png", scene.positions, scene.views, blocks, assignment.cameras,
+        unit(scene.opened.capture), compare,
+    )  # fmt: skip
+    figures.draw_scores(folder / "scores.png", scores.scores, assignment.cameras)

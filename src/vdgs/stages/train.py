@@ -13,7 +13,7 @@ from rich.console import Console
 
 from vdgs.errors import RunError
 from vdgs.executors.local import Job, default_jobs, run_jobs
-from vdgs.partition.blocks import Blocks
+from vdgs.kernels.native.module import threads as threads_available
 from vdgs.run import RunFolder
 from vdgs.run_options import WatchOptions
 from vdgs.stages.block import blocks_of
@@ -39,9 +39,9 @@ def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console)
             console.print(f"{path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
             return
         free = psutil.virtual_memory().available
-        at_once, threads = default_jobs(len(left), psutil.cpu_count() or 1, free, _block_bytes(run, blocks))
+        at_once, threads = default_jobs(len(left), threads_available(), free, _block_bytes(run))
         if jobs:
-            at_once, threads = min(jobs, len(left)), max(1, (psutil.cpu_count() or 1) // min(jobs, len(left)))
+            at_once, threads = min(jobs, len(left)), max(1, (threads_available()) // min(jobs, len(left)))
         budget = options.image_memory_gb or free / 4e9
         console.print(
             f"{len(left)} of {len(blocks)} blocks to train, {at_once} at once with {threads} thread(s) each",
@@ -82,8 +82,8 @@ def _remove_beyond(run: RunFolder, count: int) -> None:
             shutil.rmtree(folder.path)
 
 
-def _block_bytes(run: RunFolder, blocks: Blocks) -> int:
+def _block_bytes(run: RunFolder) -> int:
     """Memory that the largest block may need, from its anchors, those around it and its photographs."""
-    largest = max(each["anchors"] for each in run.partition_facts()["blocks"])
-    everything = sum(each["anchors"] for each in run.partition_facts()["blocks"])
+    largest = max(each["anchors_core"] for each in run.partition_facts()["blocks"])
+    everything = sum(each["anchors_core"] for each in run.partition_facts()["blocks"])
     return int(PROCESS_BYTES + ANCHOR_BYTES * GROWTH * largest + 300 * everything)
