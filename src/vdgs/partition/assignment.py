@@ -1,7 +1,8 @@
 """Which cameras train which block, decided from the score matrix (section III-C).
 
-The paper assigns a camera where its score is above a threshold. Alone, that leaves cameras without any block and blocks
-without any camera; so (choice) every camera also joins its best block, and every block is topped up with its best views.
+The paper assigns a camera where its score is above a threshold. Alone, that leaves cameras without any block and
+blocks without any camera; so (choice) every camera also joins its best block, and every block is topped up with its
+best views.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def assign(scores: Scores, config: AssignmentConfig) -> Assignment:
     why[(scores.scores > threshold) & (seen | (scores.mode == "literal"))] = ABOVE_THRESHOLD
     rows, best = np.arange(len(why)), _best_blocks(scores)
     why[rows, best] = np.where(why[rows, best] == NOT_ASSIGNED, BEST_BLOCK, why[rows, best])
-    for block in range(why.shape[1]):
+    for block in range(len(scores.anchors)):
         missing = max(config.min_cameras - np.count_nonzero(why[:, block]), 0)
         order = np.lexsort((-scores.held[:, block], -scores.scores[:, block]))
         candidates = order[seen[order, block] & (why[order, block] == NOT_ASSIGNED)]
@@ -61,7 +62,7 @@ def _best_blocks(scores: Scores) -> np.ndarray:
     if not len(scores.scores):
         return np.zeros(0, np.int64)
     seen = scores.held > 0
-    best = np.lexsort((-scores.held, -scores.scores, ~seen), axis=1)[:, 0]
+    best = np.lexsort((-scores.held, -scores.scores, ~seen), axis=-1)[:, 0]
     blank = ~seen.any(axis=1) & (scores.scores.max(axis=1) == scores.scores.min(axis=1))
     return np.where(blank, scores.beneath, best)
 

@@ -54,8 +54,8 @@ def load_scores(path: Path) -> SavedScores:
         raise RunError(f"{path}: is not there. Assign the cameras first: vdgs assign RUN") from error
     # What zipfile and numpy raise on damaged bytes has no common base.
     except (
-        OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError, NotImplementedError, RuntimeError,
-        SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error, struct.error,
+        OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError, NotImplementedError,
+        RuntimeError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error, struct.error,
     ) as error:  # fmt: skip
         raise RunError(f"{path}: is damaged ({error}). Assign the cameras again: vdgs assign RUN") from error
     scores = Scores(

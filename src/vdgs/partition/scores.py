@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -61,10 +62,10 @@ def score_matrix(
 ) -> Scores:
     """Score every camera for every block. `progress` is told (cameras done, all cameras) after each, in this thread.
 
-    - `coverage` (choice): |{Δ < τ and alpha of the block > 0.5}| / |{alpha of the scene > 0.5}|, 0 where the scene draws
-      nothing; Δ (eq. 6) compares the scene with the widened block drawn alone. Pixels empty in both do not count.
+    - `coverage` (choice): |{Δ < τ and alpha of the block > 0.5}| / |{alpha of the scene > 0.5}|; Δ (eq. 6) compares
+      the scene with the widened block drawn alone. Pixels empty in both do not count; 0 where the scene is empty.
     - `literal`: the share of *all* pixels with Δ < τ (eq. 7).
-    - `leave_one_out`: 1 - SSIM of the scene without the anchors that the block owns, against the whole scene, on 8 bits.
+    - `leave_one_out`: 1 - SSIM of the scene without the anchors that the block owns against the whole scene, 8 bits.
     - `frustum`: the share of the anchors that the block owns whose centre the camera holds; nothing is drawn.
 
     Pictures are at most `config.longest_side_px` wide and high. The scores of a camera depend on no other camera and on
@@ -156,7 +157,7 @@ class _Members:
     def held(self, camera: Camera) -> list[int]:
         """How many anchors of every block the frustum holds."""
         seen = kernels.count_views(self.points, [camera])
-        return [int(seen[a:b].sum()) for a, b in zip(self.bounds, self.bounds[1:], strict=False)]
+        return [int(seen[a:b].sum()) for a, b in pairwise(self.bounds)]
 
 
 @torch.no_grad()  # holds for the thread that it is entered in

@@ -1,0 +1,375 @@
+"""Camera assignment: what a score means, whom each block gets, and what is kept of it."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+from captures_support import look_down
+from native_choice import every_instruction_set, on_threads, using
+from vdgs.anchors import AnchorModel, Anchors
+from vdgs.cameras import Camera
+from vdgs.config import AssignmentConfig
+from vdgs.decoder import Decoder
+from vdgs.errors import RunError
+from vdgs.kernels import native as kernels
+from vdgs.partition.assignment import ABOVE_THRESHOLD, BEST_BLOCK, NOT_ASSIGNED, TOPPED_UP, assign
+from vdgs.partition.assignment_tables import assignment_rows, assignment_table, explain
+from vdgs.partition.blocks import Block, Blocks
+from vdgs.partition.saving import load_scores, save_scores
+from vdgs.partition.scores import Scores, reduced, score_matrix, select_splats
+from vdgs.render import decode_visible, gather_visible, render
+
+MODES = ("coverage", "literal", "leave_one_out", "frustum")
+RENDERED = MODES[:3]
+CONFIG = AssignmentConfig(longest_side_px=48, min_cameras=0)
+WIDTH = 24.0
+
+
+@cache
+def scene() -> AnchorModel:
+    """Opaque ground 24 wide and 6 deep, anchors in random order."""
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(np.arange(0.2, WIDTH, 0.4), np.arange(0.2, 6, 0.4))
+    ground = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    rng.shuffle(ground)
+    n, g = len(ground), torch.Generator().manual_seed(0)
+    anchors = Anchors(
+        positions=torch.from_numpy(ground.astype(np.float32)),
+        features=torch.randn(n, 32, generator=g),
+        offsets=0.3 * torch.randn(n, 4, 3, generator=g),
+        log_scales=torch.full((n, 6), float(np.log(0.6))),
+    )
+    tensors = Decoder.initial(4, False, 0, 1, g).tensors()
+    tensors["opacity_b2"] = tensors["opacity_b2"] + 3.0  # what is in view is opaque
+    tensors["colour_b2"] = tensors["colour_b2"] + 1.0  # and lighter than the black behind it
+    return AnchorModel(anchors, Decoder.from_tensors(tensors), 0.4, (0.5, 0.5, 0.5), {})
+
+
+def strips(count: int, margin: float = 0.5) -> Blocks:
+    """Blocks side by side along x."""
+    edges = np.linspace(0, WIDTH, count + 1)
+    cores = [shapely.box(a, 0, b, 6) for a, b in pairwise(edges)]
+    return Blocks(tuple(Block(core, core.buffer(margin, join_style="mitre")) for core in cores))
+
+
+def camera(x: float, y: float = 3.0, height: float = 4.0, tilt_deg: float = 0.0) -> Camera:
+    pose = look_down(np.array([x, y, height]), tilt_deg, 90.0)
+    return Camera(pose, 70.0, 70.0, 32.0, 24.0, 64, 48)
+
+
+def flight() -> list[Camera]:
+    return [camera(float(x), tilt_deg=tilt) for x, tilt in zip(np.linspace(1, 23, 9), [0, 20, 0] * 3, strict=True)]
+
+
+def skyward() -> Camera:
+    """A camera beneath which lies the last of four strips, and that sees nothing."""
+    return camera(22.0, height=5.0, tilt_deg=180.0)
+
+
+def hand_made(scores, held=None, mode="coverage") -> Scores:
+    values = np.array(scores, np.float32)
+    held = (values > 0).astype(np.int32) if held is None else np.array(held, np.int32)
+    anchors = np.full(values.shape[1], 1000, np.int64)
+    return Scores(mode, values, held, values.copy(), anchors, np.zeros(len(values), np.int64))
+
+
+# What a score means
+
+
+@pytest.mark.parametrize("mode", RENDERED)
+def test_one_block_is_the_whole_scene(mode):
+    config = replace(CONFIG, mode=mode)
+    scores = score_matrix(scene(), strips(1), [*flight(), skyward()], config)
+    assert np.array_equal(scores.covered[:, 0], [1.0] * 9 + [0.0])
+    assert np.array_equal(scores.held[:, 0] > 0, [True] * 9 + [False])
+    if mode == "leave_one_out":
+        assert (scores.scores[:9, 0] > 0.5).all()
+    else:
+        assert np.array_equal(scores.scores[:, 0], [1.0] * 9 + [float(mode == "literal")])
+
+
+@every_instruction_set
+def test_the_splats_of_a_block_draw_what_the_block_alone_draws(instructions):
+    model, blocks, view = scene(), strips(3), camera(8.0, tilt_deg=30.0)
+    places = model.anchors.positions[:, :2].double().numpy()
+    with using(instructions), torch.no_grad():
+        visible = gather_visible(model.anchors, view)
+        splats = decode_visible(visible.anchors, model.decoder.weights, view)
+        anchor = visible.rows[splats.source.long() // 4]
+        for index in range(3):
+            reached = torch.from_numpy(blocks.reaches(index, places))
+            some = select_splats(splats, reached[anchor].nonzero().squeeze(1))
+            ours = kernels.rasterise(
+                some.means_px, some.conics, some.colours, some.opacities, some.depths, torch.zeros(3),
+                view.width, view.height,
+            )  # fmt: skip
+            alone = render(replace(model, anchors=model.anchors.select(reached)), view, background=(0.0, 0.0, 0.0))
+            assert torch.equal(ours.image, alone.image)
+            assert torch.equal(ours.alpha, alone.alpha)
+
+
+def expected_scores(mode: str, model: AnchorModel, blocks: Blocks, view: Camera) -> list[float]:
+    """The definitions, block by block, from whole renders of parts of the model."""
+    positions, black = model.anchors.positions, (0.0, 0.0, 0.0)
+    places = positions[:, :2].double().numpy()
+    part = lambda keep: replace(model, anchors=model.anchors.select(torch.from_numpy(keep)))  # noqa: E731
+    small = reduced(view, CONFIG)
+    full, scores = render(model, small, background=black), []
+    for index in range(len(blocks)):
+        own = blocks.owner(places) == index
+        block = render(part(blocks.reaches(index, places)), small, background=black)
+        alike = (block.image - full.image).abs().mean(-1) < CONFIG.tau
+        if mode == "coverage":
+            drawn = full.alpha > 0.5
+            scores.append(float((alike & drawn & (block.alpha > 0.5)).sum() / drawn.sum()))
+        elif mode == "literal":
+            scores.append(float(alike.float().mean()))
+        elif mode == "frustum":
+            scores.append(float(view.sees(positions.double().numpy()[own]).mean()))
+        else:
+            rest = render(part(~own), small, background=black).image
+            target = (full.image.clamp(0, 1) * 255).round().to(torch.uint8)
+            scores.append(1 - float(kernels.photometric_loss(rest, target, None).ssim))
+    return scores
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_scores_are_what_whole_renders_give(mode):
+    blocks, views = strips(4), flight()[1:4]
+    scores = score_matrix(scene(), blocks, views, replace(CONFIG, mode=mode))
+    expected = [expected_scores(mode, scene(), blocks, view) for view in views]
+    assert scores.scores == pytest.approx(np.array(expected), abs=3e-3)
+    assert np.count_nonzero(scores.scores > 0.1) >= 3
+    everything = scene().anchors.positions.double().numpy()
+    owner = blocks.owner(everything[:, :2])
+    assert scores.held.tolist() == [np.bincount(owner[view.sees(everything)], minlength=4).tolist() for view in views]
+    assert scores.anchors.tolist() == np.bincount(owner, minlength=4).tolist()
+    assert np.isnan(scores.covered).all() == (mode == "frustum")
+
+
+def test_empty_pixels_count_in_literal_mode_alone():
+    """From high above, the scene fills a small part of the picture: the rest matches any block, however far."""
+    views = [camera(WIDTH / 2, height=60.0)]
+    literal, coverage = (score_matrix(scene(), strips(4), views, replace(CONFIG, mode=m)) for m in MODES[1::-1])
+    assert (literal.scores > 0.8).all()
+    assert (coverage.scores < 0.5).all()
+    assert np.array_equal(literal.covered, coverage.scores)
+    empty = score_matrix(scene(), strips(4), [skyward()], replace(CONFIG, mode="literal"))
+    assert (empty.scores == 1).all()
+
+
+@pytest.mark.parametrize("mode", ["coverage", "leave_one_out", "frustum"])
+def test_a_block_out_of_view_scores_nothing(mode):
+    scores = score_matrix(scene(), strips(4), [camera(2.0)], replace(CONFIG, mode=mode))
+    assert scores.scores[0, 0] > 0.05
+    assert scores.scores[0, 2:].tolist() == [0.0, 0.0]
+    assert scores.held[0, 2:].tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_scores_depend_on_no_other_camera_and_on_no_number_of_threads(mode):
+    config, views, blocks = replace(CONFIG, mode=mode), flight(), strips(3)
+    order, told = np.random.default_rng(1).permutation(len(views)), []
+    with on_threads(1):
+        alone = score_matrix(scene(), blocks, views, config)
+    with on_threads(3):
+        shuffled = score_matrix(scene(), blocks, [views[i] for i in order], config, lambda *done: told.append(done))
+    for name in ("scores", "held", "covered", "beneath"):
+        assert np.array_equal(getattr(alone, name)[order], getattr(shuffled, name), equal_nan=name == "covered")
+    assert told == [(i + 1, 9) for i in range(9)]
+
+
+def test_pictures_are_made_smaller_and_never_larger():
+    big = replace(camera(0.0), width=6400, height=4800)
+    assert (reduced(big, CONFIG).width, reduced(big, CONFIG).height) == (48, 36)
+    assert reduced(camera(0.0), AssignmentConfig()).width == 64
+
+
+# Whom each block gets
+
+matrices = st.integers(0, 12).flatmap(
+    lambda c: st.integers(1, 5).flatmap(
+        lambda b: st.tuples(
+            st.lists(st.lists(st.sampled_from([0.0, 0.2, 0.5, 1.0]), min_size=b, max_size=b), min_size=c, max_size=c),
+            st.lists(st.lists(st.integers(0, 2), min_size=b, max_size=b), min_size=c, max_size=c),
+        ).map(lambda pair: (np.reshape(pair[0], (c, b)), np.reshape(pair[1], (c, b))))
+    )
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(matrices, st.sampled_from(MODES), st.integers(0, 8))
+def test_laws_of_assignment(matrix, mode, floor):
+    scores = hand_made(*matrix, mode=mode)
+    config = replace(CONFIG, mode=mode, min_cameras=floor)
+    threshold = 0.05 if mode == "leave_one_out" else 0.45
+    result = assign(scores, config)
+    seen = scores.held > 0
+    assert result.cameras.any(axis=1).all(), "every camera serves a block"
+    assert np.array_equal(result.cameras, result.why != NOT_ASSIGNED)
+    above = (scores.scores > threshold) & (seen | (mode == "literal"))
+    assert np.array_equal(result.why == ABOVE_THRESHOLD, above)
+    for block in range(seen.shape[1]):
+        mine, watching = result.cameras[:, block], seen[:, block]
+        assert mine.sum() >= min(floor, watching.sum()), "the floor is met, or all that see the block are there"
+        topped = result.why[:, block] == TOPPED_UP
+        assert not (topped & ~watching).any()
+        assert not topped.any() or mine.sum() <= floor
+        left = watching & ~mine
+        if topped.any() and left.any():
+            assert scores.scores[topped, block].min() >= scores.scores[left, block].max()
+    for row, block in zip(*np.nonzero(result.why == BEST_BLOCK), strict=True):
+        best = scores.scores[row, seen[row]].max() if seen[row].any() else scores.scores[row].max()
+        assert scores.scores[row, block] == best
+    assert np.array_equal(assign(scores, config).why, result.why)
+
+
+def test_equal_scores_are_settled_by_anchors_held_and_then_by_index():
+    scores = hand_made([[0.2, 0.2, 0.2]] * 4, [[1, 2, 2], [1, 1, 1], [3, 0, 0], [1, 1, 0]])
+    result = assign(scores, replace(CONFIG, min_cameras=2))
+    assert np.argmax(result.why == BEST_BLOCK, axis=1).tolist() == [1, 0, 0, 0]
+    assert np.flatnonzero(result.why[:, 1] == TOPPED_UP).tolist() == [1]
+    assert np.flatnonzero(result.why[:, 2] == TOPPED_UP).tolist() == [0, 1]
+
+
+def test_a_camera_that_sees_nothing_joins_the_block_beneath_it():
+    scores = score_matrix(scene(), strips(4), [skyward()], CONFIG)
+    assert scores.beneath.tolist() == [3]
+    assert assign(scores, CONFIG).why.tolist() == [[0, 0, 0, BEST_BLOCK]]
+
+
+def test_a_camera_over_the_ring_alone_is_not_taken_for_it():
+    """It would draw anchors that do not move, and teach nothing."""
+    scores = hand_made([[0.9, 0.6]], [[0, 5]])
+    assert assign(scores, CONFIG).why.tolist() == [[NOT_ASSIGNED, ABOVE_THRESHOLD]]
+    assert assign(replace(scores, mode="literal"), CONFIG).why.tolist() == [[ABOVE_THRESHOLD, ABOVE_THRESHOLD]]
+
+
+def test_a_block_without_cameras_complains_and_says_why():
+    scores = score_matrix(scene(), strips(4), [camera(2.0), camera(8.0)], CONFIG)
+    lines = assign(scores, replace(CONFIG, min_cameras=5)).complaints
+    assert [line.split(":")[0] for line in lines] == ["Block 2", "Block 3"]
+    assert "no training camera sees any of its 225 anchors" in lines[1]
+    (unpicked,) = assign(hand_made([[0.3, 0.2]]), CONFIG).complaints
+    assert "1 training camera(s) see" in unpicked
+    assert "best: 0.2" in unpicked
+    nothing = replace(hand_made([[1.0, 0.0]]), anchors=np.array([7, 0]))
+    assert "Block 1 holds no anchors" in assign(nothing, CONFIG).complaints[0]
+    assert assign(hand_made([[0.3, 0.2]]), replace(CONFIG, min_cameras=1)).complaints == []
+
+
+# What is kept and shown
+
+
+@pytest.fixture
+def saved(tmp_path):
+    scores = score_matrix(scene(), strips(4), [camera(2.0), camera(8.0), skyward()], CONFIG)
+    result = assign(scores, CONFIG)
+    path = tmp_path / "partition" / "scores.npz"
+    save_scores(path, ["a.jpg", "b/ö.jpg", "c.jpg"], scores, result)
+    return path, scores, result
+
+
+def test_what_is_saved_is_loaded(saved):
+    path, scores, result = saved
+    names, loaded, decided = load_scores(path)
+    assert names == ["a.jpg", "b/ö.jpg", "c.jpg"]
+    assert loaded.mode == "coverage"
+    for name in ("scores", "held", "covered", "anchors", "beneath"):
+        assert np.array_equal(getattr(loaded, name), getattr(scores, name))
+    assert np.array_equal(decided.why, result.why)
+    assert np.array_equal(decided.cameras, result.cameras)
+    assert decided.complaints == result.complaints
+    assert len(result.complaints) == 2
+    before = path.read_bytes()
+    save_scores(path, names, loaded, decided)
+    assert path.read_bytes() == before
+
+
+def test_the_scores_of_no_camera_at_all_can_be_saved(tmp_path):
+    scores = score_matrix(scene(), strips(2), [], CONFIG)
+    result = assign(scores, CONFIG)
+    assert len(result.complaints) == 2
+    save_scores(tmp_path / "none.npz", [], scores, result)
+    assert load_scores(tmp_path / "none.npz").scores.scores.shape == (0, 2)
+
+
+def test_missing_and_damaged_files_say_so(saved, tmp_path):
+    path, scores, result = saved
+    with pytest.raises(RunError, match="is not there"):
+        load_scores(tmp_path / "nothing.npz")
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    for cut in (0, 10, len(whole) // 2, len(whole) - 3):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(RunError, match=r"scores\.npz: is damaged"):
+            load_scores(path)
+    for place in rng.integers(0, len(whole), 300):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x55]) + whole[place + 1 :])
+        try:  # a byte that nobody reads (a date, say) may change
+            loaded = load_scores(path)
+        except RunError:
+            continue
+        assert np.array_equal(loaded.scores.scores, scores.scores)
+        assert np.array_equal(loaded.assignment.why, result.why)
+
+
+def test_a_file_whose_arrays_disagree_is_refused(saved):
+    path, _, _ = saved
+    with np.load(path, allow_pickle=False) as file:
+        arrays = dict(file)
+    for name, value in (
+        ("held", arrays["held"][:1]), ("why", arrays["why"] + 9), ("scores", arrays["scores"].astype(float)),
+        ("names", np.arange(3)), ("format", np.array("other")),
+    ):  # fmt: skip
+        np.savez(path, **{**arrays, name: value})
+        with pytest.raises(RunError, match="is damaged"):
+            load_scores(path)
+
+
+def test_anyone_can_ask_why(saved):
+    names, scores, result = load_scores(saved[0])
+    rows = explain(names, scores, result, view="b/ö.jpg")
+    assert [row["block"] for row in rows[:1]] == [1]
+    assert rows[0]["why"] == "above the threshold"
+    assert [row["score"] for row in rows[1:]] == sorted((row["score"] for row in rows[1:]), reverse=True)
+    assert {row["why"] for row in rows[1:]} == {"not assigned"}
+    assert explain(names, scores, result, block=3)[0]["view"] == "c.jpg"
+    assert len(explain(names, scores, result)) == 12
+    unmeasured = score_matrix(scene(), strips(4), [camera(2.0)], replace(CONFIG, mode="frustum"))
+    assert explain(["a"], unmeasured, assign(unmeasured, CONFIG), block=0)[0]["covered"] is None
+    with pytest.raises(RunError, match="no training view 'z'"):
+        explain(names, scores, result, view="z")
+    with pytest.raises(RunError, match="numbered 0 to 3"):
+        explain(names, scores, result, block=4)
+
+
+def test_the_table_counts_what_was_decided(saved):
+    _, scores, result = saved
+    blocks, positions = strips(4), scene().anchors.positions.numpy()
+    visibility = kernels.count_views(scene().anchors.positions, [camera(2.0), camera(8.0)]).numpy()
+    rows = assignment_rows(blocks, positions, visibility, result)
+    for index, row in enumerate(rows):
+        assert row["cameras"] == row["above_threshold"] + row["best_block"] + row["topped_up"]
+        assert row["cameras"] == result.cameras[:, index].sum()
+        assert row["anchors_core"] == scores.anchors[index] < row["anchors_expanded"]
+        assert row["area"] == pytest.approx(36.0)
+    assert rows[3]["mean_v"] == 0.0 < rows[0]["mean_v"]
+    console = Console(width=100, file=io.StringIO())
+    console.print(assignment_table(rows))
+    lines = [line.split() for line in console.file.getvalue().splitlines()]
+    assert [line[:2] for line in lines if line and line[0].isdigit()] == [
+        [str(row["block"]), str(row["cameras"])] for row in rows
+    ]
+    assert json.loads(json.dumps(rows)) == rows
