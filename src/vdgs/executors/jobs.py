@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,8 @@ from vdgs.run import StageFolder
 State = Literal["queued", "running", "done", "failed", "stopped"]
 #: Readings of a status file between which the speed is measured.
 WINDOW = 20
+#: No figure is larger, in whatever unit: beyond it the file is damaged.
+LARGEST = 1e12
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def _number(value: Any) -> float | None:
         number = float(value)
     except OverflowError:
         return None
-    return number if math.isfinite(number) and number >= 0 else None
+    return number if 0 <= number <= LARGEST else None
 
 
 def _count(value: Any) -> int | None:

@@ -19,7 +19,7 @@ def last_lines(output: Path, start: int = 0) -> list[str]:
         with output.open("rb") as handle:
             end = handle.seek(0, 2)
             handle.seek(max(start, end - TAIL_BYTES))
-            text = handle.read().decode(errors="replace")
+            text = handle.read(TAIL_BYTES).decode(errors="replace")
     except OSError:
         return []
     # A carriage return overwrites its line: what follows the last one is what a person saw.

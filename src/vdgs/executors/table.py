@@ -52,22 +52,26 @@ class Board:
         if self._live is not None:
             table = progress_table(self._rows, self._at_once, self._console.height - FRAME_LINES)
             self._live.update(table, refresh=True)
-        elif time.monotonic() - self._last_line >= PLAIN_SECONDS:
+        elif self._open and time.monotonic() - self._last_line >= PLAIN_SECONDS:
             self._last_line = time.monotonic()
             self.say(progress_line(self._rows, self._at_once))
+
+    @property
+    def _open(self) -> bool:
+        return any(row.state in ("queued", "running") for row in self._rows)
 
 
 def progress_table(rows: list[JobProgress], at_once: int, most: int) -> Table:
     """One row for each job and one with totals; of more than `most` jobs, those that wait or are done are counted."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for column in ("block", "state", "iteration", "PSNR (dB)", "anchors", "it/s", "left", "memory", "attempt"):
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), caption_justify="left")  # 80 columns
+    for column in ("block", "state", "iteration", "PSNR", "anchors", "it/s", "left", "memory", "tries"):
         table.add_column(column, justify="left" if column == "state" else "right", no_wrap=True)
     shown = _chosen(rows, max(most, 1))
     for row in shown:
         table.add_row(*_cells(row), style=STYLES[row.state])
     if len(shown) < len(rows):
         hidden = [row for row in rows if row not in shown]
-        table.add_row("…", _states(hidden), style="dim")
+        table.caption = f"and {_states(hidden)}"
     table.add_section()
     table.add_row(*_totals(rows, at_once), style="bold")
     return table
@@ -141,7 +145,7 @@ def _totals(rows: list[JobProgress], at_once: int) -> list[str]:
         _shown(sum(speeds) if speeds else None, "{:.1f}"),
         _shown(seconds_left_overall(rows, at_once)),
         _gigabytes(sum(memory) if memory else None),
-        str(sum(row.attempts for row in rows)),
+        "",
     ]
 
 

@@ -1,0 +1,287 @@
+"""Jobs side by side: each ends as it should, none harms another, and none outlives the one who started it unasked."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from vdgs.executors import local
+from vdgs.executors.jobs import Job
+from vdgs.executors.local import run_jobs
+from vdgs.executors.parent import PARENT, stop_when_parent_dies
+from vdgs.run import StageFolder
+
+#: What every fake block begins with: it knows its folder, can say how far it is, and lists the SIGTERMs it gets.
+PRELUDE = """
+import json, os, pathlib, signal, sys, time
+folder = pathlib.Path(sys.argv[1])
+def tell(state, **facts):
+    (folder / "status.json").write_text(json.dumps({"state": state, **facts}))
+def stop(*_):
+    with (folder / "terms").open("a") as terms:
+        terms.write("TERM ")
+signal.signal(signal.SIGTERM, stop)
+def wait_for_stop(seconds=20):
+    end = time.monotonic() + seconds
+    while not (folder / "terms").exists() and time.monotonic() < end:
+        time.sleep(0.02)
+"""
+FINE = 'tell("done", iteration=10, iterations=10, psnr_training=25.5, anchors=1234)'
+#: Runs until asked to stop, then saves for a moment, in which a second SIGTERM would be noticed.
+LONG = """
+tell("running", iteration=3, iterations=10)
+(folder / "ready").touch()
+wait_for_stop()
+time.sleep(0.2)
+tell("stopped", iteration=4)
+sys.exit(130)
+"""
+
+
+def job(root: Path, index: int, script: str) -> Job:
+    folder = StageFolder(root / f"{index:02d}")
+    command = [sys.executable, "-S", "-c", PRELUDE + textwrap.dedent(script), str(folder.path)]
+    return Job(index, folder, command, {"BLOCK": str(index)})
+
+
+def run(jobs, *, at_once=2, retries=2, terminal=False):
+    """Outcomes, and what was printed."""
+    console = Console(file=io.StringIO(), width=120, height=40, force_terminal=terminal, color_system=None)
+    outcomes = run_jobs(jobs, at_once=at_once, retries=retries, console=console, poll_seconds=0.02)
+    return outcomes, console.file.getvalue()
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_all_are_done_and_shown(tmp_path, terminal):
+    outcomes, text = run([job(tmp_path, i, FINE) for i in (0, 3, 5)], terminal=terminal)
+    assert [(o.index, o.state, o.attempts, o.why) for o in outcomes] == [(i, "done", 1, "") for i in (0, 3, 5)]
+    assert "3 of 3 blocks done" in text
+    expected = ("3/3 done", "25.50", "1,234", "100 %") if terminal else ("block 05: started", "block 05: done after")
+    assert all(word in text for word in expected)
+
+
+def test_no_jobs_are_no_trouble():
+    assert run([])[0] == []
+
+
+def test_never_more_than_asked_for_at_once(tmp_path):
+    script = """
+        with (folder.parent / "log").open("a") as log: log.write("+")
+        time.sleep(0.15)
+        with (folder.parent / "log").open("a") as log: log.write("-")
+    """
+    outcomes, _ = run([job(tmp_path, i, script) for i in range(6)], at_once=2)
+    steps = (tmp_path / "log").read_text()
+    running = [steps[:end].count("+") - steps[:end].count("-") for end in range(len(steps) + 1)]
+    assert len(outcomes) == 6
+    assert len(steps) == 12
+    assert max(running) == 2  # not more, and not one after the other either
+
+
+def test_a_crash_is_continued_and_said(tmp_path):
+    script = """
+        if not (folder / "state").exists():
+            (folder / "state").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        print("continued", os.environ["BLOCK"])
+        tell("done")
+    """
+    (outcome,), text = run([job(tmp_path, 4, script)])
+    assert (outcome.state, outcome.attempts) == ("done", 2)
+    assert "block 04: crashed by SIGKILL" in text
+    assert "attempt 2" in text
+    output = (tmp_path / "04/output.log").read_text()
+    assert output.count("--- ") == 2  # both attempts are in the one log
+    assert "continued 4" in output
+
+
+def test_a_crash_that_comes_back_fails_and_leaves_no_running_status(tmp_path):
+    script = 'tell("running", iteration=7, key="k"); print("last words", flush=True); os._exit(77)'
+    (outcome,), text = run([job(tmp_path, 0, script)], retries=1)
+    assert (outcome.state, outcome.attempts) == ("failed", 2)
+    assert "crashed 2 times" in outcome.why
+    assert "exit code 77" in outcome.why
+    assert "last words" in text
+    status = StageFolder(tmp_path / "00").status()
+    assert (status["state"], status["iteration"], status["key"]) == ("failed", 7, "k")
+
+
+def test_an_explained_failure_is_not_repeated_and_stops_no_other(tmp_path):
+    failing = 'print("starting"); print("vdgs train: a.jpg: is gone.\\nPut it back.", file=sys.stderr); sys.exit(1)'
+    jobs = [job(tmp_path, 0, FINE), job(tmp_path, 1, failing), job(tmp_path, 2, FINE), job(tmp_path, 3, FINE)]
+    outcomes, text = run(jobs, at_once=1)
+    assert [o.state for o in outcomes] == ["done", "failed", "done", "done"]
+    assert (outcomes[1].attempts, outcomes[1].why) == (1, "a.jpg: is gone.\nPut it back.")
+    assert "block 01 failed: a.jpg: is gone." in text
+    assert "3 of 4 blocks done" in text
+    assert str(jobs[1].output) in text.replace("\n", "")
+
+
+def test_a_job_that_someone_else_stopped_is_not_started_again(tmp_path):
+    (outcome,), _ = run([job(tmp_path, 0, 'print("vdgs train: Stopped at iteration 9; saved."); sys.exit(130)')])
+    assert (outcome.state, outcome.attempts) == ("stopped", 1)
+    assert "someone else" in outcome.why
+    assert "iteration 9" in outcome.why
+
+
+def test_memory_that_ran_out_lowers_the_number_at_once(tmp_path, monkeypatch):
+    kills = iter([5, 6, 6, 6])
+    monkeypatch.setattr(local, "out_of_memory_kills", lambda: next(kills))
+    script = """
+        if not (folder / "state").exists() and os.environ["BLOCK"] == "0":
+            (folder / "state").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+    """
+    outcomes, text = run([job(tmp_path, i, script) for i in range(3)])
+    assert [o.state for o in outcomes] == ["done"] * 3
+    assert "at most 1 at once" in text
+
+
+@pytest.mark.parametrize("content", [b"", b'{"sta', b"\xff\xfe\x00", b"[1, 2]", b"[" * 100_000, b'{"state": 3}'])
+def test_a_damaged_status_file_is_no_reason_to_fall(tmp_path, content):
+    script = f'(folder / "status.json").write_bytes({content[:50]!r}); time.sleep(0.1); os._exit(9)'
+    made = job(tmp_path, 0, script)
+    made.folder.path.mkdir()
+    made.folder.status_file.write_bytes(content)
+    (outcome,), _ = run([made], retries=0, terminal=True)
+    assert outcome.state == "failed"
+    assert "exit code 9" in outcome.why
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "blocks").write_text("a file where a folder should be")
+    outcomes, _ = run([job(tmp_path / "blocks", 0, FINE), job(tmp_path, 1, FINE)])
+    assert [o.state for o in outcomes] == ["failed", "done"]
+    assert str(tmp_path / "blocks/00") in outcomes[0].why
+    assert "Not a directory" in outcomes[0].why
+    assert "run the same command again" in outcomes[0].why
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_a_full_disk_is_named(tmp_path):
+    made = job(tmp_path, 0, FINE)
+    made.folder.path.mkdir()
+    made.output.symlink_to("/dev/full")
+    (outcome,), _ = run([made])
+    assert outcome.state == "failed"
+    assert "No space left on device" in outcome.why
+    assert str(made.output) in outcome.why
+
+
+def test_a_command_that_is_not_there_is_named(tmp_path):
+    (outcome,), _ = run([Job(0, StageFolder(tmp_path), ["/nowhere/python"])])
+    assert outcome.state == "failed"
+    assert "/nowhere/python" in outcome.why
+
+
+def test_a_folder_that_another_process_holds_is_waited_for(tmp_path):
+    made = job(tmp_path, 0, FINE)
+    made.folder.path.mkdir()
+    holder = (
+        "import fcntl, sys, time; f = open(sys.argv[1], 'w'); fcntl.flock(f, 2); print(1, flush=True); time.sleep(0.6)"
+    )
+    command = [sys.executable, "-c", holder, str(made.folder.path / ".lock")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as other:
+        assert other.stdout.readline() == b"1\n"
+        (outcome,), text = run([made])
+    assert outcome.state == "done"
+    assert "waiting for another process" in text
+
+
+DRIVER = """
+import json, sys
+from pathlib import Path
+from rich.console import Console
+from vdgs.executors.local import Job, run_jobs
+from vdgs.run import StageFolder
+jobs = [Job(index, StageFolder(Path(folder)), command, {}) for index, folder, command in json.loads(sys.argv[1])]
+outcomes = run_jobs(jobs, at_once=2, retries=2, console=Console(), poll_seconds=0.02)
+print("OUTCOMES", json.dumps([[o.state, o.attempts, o.why] for o in outcomes]))
+"""
+
+
+def driver(jobs: list[Job]) -> subprocess.Popen:
+    """A process that runs the jobs; returns once the first two say that they are ready."""
+    argument = json.dumps([[made.index, str(made.folder.path), made.command] for made in jobs])
+    process = subprocess.Popen([sys.executable, "-c", DRIVER, argument], stdout=subprocess.PIPE, text=True)
+    for made in jobs[:2]:
+        wait_until((made.folder.path / "ready").exists)
+    return process
+
+
+def wait_until(condition, seconds=15.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+def outcomes_of(process: subprocess.Popen) -> list:
+    text, _ = process.communicate(timeout=15)
+    assert process.returncode == 0
+    return json.loads(next(line for line in text.splitlines() if line.startswith("OUTCOMES")).removeprefix("OUTCOMES"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_request_to_stop_reaches_each_job_once(tmp_path, number):
+    jobs = [job(tmp_path, i, LONG) for i in range(3)]
+    process = driver(jobs)
+    process.send_signal(number)
+    time.sleep(0.1)
+    if number == signal.SIGTERM:
+        process.send_signal(number)  # a scheduler that asks twice: still once, and no kill
+    outcomes = outcomes_of(process)
+    assert [o[:2] for o in outcomes] == [["stopped", 1], ["stopped", 1], ["stopped", 0]]
+    assert [made.folder.status()["state"] for made in jobs[:2]] == ["stopped"] * 2
+    assert [(made.folder.path / "terms").read_text() for made in jobs[:2]] == ["TERM "] * 2
+    assert not jobs[2].folder.path.exists() or not jobs[2].output.exists()
+
+
+def test_a_second_interrupt_kills(tmp_path):
+    deaf = LONG.replace("wait_for_stop()", "time.sleep(20)")  # a sleep goes on after a signal that is handled
+    jobs = [job(tmp_path, i, deaf) for i in range(2)]
+    process = driver(jobs)
+    process.send_signal(signal.SIGINT)
+    wait_until((jobs[1].folder.path / "terms").exists)
+    process.send_signal(signal.SIGINT)
+    outcomes = outcomes_of(process)
+    assert [o[0] for o in outcomes] == ["stopped", "stopped"]
+    assert all("SIGKILL" in o[2] for o in outcomes)
+    assert jobs[0].folder.status()["state"] == "stopped"  # it could not write that itself
+
+
+def test_a_job_ends_with_a_driver_that_was_killed(tmp_path):
+    watched = (
+        "import sys; sys.path.insert(0, sys.argv[2])\n"
+        "from vdgs.executors.parent import stop_when_parent_dies\nstop_when_parent_dies(0.05)\n" + LONG
+    )
+    source = str(Path(local.__file__).parents[2])
+    jobs = [job(tmp_path, i, watched) for i in range(2)]
+    for made in jobs:
+        made.command.append(source)
+    process = driver(jobs)
+    process.kill()
+    process.communicate()
+    for made in jobs:
+        wait_until(lambda made=made: made.folder.status()["state"] == "stopped")
+        assert (made.folder.path / "terms").read_text() == "TERM "
+
+
+def test_a_process_without_a_driver_is_not_watched(monkeypatch):
+    monkeypatch.delenv(PARENT, raising=False)
+    assert stop_when_parent_dies() is None
+    monkeypatch.setenv(PARENT, "no number")
+    assert stop_when_parent_dies() is None
+    monkeypatch.setenv(PARENT, str(os.getppid()))
+    watch = stop_when_parent_dies(0.01)
+    assert watch is not None
+    assert watch.is_alive()
+    assert PARENT not in os.environ  # what this process starts has another parent

@@ -1,0 +1,95 @@
+"""What is shown of jobs that run side by side, and how many run by default."""
+
+import io
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from vdgs.executors.jobs import Figures, JobProgress, read_figures, seconds_left_overall
+from vdgs.executors.local import default_jobs
+from vdgs.executors.output import explanation
+from vdgs.executors.table import duration, progress_line, progress_table
+
+
+@given(st.dictionaries(st.sampled_from(["iteration", "iterations", "psnr_training", "anchors", "seconds_left",
+    "peak_memory_bytes"]), st.one_of(st.none(), st.booleans(), st.floats(), st.integers(), st.just(10**400),
+    st.text(max_size=3), st.lists(st.integers(), max_size=2))))  # fmt: skip
+def test_any_status_can_be_shown(tmp_path_factory, status):
+    path = tmp_path_factory.getbasetemp() / "any_status.json"
+    path.write_text(json.dumps({"state": "running", **status}))
+    row = JobProgress(0)
+    row.started()
+    row.observe(read_figures(path), 1.0)
+    console = Console(file=io.StringIO(), width=200)
+    console.print(progress_table([row, JobProgress(1)], 1, 10))
+    assert "0/2 done" in console.file.getvalue()
+    assert "1 running" in progress_line([row], 1)
+
+
+@given(st.integers(1, 60), st.integers(1, 128), st.integers(0, 10**12), st.integers(0, 10**11))
+def test_default_jobs_fit_the_machine(blocks, cores, available, each):
+    jobs, threads = default_jobs(blocks, cores, available, each)
+    assert 1 <= jobs <= min(blocks, cores)
+    assert jobs * threads <= cores
+    assert jobs == 1 or jobs * each <= available
+
+
+def test_default_jobs_on_known_machines():
+    assert default_jobs(8, 2, 8 * 10**9, 2 * 10**9) == (2, 1)
+    assert default_jobs(8, 2, 3 * 10**9, 2 * 10**9) == (1, 2)
+    assert default_jobs(4, 64, 10**12, 5 * 10**9) == (4, 16)
+
+
+def test_time_left_follows_from_speed_and_what_waits():
+    first, second, third = rows = [JobProgress(i) for i in range(3)]
+    assert seconds_left_overall(rows, 2) is None
+    first.started()
+    first.observe(Figures(iteration=0, iterations=100), 0.0)
+    first.observe(None, 5.0)  # a reading that failed
+    first.observe(Figures(iteration=50, iterations=100), 10.0)
+    assert first.speed == pytest.approx(5.0)
+    assert seconds_left_overall(rows, 1) == pytest.approx(10 + 20 + 20)
+    assert seconds_left_overall(rows, 2) == pytest.approx(25)
+    first.state = second.state = third.state = "done"
+    assert seconds_left_overall(rows, 2) == 0.0
+
+
+def test_a_new_attempt_has_a_speed_of_its_own():
+    row = JobProgress(0)
+    row.started()
+    for second in range(3):
+        row.observe(Figures(iteration=100 * second, iterations=1000), float(second))
+    row.observe(Figures(iteration=50, iterations=1000), 10.0)
+    assert row.speed is None
+
+
+def test_the_table_fits_the_screen_and_keeps_what_matters():
+    rows = [JobProgress(i) for i in range(40)]
+    rows[37].started()
+    rows[38].state = "failed"
+    console = Console(file=io.StringIO(), width=80)
+    figures = Figures(11_200, 15_000, 24.31, 1_234_567, 5000.0, 1_400_000_000)
+    rows[37].observe(figures, 0.0)
+    console.print(progress_table(rows, 2, 5))
+    lines = [line for line in console.file.getvalue().splitlines() if line.strip()]
+    assert len(lines) <= 5 + 5
+    assert "…" not in "".join(lines)  # nothing is cut off on a narrow terminal
+    assert "24.31  1,234,567" in "".join(lines)
+    assert any(line.split()[:2] == ["37", "running"] for line in lines)
+    assert any(line.split()[:2] == ["38", "failed"] for line in lines)
+    assert "35 queued" in "\n".join(lines)
+    assert duration(3671.4) == "1:01:11"
+
+
+def test_the_message_is_found_among_the_output(tmp_path):
+    output = tmp_path / "output.log"
+    output.write_bytes(
+        b"vdgs train: old\n--- again\nnoise\r\x1b[31m 50 %\x1b[0m\nvdgs train: a.jpg: gone\nPut it back\n\n"
+    )
+    assert explanation(output) == "a.jpg: gone\nPut it back"
+    output.write_bytes(b"Traceback\n  somewhere\nValueError: \xff\x07no\n")
+    assert explanation(output) == "ValueError: �no"
+    assert explanation(tmp_path / "missing") == ""
