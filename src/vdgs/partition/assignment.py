@@ -72,11 +72,11 @@ def _complaints(scores: Scores, why: np.ndarray, threshold: float) -> list[str]:
     for block, anchors in enumerate(scores.anchors):
         watching = int(np.count_nonzero(scores.held[:, block]))
         if anchors == 0:
-            complaints.append(f"Block {block} holds no anchors. Cut the scene into fewer blocks: --partition.blocks.")
+            complaints.append(f"Block {block} holds no anchors. Cut the scene into fewer blocks: --blocks.")
         elif watching == 0:
             complaints.append(
                 f"Block {block}: no training camera sees any of its {anchors:,} anchors. It cannot be trained; the "
-                "coarse anchors stay. Fewer blocks (--partition.blocks) would join it to one that is seen."
+                "coarse anchors stay. Fewer blocks (--blocks) would join it to one that is seen."
             )
         elif not why[:, block].any():
             complaints.append(

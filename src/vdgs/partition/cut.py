@@ -54,7 +54,7 @@ def cut_scene(
     if len(cores) < count:
         warnings.append(
             f"the scene is cut into {len(cores)} blocks instead of {count}: the anchors of the other clusters are "
-            "scattered among those of their neighbours. A smaller --partition.lambda-vis or fewer blocks avoid this."
+            "scattered among those of their neighbours. A smaller --lambda-vis or fewer blocks avoid this."
         )
     if len(cores) == 1:
         return _whole(ground, config.expansion), warnings

@@ -51,13 +51,13 @@ def load_scores(path: Path) -> SavedScores:
             arrays = {name: file[name] for name in file.files}
         _check(arrays)
     except FileNotFoundError as error:
-        raise RunError(f"{path}: is not there. Assign the cameras first: vdgs assign RUN") from error
+        raise RunError(f"{path}: is not there. Assign the cameras first: vdgs partition RUN") from error
     # What zipfile and numpy raise on damaged bytes has no common base.
     except (
         OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError, NotImplementedError,
         RuntimeError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error, struct.error,
     ) as error:  # fmt: skip
-        raise RunError(f"{path}: is damaged ({error}). Assign the cameras again: vdgs assign RUN") from error
+        raise RunError(f"{path}: is damaged ({error}). Assign the cameras again: vdgs partition RUN") from error
     scores = Scores(
         str(arrays["mode"]),
         *(arrays[name] for name in ("scores", "held", "covered", "anchors", "beneath")),

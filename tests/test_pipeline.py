@@ -1,0 +1,258 @@
+"""`vdgs run` as people run it: real processes, stopped, killed, damaged, given other settings and continued."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from captures_support import tiny_scene, write_colmap
+from vdgs.anchors import AnchorModel
+from vdgs.partition.blocks import load_blocks
+from vdgs.partition.saving import load_scores
+from vdgs.stages.block import places
+from vdgs.stages.opening import open_run
+from vdgs.visibility import views_of
+
+SETTINGS = (
+    "--preset", "laptop", "--iterations", "400", "--save-every", "40", "--anchors.offsets", "3", "--up", "z",
+    "--growth.start", "100", "--growth.statistics-from", "50", "--growth.gate", "0.05", "--blocks", "2",
+    "--assignment.min-cameras", "4", "--block.iterations", "250", "--block.growth.gate", "0.05",
+    "--block.growth.start", "50", "--block.growth.statistics-from", "0", "--block.growth.interval", "50",
+)  # fmt: skip
+#: What a block's model is compared by: the whole file.
+MERGED = "merged/model.safetensors"
+
+
+def vdgs(*arguments: object, wait: float = 240) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "vdgs.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=wait)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("place") / "capture"
+    write_colmap(folder, tiny_scene())
+    origin = {"frame": "ENU", "origin_lat_deg": 47.0, "origin_lon_deg": 8.5, "origin_alt_m": 400.0}
+    (folder / "georef.json").write_text(json.dumps(origin))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def unbroken(capture, tmp_path_factory) -> Path:
+    run = tmp_path_factory.mktemp("unbroken") / "run"
+    done = vdgs("run", capture, "--output", run, *SETTINGS)
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "→ merged" in done.stdout
+    return run
+
+
+@pytest.fixture
+def copied(unbroken, tmp_path) -> Path:
+    return Path(shutil.copytree(unbroken, tmp_path / "run", ignore=shutil.ignore_patterns(".lock")))
+
+
+def model(run: Path, name: str = MERGED) -> bytes:
+    return (run / name).read_bytes()
+
+
+def changed_files(run: Path, before: dict[str, int]) -> set[str]:
+    return {name for name, moment in moments(run).items() if before.get(name) != moment}
+
+
+def moments(run: Path) -> dict[str, int]:
+    return {
+        str(path.relative_to(run)): path.stat().st_mtime_ns
+        for path in run.rglob("*")
+        if path.is_file() and path.name != ".lock"
+    }
+
+
+def test_a_run_leaves_what_the_documents_say(unbroken):
+    expected = [
+        "config.yaml", "capture.json", "coarse/model.safetensors", "coarse/evaluation/metrics.json",
+        "visibility/visibility.json", "visibility/map.png", "partition/blocks.geojson", "partition/scores.npz",
+        "partition/blocks_wgs84.geojson", "partition/partition.json", "partition/blocks.png",
+        "partition/block_facts.png", "partition/scores.png", "blocks/00/model.safetensors", "blocks/01/log.jsonl",
+        "blocks/01/output.log", MERGED, "evaluation/metrics.json", "evaluation/by_block.json",
+        "evaluation/contact_sheet.png", "report.html",
+    ]  # fmt: skip
+    assert [name for name in expected if not (unbroken / name).is_file()] == []
+    assert not [path for path in unbroken.rglob("*.tmp")]
+    metrics = {folder: json.loads((unbroken / folder / "metrics.json").read_text())
+               for folder in ("coarse/evaluation", "evaluation")}  # fmt: skip
+    assert (metrics["coarse/evaluation"]["model"], metrics["evaluation"]["model"]) == ("coarse", "merged")
+    bins = [[each["pixels"] for each in each["by_visibility"]] for each in metrics.values()]
+    assert bins[0] == bins[1]  # both models are measured on the same pixels
+
+
+def test_the_merged_scene_is_the_cores_of_the_blocks(unbroken):
+    blocks, merged = load_blocks(unbroken / "partition/blocks.geojson"), AnchorModel.load(unbroken / MERGED)
+    assert len(blocks) == 2
+    owner = blocks.owner(places(merged.anchors.positions))
+    for index in range(2):
+        own = AnchorModel.load(unbroken / f"blocks/{index:02d}/model.safetensors").anchors
+        part = merged.anchors.select(torch.from_numpy(owner == index))
+        assert all(torch.equal(own.tensors()[name], tensor) for name, tensor in part.tensors().items())
+    coarse = AnchorModel.load(unbroken / "coarse/model.safetensors")
+    assert len(merged.anchors) > len(coarse.anchors)
+    for name, tensor in coarse.decoder.tensors().items():
+        assert torch.equal(tensor, merged.decoder.tensors()[name])
+
+
+def test_cycles_of_compensated_growth_are_logged(unbroken):
+    lines = [json.loads(line) for line in (unbroken / "blocks/00/log.jsonl").read_text().splitlines()]
+    cycles = [line for line in lines if line.get("low_share") is not None]
+    assert [line["iteration"] for line in cycles] == [50, 100]
+    assert all(0 <= line["low_share"] <= 1 and line["t_low"] == 0.2 for line in cycles)
+    assert all(line["grown_low"] + line["grown_other"] == line["grown"] for line in cycles)
+
+
+def test_every_camera_serves_a_block_and_v_is_brute_force(unbroken):
+    _, _, assignment = load_scores(unbroken / "partition/scores.npz")
+    assert assignment.cameras.any(axis=1).all()
+    assert (assignment.cameras.sum(axis=0) >= 4).all()
+    opened = open_run(unbroken, "coarse")
+    cameras = [view.camera for view in opened.capture.train_views]
+    brute = sum(camera.sees(opened.model.anchors.positions.double().numpy()).astype(int) for camera in cameras)
+    assert np.array_equal(views_of(opened.model.anchors.positions, cameras).numpy(), brute)
+
+
+def test_a_finished_run_does_nothing_again(capture, copied):
+    before = moments(copied)
+    again = vdgs("run", capture, "--output", copied, *SETTINGS)
+    assert again.returncode == 0, again.stderr
+    assert again.stdout.count("nothing to do") == 7
+    assert changed_files(copied, before) <= {"report.html"}
+
+
+def test_other_settings_are_refused_where_they_cost_training(capture, copied):
+    before = moments(copied)
+    refused = vdgs("run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0")
+    assert refused.returncode == 1
+    assert "partition.lambda_vis: 1.0 -> 0.0" in refused.stderr
+    assert "--redo" in refused.stderr
+    assert changed_files(copied, before) == set()
+
+
+def test_a_changed_setting_redoes_exactly_what_depends_on_it(capture, copied):
+    before = moments(copied)
+    redone = vdgs("run", capture, "--output", copied, *SETTINGS, "--block.compensation.beta-g", "0", "--redo")
+    assert redone.returncode == 0, redone.stderr
+    changed = {name.split("/")[0] for name in changed_files(copied, before)}
+    assert changed == {"config.yaml", "blocks", "merged", "evaluation", "report.html"}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_run_that_is_cut_off_while_blocks_train_continues_to_the_same_bits(capture, unbroken, copied, number):
+    for name in ("blocks", "merged", "evaluation"):
+        shutil.rmtree(copied / name)
+    command = [sys.executable, "-m", "vdgs.cli", "run", str(capture), "--output", str(copied), *SETTINGS]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while process.poll() is None and not list(copied.glob("blocks/*/checkpoints/*.json")):
+        time.sleep(0.02)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=60)
+    if number == signal.SIGINT:
+        assert process.returncode == 130, errors
+        assert "The same command continues" in errors
+    done = vdgs("run", capture, "--output", copied, *SETTINGS)
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert model(copied) == model(unbroken)
+
+
+def test_a_block_that_is_killed_is_started_again(unbroken, copied):
+    shutil.rmtree(copied / "blocks/01")
+    command = [sys.executable, "-m", "vdgs.cli", "train", str(copied)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while process.poll() is None and not list(copied.glob("blocks/01/checkpoints/*.json")):
+        time.sleep(0.02)
+    children = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout.split()
+    for child in children:
+        subprocess.run(["kill", "-9", child], check=False)
+    output, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    assert "crashed by SIGKILL" in output
+    assert model(copied, "blocks/01/model.safetensors") == model(unbroken, "blocks/01/model.safetensors")
+
+
+def test_one_block_alone_is_the_same_block(unbroken, copied):
+    shutil.rmtree(copied / "blocks/00")
+    done = vdgs("train", copied, "--block", "0", "--threads", "2")
+    assert done.returncode == 0, done.stderr
+    assert model(copied, "blocks/00/model.safetensors") == model(unbroken, "blocks/00/model.safetensors")
+    absent = vdgs("train", copied, "--block", "7")
+    assert absent.returncode == 1
+    assert "has blocks 0 to 1; there is no block 7" in absent.stderr
+
+
+def test_a_missing_block_stops_the_merge_unless_the_coarse_model_may_stand_in(copied):
+    for name in ("blocks/01", "merged"):
+        shutil.rmtree(copied / name)
+    refused = vdgs("merge", copied)
+    assert refused.returncode == 1
+    assert "block 1 is new" in refused.stderr
+    assert "--incomplete" in refused.stderr
+    assert not (copied / MERGED).exists()
+    done = vdgs("merge", copied, "--incomplete")
+    assert done.returncode == 0, done.stderr
+    blocks, merged = load_blocks(copied / "partition/blocks.geojson"), AnchorModel.load(copied / MERGED)
+    coarse = AnchorModel.load(copied / "coarse/model.safetensors").anchors
+    stood_in = coarse.positions[torch.from_numpy(blocks.owner(places(coarse.positions)) == 1)]
+    held = merged.anchors.positions[torch.from_numpy(blocks.owner(places(merged.anchors.positions)) == 1)]
+    assert torch.equal(stood_in, held)
+
+
+def test_one_block_is_the_whole_scene_and_merging_it_the_identity(capture, copied):
+    done = vdgs("run", capture, "--output", copied, *SETTINGS, "--no-blocking", "--redo")
+    assert done.returncode == 0, done.stderr
+    assert [path.name for path in (copied / "blocks").iterdir()] == ["00"]
+    merged, block = (AnchorModel.load(copied / name) for name in (MERGED, "blocks/00/model.safetensors"))
+    assert all(torch.equal(t, block.anchors.tensors()[name]) for name, t in merged.anchors.tensors().items())
+
+
+def test_stages_need_those_before_them(capture, tmp_path):
+    run = tmp_path / "run"
+    done = vdgs("coarse", capture, "--output", run, *SETTINGS[:4], "--anchors.offsets", "3", "--up", "z")
+    assert done.returncode == 0, done.stderr
+    for verb, needed in (("train", "vdgs partition"), ("merge", "vdgs partition")):
+        refused = vdgs(verb, run)
+        assert refused.returncode == 1
+        assert needed in refused.stderr
+        assert "Traceback" not in refused.stderr
+    for verb in ("visibility", "partition", "train", "merge", "eval", "report"):
+        more = ["--blocks", "2"] if verb == "partition" else ["--block.iterations", "30"] if verb == "train" else []
+        done = vdgs(verb, run, *more)
+        assert done.returncode == 0, done.stderr
+    assert json.loads((run / "evaluation/metrics.json").read_text())["model"] == "merged"
+
+
+@pytest.mark.parametrize("file", ["partition/blocks.geojson", "partition/scores.npz", "partition/partition.json"])
+def test_damaged_files_of_a_partition_are_named(copied, file):
+    shutil.rmtree(copied / "blocks/00")
+    (copied / file).write_bytes((copied / file).read_bytes()[:50])
+    done = vdgs("train", copied, "--block", "0")
+    assert done.returncode == 1
+    assert Path(file).name in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_the_report_is_one_file_without_links_out(unbroken):
+    text = (unbroken / "report.html").read_text()
+
+    class Links(HTMLParser):
+        found: list[str] = []
+
+        def handle_starttag(self, tag, attrs):
+            self.found += [value for name, value in attrs if name in ("src", "href") and value]
+
+    Links().feed(text)
+    assert len(Links.found) > 5
+    assert all(link.startswith(("data:", "#")) for link in Links.found)
