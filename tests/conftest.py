@@ -8,5 +8,16 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 from jaxtyping import install_import_hook
 
 # The numerical core's annotations (shapes and types) are checked while the tests run.
-CORE = ("kernels", "evaluation", "anchors", "cameras", "decoder", "growth", "optimiser", "render", "training")
+CORE = (
+    "kernels",
+    "evaluation",
+    "anchors",
+    "cameras",
+    "compensation",
+    "decoder",
+    "growth",
+    "optimiser",
+    "render",
+    "training",
+)
 install_import_hook([f"vdgs.{room}" for room in CORE], "typecheck.checked")

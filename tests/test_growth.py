@@ -7,6 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vdgs import growth
 from vdgs.anchors import Anchors
 from vdgs.config import GrowthConfig
 from vdgs.growth import Statistics, decide
@@ -139,3 +140,59 @@ def test_a_view_is_counted_where_it_was_drawn():
     assert stats.drawn.sum() == 3
     assert stats.opacity.tolist() == [0, 0.75, 0, 1.0, 0]
     assert stats.seen.tolist() == [0, 1, 0, 1, 0]
+
+
+def test_surroundings_occupy_cells_but_neither_grow_nor_go():
+    before = anchors(60)
+    free = decide(before, statistics(60), 1.0, ALWAYS, torch.Generator().manual_seed(0))
+    neighbours = torch.cat([free.added.positions[::2], torch.full((1, 3), 1e9)])  # one is beyond the lattice
+    decision = decide(before, statistics(60), 1.0, ALWAYS, torch.Generator().manual_seed(0), surroundings=neighbours)
+    assert torch.equal(decision.added.positions, free.added.positions[1::2])
+    assert torch.equal(decision.added.features, free.added.features[1::2])
+    assert len(decision.kept) == 60
+
+
+def test_new_anchors_stay_where_they_may_be_and_no_budget_is_spent_elsewhere():
+    before, coins = anchors(200), torch.Generator
+    config = GrowthConfig(gate=0.0, levels=2, coarsest_cell=1.0, threshold=1.0)
+
+    def east(places: torch.Tensor) -> torch.Tensor:
+        return places[:, 0] >= 0
+
+    free = decide(before, statistics(200), 0.5, config, coins().manual_seed(0)).added
+    held = decide(before, statistics(200), 0.5, config, coins().manual_seed(0), may_hold=east).added
+    assert torch.equal(held.positions, free.positions[east(free.positions)])
+    assert 0 < len(held) < len(free)
+    budget = GrowthConfig(gate=0.0, levels=2, coarsest_cell=1.0, threshold=1.0, max_anchors=220)
+    few = decide(before, statistics(200), 0.5, budget, coins().manual_seed(0), may_hold=east).added
+    assert len(few) == 20
+    assert bool(east(few.positions).all())
+    none = decide(
+        before, statistics(200), 0.5, config, coins().manual_seed(0), may_hold=lambda places: places[:, 0] > 1e6
+    )
+    assert len(none.added) == 0
+
+
+def test_the_order_of_anchors_does_not_decide_where_new_ones_come(monkeypatch):
+    monkeypatch.setattr(growth, "_random", lambda index, count, generator: torch.ones(len(index)))
+    before, stats = anchors(80), statistics(80)
+    order = torch.randperm(80, generator=torch.Generator().manual_seed(1))
+    config = GrowthConfig(gate=0.0, levels=3, coarsest_cell=4.0, threshold=1.0)
+    moved = decide(before.select(order), stats.select(order), 1.0, config, torch.Generator()).added
+    added = decide(before, stats, 1.0, config, torch.Generator()).added
+    assert len(added) > 50
+    assert torch.equal(moved.positions, added.positions)
+    assert torch.equal(moved.features, added.features)
+
+
+@settings(deadline=None, max_examples=30)
+@given(count=st.integers(1, 300), chunk=st.integers(1, 100), data=st.data())
+def test_random_numbers_are_those_of_one_draw(count, chunk, data):
+    index = torch.tensor(sorted(data.draw(st.sets(st.integers(0, count - 1)))), dtype=torch.int64)
+    before = growth.RANDOM_CHUNK
+    growth.RANDOM_CHUNK = chunk
+    try:
+        numbers = growth._random(index, count, torch.Generator().manual_seed(7))
+    finally:
+        growth.RANDOM_CHUNK = before
+    assert torch.equal(numbers, torch.rand(count, generator=torch.Generator().manual_seed(7))[index])

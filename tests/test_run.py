@@ -4,13 +4,16 @@ import json
 
 import pytest
 
-from vdgs.config import PRESETS, TrainConfig, differences, to_dict, validate, with_iterations
+from vdgs.config import PRESETS, MethodConfig, TrainConfig, differences, from_dict, to_dict, with_iterations
+from vdgs.config_checks import validate
 from vdgs.errors import RunError
 from vdgs.run import RunFolder, StageFolder
+from vdgs.stages.keys import stage_keys
 
 
 def settings(**changes) -> dict:
-    return {"capture": {"path": "/data/a"}, "training": to_dict(PRESETS["laptop"]) | changes}
+    method = to_dict(PRESETS["laptop"])
+    return {"capture": {"path": "/data/a"}} | method | {"training": method["training"] | changes}
 
 
 def test_the_same_settings_continue(tmp_path):
@@ -67,8 +70,67 @@ def test_presets_are_valid():
     assert all(validate(preset) == [] for preset in PRESETS.values())
 
 
+@pytest.mark.parametrize("preset", PRESETS)
+def test_settings_survive_a_file(preset):
+    method = PRESETS[preset]
+    assert from_dict(MethodConfig, json.loads(json.dumps(to_dict(method)))) == method
+
+
+def test_an_unknown_setting_is_named():
+    with pytest.raises(ValueError, match=r"settings\.block has no 'rings'"):
+        from_dict(MethodConfig, {"block": {"rings": "frozen"}})
+
+
+def test_a_change_that_costs_trained_work_needs_redo(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    run.begin(settings())
+    other = settings() | {"partition": settings()["partition"] | {"lambda_vis": 0.7}}
+    run.change(other, redo=False)  # nothing is trained yet
+    run.block(0).claim(run.keys().blocks)
+    run.block(0).model.write_bytes(b"a trained block")
+    with pytest.raises(RunError, match=r"partition\.lambda_vis: 0\.7 -> 1\.0(?s:.*)a block useless. Add --redo"):
+        run.change(settings(), redo=False)
+    assert run.settings() == other
+    assert run.change(settings(), redo=True) == ["partition.lambda_vis: 0.7 -> 1.0"]
+    assert run.settings() == settings()
+
+
+def test_a_stage_deletes_what_was_made_for_other_settings_and_nothing_else(tmp_path):
+    folder = StageFolder(tmp_path / "stage")
+    folder.claim("a")
+    folder.model.write_bytes(b"model")
+    folder.set_status("done", iteration=3)
+    folder.claim("a")
+    assert folder.is_done("a")
+    assert not folder.is_done("b")
+    folder.claim("b")
+    assert not folder.model.exists()
+    assert folder.status() == {"state": "new", "key": "b"}
+
+
+def test_each_setting_invalidates_the_stages_that_depend_on_it_and_no_others():
+    order = ["coarse", "partition", "assignment", "blocks", "merge"]
+    before = stage_keys(settings())
+    for section, first in [("capture", 0), ("training", 0), ("partition", 1), ("assignment", 2), ("block", 3),
+                           ("merge", 4)]:  # fmt: skip
+        changed = stage_keys(settings() | {section: settings()[section] | {"new": 1}})
+        same = [getattr(before, stage) == getattr(changed, stage) for stage in order]
+        assert same == [index < first for index in range(5)], section
+    moved = stage_keys(settings() | {"capture": {"path": "/elsewhere"}})
+    assert moved == before
+
+
+def test_blocks_share_the_run_and_one_process_works_on_each(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    with run.locked(shared=True), run.locked(shared=True), run.block(1).locked():
+        with pytest.raises(RunError, match="another vdgs process"), run.locked():
+            pass
+        with pytest.raises(RunError, match="another vdgs process"), run.block(1).locked():
+            pass
+
+
 def test_validation_names_each_problem():
-    bad = TrainConfig(iterations=-1, resolutions=((0.5, 2),))
+    bad = MethodConfig(TrainConfig(iterations=-1, resolutions=((0.5, 2),)))
     assert len(validate(bad)) == 2
 
 

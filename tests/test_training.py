@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from checkerboard import Photographs
 from vdgs.anchors import AnchorModel, initial_anchors
-from vdgs.cameras import Camera
 from vdgs.checkpoints import load_newest, save_state
 from vdgs.config import AnchorConfig, GrowthConfig, TrainConfig
 from vdgs.decoder import Decoder
@@ -16,7 +16,6 @@ from vdgs.kernels.native.module import set_threads, threads
 from vdgs.render import render
 from vdgs.training import Stage, downscale_at, from_saved, start_state, to_saved, train, train_step, view_at
 
-SIZE = (48, 40)
 BLACK = (0.0, 0.0, 0.0)
 CONFIG = TrainConfig(
     iterations=60,
@@ -24,35 +23,6 @@ CONFIG = TrainConfig(
     anchors=AnchorConfig(offsets=4, appearance=3),
     growth=GrowthConfig(interval=10, statistics_from=5, start=20, until=0.9, threshold=1e-6, gate=0.05),
 )
-
-
-class Photographs:
-    """Eight views from above of a coloured checkerboard plane, ray cast exactly."""
-
-    def __init__(self) -> None:
-        self.cameras = [self._camera(x, y) for x in (-2.0, -0.7, 0.7, 2.0) for y in (-1.0, 1.0)]
-
-    @staticmethod
-    def _camera(x: float, y: float) -> Camera:
-        pose = np.diag([1.0, -1.0, -1.0, 1.0])
-        pose[:3, 3] = -pose[:3, :3] @ np.array([x, y, 5.0])
-        width, height = SIZE
-        return Camera(pose, 40.0, 40.0, width / 2, height / 2, width, height)
-
-    def camera(self, index: int, downscale: int = 1) -> Camera:
-        return self.cameras[index].resized(SIZE[0] // downscale, SIZE[1] // downscale)
-
-    def get(self, index: int, downscale: int = 1):
-        camera = self.camera(index, downscale)
-        v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-        x = camera.position[0] + (u - camera.cx) / camera.fx * 5
-        y = camera.position[1] - (v - camera.cy) / camera.fy * 5
-        checks = (np.floor(x) + np.floor(y)) % 2
-        picture = np.stack([0.2 + 0.6 * checks, 0.5 + 0.1 * x, 0.5 + 0.1 * y], axis=-1)
-        return torch.from_numpy((picture.clip(0, 1) * 255).astype(np.uint8)), None
-
-    def prefetch(self, indices, downscale: int = 1) -> None:
-        pass
 
 
 def stage(config: TrainConfig = CONFIG) -> Stage:
@@ -66,7 +36,8 @@ def start(config: TrainConfig = CONFIG):
         points, np.full((300, 3), 128, np.uint8), Photographs().cameras, replace(config.anchors, voxel=0.4)
     )
     generator = torch.Generator().manual_seed(config.seed)
-    return start_state(anchors, Decoder.initial(config.anchors.offsets, False, config.anchors.appearance, 8, generator))
+    decoder = Decoder.initial(config.anchors.offsets, False, config.anchors.appearance, 8, generator)
+    return start_state(anchors, decoder, stage(config))
 
 
 def run(state, stage_, until: int | None = None):
@@ -107,7 +78,7 @@ def test_a_stopped_and_continued_run_has_the_same_bits(unbroken, tmp_path):
         save_state(tmp_path, to_saved(state))
         saved, _ = load_newest(tmp_path)
         assert saved is not None
-        state = from_saved(saved)
+        state = from_saved(saved, stage())
     assert bits(run(state, stage())) == bits(unbroken)
 
 

@@ -12,8 +12,18 @@ usage: vdgs VERB [options]
 vdgs turns a folder of drone photographs into one 3D Gaussian splatting scene.
 
   inspect CAPTURE --output FOLDER   what a capture holds and how well it covers the place
+  run CAPTURE --output RUN          everything: model, blocks, merge, metrics, report; the same command continues
+
+its stages, one by one:
   coarse CAPTURE --output RUN       train the global model; the same command continues it
+  visibility RUN                    how many cameras see each part of the scene
+  partition RUN                     cut the scene into blocks and give each its cameras
+  train RUN [--block N]             train the blocks, or one of them; the same command continues
+  merge RUN                         the blocks become one scene
   eval RUN                          metrics and pictures of the test views
+  report RUN                        one HTML file with figures, metrics, pictures and settings
+
+more:
   render RUN                        views or a camera path, as PNG or video
   synth OUTPUT                      generate a small aerial town with known truth
   doctor                            what this machine can use, and what to install for the rest
@@ -22,7 +32,10 @@ vdgs VERB --help explains the options of a verb. A capture is a folder with imag
 transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of MatrixCity.
 """
 
-VERBS = ("inspect", "coarse", "eval", "render", "synth", "doctor")
+VERBS = (
+    "inspect", "run", "coarse", "visibility", "partition", "train", "merge", "eval", "report", "render", "synth",
+    "doctor",
+)  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

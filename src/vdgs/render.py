@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int64
@@ -11,12 +11,8 @@ from torch import Tensor
 from vdgs.anchors import AnchorModel, Anchors
 from vdgs.cameras import Camera
 from vdgs.kernels import native as kernels
-from vdgs.kernels.decode_types import Splats
+from vdgs.kernels.decode_types import DecoderWeights, Splats
 from vdgs.kernels.types import Raster
-
-
-#: What the rasteriser reads of splats.
-DRAWN = ("means_px", "conics", "depths", "colours", "opacities")
 
 
 @dataclass(frozen=True)
@@ -33,23 +29,28 @@ def gather_visible(anchors: Anchors, camera: Camera) -> VisibleAnchors:
     return VisibleAnchors(rows, anchors.select(rows))
 
 
-def decode_visible(visible: Anchors, weights, camera: Camera) -> Splats:  # type: ignore[no-untyped-def]
+def decode_visible(visible: Anchors, weights: DecoderWeights, camera: Camera) -> Splats:
     """Splats of the gathered anchors in this view; differentiable."""
     return kernels.decode(visible.positions, visible.features, visible.offsets, visible.log_scales, weights, camera)
 
 
-def draw(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:
-    """Splats to image, alpha and (on request) expected depth; differentiable."""
+def draw(
+    splats: Splats,
+    camera: Camera,
+    background: Float[Tensor, "3"],
+    depth: bool = False,
+    around: Splats | None = None,
+) -> Raster:
+    """Splats to image, alpha and (on request) expected depth; differentiable. `around` are drawn with them."""
+
+    def both(name: str) -> Tensor:
+        own = getattr(splats, name)
+        return own if around is None else torch.cat([own, getattr(around, name)])
+
     return kernels.rasterise(
-        splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths,
+        both("means_px"), both("conics"), both("colours"), both("opacities"), both("depths"),
         background, camera.width, camera.height, depth=depth,
     )  # fmt: skip
-
-
-def beside(first: Splats, second: Splats) -> Splats:
-    """Both drawn together; `source` and `volumes` stay those of the first alone."""
-    joined = {n: torch.cat([getattr(first, n), getattr(second, n)]) for n in DRAWN}
-    return replace(first, **joined)
 
 
 @torch.no_grad()

@@ -27,7 +27,7 @@ def render_run(asked: RenderArguments, console: Console) -> None:
     """Render what was asked for. Raises VdgsError for an unusable path, codec or output."""
     if min(asked.width, asked.fps, asked.seconds) < 0:
         raise VdgsError("--width, --fps and --seconds must not be negative")
-    run = open_run(asked.run)
+    run = open_run(asked.run, asked.model)
     named, fps = _cameras(asked, run)
     if asked.width:
         named = [(name, camera.resized(asked.width, _height(camera, asked.width))) for name, camera in named]

@@ -19,15 +19,15 @@ from torch import Tensor
 from vdgs.anchors import TRAINED, Anchors
 from vdgs.cameras import Camera
 from vdgs.checkpoints import SavedState
-from vdgs.compensation import Compensated, Compensation, begin_cycle, low_visibility, update_cache
+from vdgs.compensation import Compensation, begin_cycle, compensate, cycle_facts, low_visibility, update_cache
 from vdgs.config import TrainConfig
 from vdgs.decoder import Decoder
 from vdgs.errors import TrainingDiverged
-from vdgs.growth import Statistics, cycle_facts, decide
+from vdgs.growth import Compensated, Statistics, decide
 from vdgs.kernels import native as kernels
-from vdgs.kernels.decode_types import Splats
+from vdgs.kernels.decode_types import DecoderWeights, Splats
 from vdgs.optimiser import Moments, Optimiser, rates_at
-from vdgs.render import beside, decode_visible, draw, gather_visible
+from vdgs.render import decode_visible, draw, gather_visible
 from vdgs.visibility import share_in_cycle
 
 #: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
@@ -149,7 +149,8 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     weights = state.decoder.for_image(view if stage.appearance_of is None else stage.appearance_of[view])
     splats = decode_visible(visible.anchors, weights, camera)
     splats.means_px.retain_grad()
-    raster = draw(_with_surroundings(splats, stage, weights, camera), camera, _background(stage, iteration))
+    around = _surroundings(stage, weights, camera)
+    raster = draw(splats, camera, _background(stage, iteration), around=around)
     photometric = kernels.photometric_loss(raster.image, target, mask, ssim_weight=config.loss.ssim_weight)
     loss = photometric.loss
     if config.loss.volume_weight and len(splats.volumes):
@@ -182,13 +183,12 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     return report
 
 
-def _with_surroundings(splats: Splats, stage: Stage, weights, camera: Camera) -> Splats:  # type: ignore[no-untyped-def]
-    """The splats, and those of the frozen anchors around a block: drawn, but out of autograd's sight."""
+@torch.no_grad()
+def _surroundings(stage: Stage, weights: DecoderWeights, camera: Camera) -> Splats | None:
+    """The splats of the frozen anchors around a block: drawn, but out of autograd's sight."""
     if stage.surroundings is None or not len(stage.surroundings):
-        return splats
-    with torch.no_grad():
-        around = decode_visible(gather_visible(stage.surroundings, camera).anchors, weights, camera)
-    return beside(splats, around)
+        return None
+    return decode_visible(gather_visible(stage.surroundings, camera).anchors, weights, camera)
 
 
 def _move(state: TrainingState, stage: Stage, rows: Tensor, leaves: dict[str, Tensor]) -> None:
@@ -212,7 +212,7 @@ def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:
     """Add and remove anchors with their moments and statistics. Returns what StepReport says of it."""
     config = stage.config
     generator = torch.Generator().manual_seed(config.seed * 1_000_003 + state.iteration)
-    compensated, seen = _compensate(state, stage)
+    compensated, threshold = _compensate(state, stage)
     decision = decide(
         state.anchors, state.statistics, stage.voxel, config.growth, generator,
         compensated=compensated,
@@ -227,20 +227,20 @@ def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:
     if state.compensation is not None:
         state.compensation = state.compensation.extended(added).select(kept)
         begin_cycle(state.compensation, state.statistics)
-    return {"grown": added, "pruned": decision.pruned, "cycle": cycle_facts(decision, compensated) | seen}
+    cycle = {} if compensated is None else cycle_facts(compensated, threshold, decision)
+    return {"grown": added, "pruned": decision.pruned, "cycle": cycle}
 
 
-def _compensate(state: TrainingState, stage: Stage) -> tuple[Compensated | None, dict[str, Any]]:
-    """Close a growth cycle of compensated growth (eqs. 8-10): who is in L, and what is added for them."""
+def _compensate(state: TrainingState, stage: Stage) -> tuple[Compensated | None, float]:
+    """Close a cycle of compensated growth (eqs. 8-10): what is added for whom, and the T_low used."""
     if state.compensation is None:
-        return None, {}
+        return None, 0.0
     config = stage.config
     cameras = [stage.images.camera(view) for view in views_in_cycle(state.iteration, stage)]
     share = share_in_cycle(state.anchors.positions, cameras)
     low, threshold = low_visibility(share, config.compensation)
     update_cache(state.compensation, state.statistics, low, config.compensation)
-    compensated = state.compensation.compensated(low, threshold, config.growth, config.compensation)
-    return compensated, {"cycle_cameras": len(cameras), "t_low": threshold}
+    return compensate(state.compensation, low, threshold, config.growth, config.compensation), threshold
 
 
 def views_in_cycle(iteration: int, stage: Stage) -> list[int]:

@@ -6,17 +6,29 @@ Nothing heavy is imported before the options are parsed, so that help and usage 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, arg
 
 from vdgs.captures.options import CaptureOptions
-from vdgs.config import PRESETS, PresetName, TrainConfig
-from vdgs.run_options import CoarseOptions
+from vdgs.config import (
+    PRESETS,
+    AssignmentConfig,
+    BlockConfig,
+    MergeConfig,
+    MethodConfig,
+    PartitionConfig,
+    PresetName,
+    TrainConfig,
+)
+from vdgs.run_options import WatchOptions
 from vdgs.synth.options import SynthOptions
+
+if TYPE_CHECKING:
+    from vdgs.run import RunFolder
 
 # torch's OpenMP threads must block, not spin, beside the kernels' own pool; read once, when torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -49,7 +61,103 @@ class CoarseArguments:
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
-    watching: Annotated[CoarseOptions, arg(name="")] = field(default_factory=CoarseOptions)
+    watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+
+
+@dataclass(frozen=True)
+class RunArguments:
+    """Do everything: coarse model, visibility, blocks, cameras, block training, merge, metrics, report.
+
+    The same command continues a run that was stopped; finished stages are skipped.
+    """
+
+    capture: Positional[Path]
+    """Folder of the capture."""
+    output: Path
+    """Run folder; new, or the run to continue."""
+    preset: PresetName = "paper"
+    """`paper`: the paper's settings (100 000 + 50 000 iterations a block). `laptop`: a good result in minutes."""
+    redo: bool = False
+    """Allow other settings than the run has to discard what was trained with the old ones."""
+    jobs: int = 0
+    """Blocks trained at once; 0 takes what cores and memory allow."""
+    incomplete: bool = False
+    """Go on if a block fails: the coarse model stands in for it."""
+    lpips_weights: Path | None = None
+    """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
+    bins: int = 4
+    """Number of visibility quantiles by which metrics are reported."""
+    threads: int = 0
+    """Threads of the kernels; 0 for all cores. The result does not depend on it."""
+    options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
+    training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
+    partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
+    assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
+    block: BlockConfig = field(default_factory=BlockConfig)
+    merge: MergeConfig = field(default_factory=MergeConfig)
+    watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+
+    def method(self) -> MethodConfig:
+        return MethodConfig(self.training, self.partition, self.assignment, self.block, self.merge)
+
+
+@dataclass(frozen=True)
+class VisibilityArguments:
+    """Count how many training cameras see each part of a run's scene; writes a map and the distribution."""
+
+    run: Positional[Path]
+    """Run folder with a coarse model."""
+
+
+@dataclass(frozen=True)
+class PartitionArguments:
+    """Cut a run's scene into blocks by place and visibility, and give each block its cameras."""
+
+    run: Positional[Path]
+    """Run folder with a coarse model."""
+    redo: bool = False
+    """Allow another cut to discard blocks that are trained."""
+    threads: int = 0
+    """Threads of the kernels; 0 for all cores. The result does not depend on it."""
+    partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
+    assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
+
+
+@dataclass(frozen=True)
+class TrainArguments:
+    """Train the blocks of a run. The same command continues; blocks may also be trained on several machines."""
+
+    run: Positional[Path]
+    """Run folder that is cut into blocks."""
+    block: int | None = None
+    """Only this block, in this process; without it all of them, several at once."""
+    jobs: int = 0
+    """Blocks trained at once; 0 takes what cores and memory allow."""
+    redo: bool = False
+    """Allow other settings to discard blocks that are trained with the old ones."""
+    threads: int = 0
+    """Threads of the kernels for --block; 0 for all cores. The result does not depend on it."""
+    settings: Annotated[BlockConfig, arg(name="block")] = field(default_factory=BlockConfig)
+    watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+
+
+@dataclass(frozen=True)
+class MergeArguments:
+    """Merge the trained blocks of a run into one scene."""
+
+    run: Positional[Path]
+    """Run folder whose blocks are trained."""
+    incomplete: bool = False
+    """Let the coarse model stand in for blocks that are missing or failed."""
+    merge: Annotated[MergeConfig, arg(name="")] = field(default_factory=MergeConfig)
+
+
+@dataclass(frozen=True)
+class ReportArguments:
+    """Write RUN/report.html: one file with the figures, metrics, pictures and settings of a run."""
+
+    run: Positional[Path]
+    """Run folder."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +166,8 @@ class EvalArguments:
 
     run: Positional[Path]
     """Run folder."""
+    model: Literal["best", "coarse", "merged"] = "best"
+    """Which model; `best` is the merged one where there is one."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     bins: int = 4
@@ -86,6 +196,8 @@ class RenderArguments:
     """Image width; 0 takes that of the training views."""
     kind: Literal["image", "depth", "visibility"] = "image"
     """What to draw: the picture, expected depth, or the number of cameras that see each place."""
+    model: Literal["best", "coarse", "merged"] = "best"
+    """Which model; `best` is the merged one where there is one."""
     threads: int = 0
     """Threads of the kernels; 0 for all cores."""
 
@@ -121,20 +233,89 @@ def inspect(arguments: list[str]) -> None:
 
 def coarse(arguments: list[str]) -> None:
     preset = _preset(arguments)
-    default = CoarseArguments(tyro.MISSING, tyro.MISSING, preset, training=PRESETS[preset])
+    default = CoarseArguments(tyro.MISSING, tyro.MISSING, preset, training=PRESETS[preset].training)
     asked = tyro.cli(CoarseArguments, args=arguments, prog="vdgs coarse", default=default)
-    from vdgs.coarse import train_coarse
+    from vdgs.stages.coarse import begin_run, train_coarse
 
     _use_threads(asked.threads)
-    train_coarse(asked.capture, asked.output, asked.options, asked.training, asked.watching, _console())
+    method = replace(PRESETS[preset], training=asked.training)
+    run, capture = begin_run(asked.capture, asked.output, asked.options, method)
+    train_coarse(run, capture, asked.watching, _console())
+
+
+def run(arguments: list[str]) -> None:
+    preset = _preset(arguments)
+    settings = PRESETS[preset]
+    default = RunArguments(
+        tyro.MISSING, tyro.MISSING, preset, training=settings.training, partition=settings.partition,
+        assignment=settings.assignment, block=settings.block, merge=settings.merge,
+    )  # fmt: skip
+    asked = tyro.cli(RunArguments, args=arguments, prog="vdgs run", default=default)
+    from vdgs.stages.pipeline import run_all
+
+    _use_threads(asked.threads)
+    run_all(asked, _console())
+
+
+def visibility(arguments: list[str]) -> None:
+    asked = tyro.cli(VisibilityArguments, args=arguments, prog="vdgs visibility")
+    from vdgs.run import RunFolder
+    from vdgs.stages.partition import measure_visibility
+
+    measure_visibility(RunFolder(asked.run), _console())
+
+
+def partition(arguments: list[str]) -> None:
+    run, method = _recorded(arguments, PartitionArguments, "vdgs partition")
+    default = PartitionArguments(tyro.MISSING, partition=method.partition, assignment=method.assignment)
+    asked = tyro.cli(PartitionArguments, args=arguments, prog="vdgs partition", default=default)
+    from vdgs.stages.partition import partition_run
+
+    _use_threads(asked.threads)
+    _change(run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.redo)
+    partition_run(run, _console())
+
+
+def train(arguments: list[str]) -> None:
+    run, method = _recorded(arguments, TrainArguments, "vdgs train")
+    default = TrainArguments(tyro.MISSING, settings=method.block)
+    asked = tyro.cli(TrainArguments, args=arguments, prog="vdgs train", default=default)
+    _change(run, replace(method, block=asked.settings), asked.redo)
+    if asked.block is not None:
+        from vdgs.stages.block import train_block
+
+        _use_threads(asked.threads)
+        train_block(asked.run, asked.block, asked.watching, _console())
+    else:
+        from vdgs.stages.train import train_blocks
+
+        train_blocks(asked.run, asked.watching, asked.jobs, _console())
+
+
+def merge(arguments: list[str]) -> None:
+    run, method = _recorded(arguments, MergeArguments, "vdgs merge")
+    default = MergeArguments(tyro.MISSING, merge=method.merge)
+    asked = tyro.cli(MergeArguments, args=arguments, prog="vdgs merge", default=default)
+    from vdgs.stages.merge import merge_run
+
+    _change(run, replace(method, merge=asked.merge), redo=False)
+    merge_run(asked.run, asked.incomplete, _console())
 
 
 def eval(arguments: list[str]) -> None:
     asked = tyro.cli(EvalArguments, args=arguments, prog="vdgs eval")
-    from vdgs.evaluation.of_run import evaluate_run
+    from vdgs.stages.evaluate import evaluate_stage
 
     _use_threads(asked.threads)
-    evaluate_run(asked.run, asked.lpips_weights, asked.bins, _console())
+    evaluate_stage(asked.run, asked.model, asked.lpips_weights, asked.bins, _console())
+
+
+def report(arguments: list[str]) -> None:
+    asked = tyro.cli(ReportArguments, args=arguments, prog="vdgs report")
+    from vdgs.report import write_report
+    from vdgs.run import RunFolder
+
+    _console().print(f"report: {write_report(RunFolder(asked.run))}", highlight=False)
 
 
 def render(arguments: list[str]) -> None:
@@ -169,6 +350,32 @@ def doctor(arguments: list[str]) -> int:
     from vdgs.doctor import print_report
 
     return print_report(as_json=asked.json)
+
+
+def _recorded(arguments: list[str], kind: type, prog: str) -> tuple[RunFolder, MethodConfig]:
+    """The run that the arguments name and its settings: they are the defaults of the options (and of their help)."""
+    from vdgs.run import RunFolder
+
+    if "-h" in arguments or "--help" in arguments:
+        tyro.cli(kind, args=arguments, prog=prog)
+    run = RunFolder(tyro.cli(kind, args=arguments, prog=prog).run)
+    return run, run.method()
+
+
+def _change(run: RunFolder, method: MethodConfig, redo: bool) -> None:
+    """Give the run other settings for later stages, if they are other."""
+    from vdgs.config import to_dict
+    from vdgs.config_checks import validate
+    from vdgs.errors import VdgsError
+
+    problems = validate(method)
+    if problems:
+        raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
+    wanted = run.settings() | to_dict(method)
+    if wanted != run.settings():
+        with run.locked():
+            for line in run.change(wanted, redo):
+                _console().print(f"[yellow]changed[/] {line}", highlight=False)
 
 
 def _preset(arguments: list[str]) -> PresetName:

@@ -6,6 +6,7 @@ the same on every machine.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -34,6 +35,15 @@ class Thumbnail:
     caption: str
     photograph: UInt8[np.ndarray, "h w 3"]
     render: UInt8[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """A picture at the size at which it is shown, its label above it at the left, figures at the right."""
+
+    picture: Image.Image
+    label: str
+    figures: str = ""
 
 
 def absolute_error(
@@ -69,24 +79,28 @@ def comparison(
     if mask is not None:
         error = np.where(mask, error, np.nan)
     size = panel_size(reference.shape[1], reference.shape[0], PANEL_MIN_PX, PANEL_MAX_PX)
-    panels = [resize(picture, size) for picture in (reference, image, colourise(error, limit))]
-    unit = max(12, size[0] // 34)
+    photograph, render, errors = (resize(picture, size) for picture in (reference, image, colourise(error, limit)))
+    row = [Panel(photograph, "photograph"), Panel(render, "render", figures), Panel(errors, "absolute error")]
+    return row_of_panels(row, title, limit)
+
+
+def row_of_panels(panels: Sequence[Panel], title: str, limit: float) -> Image.Image:
+    """Pictures of one size side by side under a title; the last is an error, its colour bar stands at its right."""
+    width, height = panels[0].picture.size
+    count, unit = len(panels), max(12, width // 34)
     margin, gap, head = unit * 3 // 2, unit, unit * 9 // 2
     bar_width, ticks_width = unit, unit * 3
     canvas = Image.new(
-        "RGB", (2 * margin + 3 * size[0] + 3 * gap + bar_width + ticks_width, head + size[1] + margin), PAPER
+        "RGB", (2 * margin + count * (width + gap) + bar_width + ticks_width, head + height + margin), PAPER
     )
     draw = ImageDraw.Draw(canvas)
     draw.text((margin, unit * 9 // 10), title, INK, font(unit * 11 // 10, bold=True))
-    labels = ("photograph", "render", "absolute error")
-    for column, (panel, label) in enumerate(zip(panels, labels, strict=True)):
-        left = margin + column * (size[0] + gap)
-        canvas.paste(panel, (left, head))
-        draw.text((left, head - unit * 3 // 5), label, FAINT, font(unit), anchor="ls")
-    if figures:
-        right = margin + 2 * size[0] + gap
-        draw.text((right, head - unit * 3 // 5), figures, INK, font(unit), anchor="rs")
-    _colour_bar(canvas, (margin + 3 * (size[0] + gap), head, bar_width, size[1]), limit, unit)
+    for column, panel in enumerate(panels):
+        left = margin + column * (width + gap)
+        canvas.paste(panel.picture, (left, head))
+        draw.text((left, head - unit * 3 // 5), panel.label, FAINT, font(unit), anchor="ls")
+        draw.text((left + width, head - unit * 3 // 5), panel.figures, INK, font(unit), anchor="rs")
+    _colour_bar(canvas, (margin + count * (width + gap), head, bar_width, height), limit, unit)
     return canvas
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ class Blocks:
     def owner(self, places: Float[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
         """The block of every place: whose core holds it, else whose core is nearest (the first of equals).
 
-        O(n) memory for each block; distances only where no core holds the place.
+        O(n) time and memory but for the search for the nearest edge, O(log) for each place that no core holds.
         """
         owner = np.full(len(places), -1, np.int64)
         for index, block in enumerate(self.items):
@@ -47,10 +48,27 @@ class Blocks:
             owner[free[shapely.contains_xy(block.core, places[free, 0], places[free, 1])]] = index
         left = np.flatnonzero(owner < 0)
         if len(left):
-            points = shapely.points(places[left])
-            distances = np.stack([shapely.distance(block.core, points) for block in self.items], axis=1)
-            owner[left] = distances.argmin(axis=1)
+            owner[left] = self._nearest(places[left]) if len(self.items) > 1 else 0
         return owner
+
+    def _nearest(self, places: Float[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
+        """The block of the nearest edge, for places inside no core; the first of equals."""
+        edges, owners = self._edges
+        pairs = edges.query_nearest(shapely.points(places), all_matches=True)
+        nearest = np.full(len(places), len(self.items), np.int64)
+        np.minimum.at(nearest, pairs[0], owners[pairs[1]])
+        return nearest
+
+    @cached_property
+    def _edges(self) -> tuple[shapely.STRtree, Int64[np.ndarray, " e"]]:
+        """All edges of all cores, holes included, in a search tree; and whose they are."""
+        segments, owners = [], []
+        for index, block in enumerate(self.items):
+            for ring in (block.core.exterior, *block.core.interiors):
+                corners = np.asarray(ring.coords)
+                segments.append(shapely.linestrings(np.stack([corners[:-1], corners[1:]], axis=1)))
+                owners.append(np.full(len(corners) - 1, index, np.int64))
+        return shapely.STRtree(np.concatenate(segments)), np.concatenate(owners)
 
     def reaches(self, index: int, places: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
         """Which places belong to the widened block: inside its boundary, or owned by it."""

@@ -8,7 +8,7 @@ anchor covers would push the anchors at the boundary to fill the hole).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from vdgs.captures.images import ImageCache
 from vdgs.config import BlockConfig, block_training
 from vdgs.errors import RunError
 from vdgs.kernels import native as kernels
-from vdgs.partition.assignment import load_scores
+from vdgs.partition.saving import load_scores
 from vdgs.partition.blocks import Block, Blocks, load_blocks
 from vdgs.run import RunFolder, StageFolder
 from vdgs.run_options import WatchOptions
@@ -38,16 +38,6 @@ from vdgs.training import Stage, start_state
 
 #: Cells on each side of the table of the ramp.
 RAMP_CELLS = 512
-
-
-@dataclass(frozen=True)
-class BlockAnchors:
-    """The coarse anchors as one block sees them."""
-
-    #: What training moves.
-    own: Anchors
-    #: What is drawn and never moves.
-    surroundings: Anchors
 
 
 def train_block(path: Path, index: int, options: WatchOptions, console: Console) -> None:
@@ -75,7 +65,9 @@ def blocks_of(run: RunFolder) -> Blocks:
     """The blocks of a run, with cameras. Raises RunError unless they were made with the run's settings."""
     facts, keys = run.partition_facts(), run.keys()
     if (facts.get("key"), facts.get("assignment_key")) != (keys.partition, keys.assignment):
-        raise RunError(f"{run.path}: is not cut into blocks yet, or with other settings. Run: vdgs partition {run.path}")
+        raise RunError(
+            f"{run.path}: is not cut into blocks yet, or with other settings. Run: vdgs partition {run.path}"
+        )
     return load_blocks(run.partition / "blocks.geojson")
 
 
@@ -93,9 +85,11 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
     chosen = views_of_block(run, capture, index)
     views = [capture.train_views[i] for i in chosen]
     facts = {"capture": capture_facts(capture), "version": __version__, "block": index, "views": len(views)}
-    split = split_anchors(coarse.anchors, blocks, index, [view.camera for view in views], method.block)
-    if not views or not len(split.own):
-        _keep_coarse(folder, coarse, split, facts, len(views), console)
+    own, around = split_anchors(coarse.anchors, blocks, index, method.block)
+    around &= drawn_by(coarse.anchors, [view.camera for view in views])
+    anchors, surroundings = coarse.anchors.select(own), coarse.anchors.select(around)
+    if not views or not len(anchors):
+        _keep_coarse(folder, replace(coarse, anchors=anchors, facts=facts), len(views), console)
         return
     config = block_training(method, len(views))
     note_without_growth(config, console)
@@ -103,29 +97,29 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
     with ImageCache(views, image_budget(options), downscales=factors) as images:
         stage = Stage(
             config, images, len(views), coarse.voxel, camera_height(capture), coarse.background,
-            frozen_decoder=True, surroundings=split.surroundings,
+            frozen_decoder=True, surroundings=surroundings,
             may_hold=holds(blocks, index, method.block), mobility=ramp(blocks.items[index], method.block),
             appearance_of=chosen,
         )  # fmt: skip
-        state = continue_or_start(folder, stage, lambda: start_state(split.own, coarse.decoder, stage), console)
+        state = continue_or_start(folder, stage, lambda: start_state(anchors, coarse.decoder, stage), console)
         console.print(
-            f"block {index}: {len(views)} of {len(capture.train_views)} training views, {len(split.own):,} anchors of "
-            f"its own, {len(split.surroundings):,} around it, {config.iterations:,} iterations",
+            f"block {index}: {len(views)} of {len(capture.train_views)} training views, {int(own.sum()):,} anchors of "
+            f"its own, {len(surroundings):,} around it, {config.iterations:,} iterations",
             highlight=False,
         )
         train_watched(folder, state, stage, options, console)
-    model = AnchorModel(state.anchors, state.decoder, coarse.voxel, coarse.background, facts | {"iterations": state.iteration})
+    model = AnchorModel(
+        state.anchors, state.decoder, coarse.voxel, coarse.background, facts | {"iterations": state.iteration}
+    )
     finish(folder, state, model, console)
 
 
-def _keep_coarse(
-    folder: StageFolder, coarse: AnchorModel, split: BlockAnchors, facts: dict, views: int, console: Console
-) -> None:  # fmt: skip
+def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: Console) -> None:
     """A block that cannot be trained keeps what the coarse model has there, and says why."""
     why = "no camera sees it" if not views else "it holds no anchor"
-    AnchorModel(split.own, coarse.decoder, coarse.voxel, coarse.background, facts | {"iterations": 0}).save(folder.model)
-    folder.set_status("done", iteration=0, iterations=0, anchors=len(split.own), seconds=0.0, why=why)
-    console.print(f"[yellow]note[/] block {facts['block']} stays as the coarse model has it: {why}", highlight=False)
+    model.save(folder.model)
+    folder.set_status("done", iteration=0, iterations=0, anchors=len(model.anchors), seconds=0.0, why=why)
+    console.print(f"[yellow]note[/] this block stays as the coarse model has it: {why}", highlight=False)
 
 
 def places(positions: Float[Tensor, "n 3"]) -> Float[np.ndarray, "n 2"]:
@@ -133,22 +127,25 @@ def places(positions: Float[Tensor, "n 3"]) -> Float[np.ndarray, "n 2"]:
     return positions[:, :2].double().numpy()
 
 
-def split_anchors(
-    anchors: Anchors, blocks: Blocks, index: int, cameras: Sequence[Camera], config: BlockConfig
-) -> BlockAnchors:
-    """What a block moves and what it only draws.
+def split_anchors(anchors: Anchors, blocks: Blocks, index: int, config: BlockConfig) -> tuple[Tensor, Tensor]:
+    """What a block moves and what it only draws, as two masks [n].
 
-    Own are the anchors that the block owns (with a ring that is not frozen: that it reaches). Around it are those that
-    one of its cameras may draw: the ring and, with `config.context`, everything else.
+    Own are the anchors that the block owns (with a ring that is not frozen: that it reaches). Around it are the ring
+    and, with `config.context`, everything else.
     """
     place = places(anchors.positions)
     core, reached = blocks.owner(place) == index, blocks.reaches(index, place)
     own = core if config.ring == "frozen" else reached
-    around = torch.from_numpy(~own if config.context else reached & ~own)
+    around = ~own if config.context else reached & ~own
+    return torch.from_numpy(own), torch.from_numpy(around)
+
+
+def drawn_by(anchors: Anchors, cameras: Sequence[Camera]) -> Bool[Tensor, " n"]:
+    """Which anchors one of the cameras may draw."""
     drawn = torch.zeros(len(anchors), dtype=torch.bool)
     for camera in cameras:
         drawn[kernels.cull(anchors.positions, anchors.log_scales, camera)] = True
-    return BlockAnchors(anchors.select(torch.from_numpy(own)), anchors.select(around & drawn))
+    return drawn
 
 
 def holds(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -78,7 +79,7 @@ def _remove_beyond(run: RunFolder, count: int) -> None:
     """Delete blocks of an earlier cut into more of them."""
     for folder in run.block_folders():
         if int(folder.path.name) >= count:
-            folder.remove()
+            shutil.rmtree(folder.path)
 
 
 def _block_bytes(run: RunFolder, blocks: Blocks) -> int:

@@ -60,7 +60,9 @@ def continue_or_start(
                 f"{folder.checkpoints}: holds a state of another version ({error}). Start a new --output."
             ) from error
         if state.iteration > stage.config.iterations:
-            raise RunError(f"{folder.checkpoints}: is at iteration {state.iteration}, beyond {stage.config.iterations}.")
+            raise RunError(
+                f"{folder.checkpoints}: is at iteration {state.iteration}, beyond {stage.config.iterations}."
+            )
         discard_after(folder.checkpoints, state.iteration)
         console.print(f"continuing at iteration {state.iteration}")
     folder.cut_log(state.iteration)
@@ -120,9 +122,7 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or "not enough memory" in str(error) or "bad_alloc" in str(error)
 
 
-def _loop(
-    folder: StageFolder, state: TrainingState, stage: Stage, options: WatchOptions, console: Console
-) -> bool:
+def _loop(folder: StageFolder, state: TrainingState, stage: Stage, options: WatchOptions, console: Console) -> bool:
     """Train until complete (True) or asked to stop."""
     clock, board = _Clock(state), _board(folder, options, state.iteration)
     noted = time.monotonic()

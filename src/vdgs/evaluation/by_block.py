@@ -1,0 +1,161 @@
+"""Quality by block, and what the seams between blocks cost.
+
+Every pixel of a test view is labelled with the block that owns the place it shows. PSNR is then pooled by block, and
+the error near the borders of the labels is held against the error elsewhere. Borders may happen to lie in places that
+are hard anyway, so the coarse model, which has no seams, is measured on the same pixels. Nothing is kept but sums: one
+pass, memory bounded whatever the number of test views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int16
+
+from vdgs.cameras import Camera
+from vdgs.evaluation.metrics import psnr_of
+from vdgs.kernels.types import Raster
+from vdgs.partition.blocks import Blocks
+
+#: Pixels this near to a change of label belong to the border.
+BORDER_PX = 10.0
+#: Less opaque pixels count as showing nothing: their depth says little.
+DRAWN_ALPHA = 0.5
+#: A block is measured in the views of which it owns at least this share: a sliver tells little and costs a render.
+LEAST_SHARE = 0.005
+#: The label of a pixel where nothing is drawn.
+NOTHING = -1
+
+
+def label_map(drawn: Raster, camera: Camera, blocks: Blocks) -> Int16[np.ndarray, "h w"]:
+    """The block that owns what each pixel shows, NOTHING where alpha is at most one half.
+
+    The place is the centre of the pixel at the expected depth (the drawn depth divided by alpha).
+    Raises ValueError if the view was drawn without depth.
+    """
+    if drawn.depth is None:
+        raise ValueError("labels need a render with depth")
+    alpha = drawn.alpha.double().numpy()
+    seen = alpha > DRAWN_ALPHA
+    labels = np.full(alpha.shape, NOTHING, np.int16)
+    depth = drawn.depth.double().numpy()[seen] / alpha[seen]
+    labels[seen] = blocks.owner(_back_projected(np.argwhere(seen), depth, camera)[:, :2])
+    return labels
+
+
+def _back_projected(pixels: np.ndarray, depth: Float[np.ndarray, " n"], camera: Camera) -> Float[np.ndarray, "n 3"]:
+    """World points of pixels (row, column) [n, 2] at depths along the camera's axis; the inverse of `project`."""
+    x = (pixels[:, 1] + 0.5 - camera.cx) / camera.fx
+    y = (pixels[:, 0] + 0.5 - camera.cy) / camera.fy
+    spread = depth if camera.model == "pinhole" else np.ones_like(depth)
+    local = np.stack([x * spread, y * spread, depth], axis=1)
+    return (local - camera.camera_from_world[:3, 3]) @ camera.camera_from_world[:3, :3]
+
+
+def border_lines(labels: Int16[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels on either side of a change from one block to another; the edge of what is drawn is no border."""
+    lines = np.zeros(labels.shape, bool)
+    for first, second, here, there in (
+        (labels[1:], labels[:-1], lines[1:], lines[:-1]),
+        (labels[:, 1:], labels[:, :-1], lines[:, 1:], lines[:, :-1]),
+    ):
+        change = (first != second) & (first >= 0) & (second >= 0)
+        here |= change
+        there |= change
+    return lines
+
+
+def border_pixels(labels: Int16[np.ndarray, "h w"], width_px: float = BORDER_PX) -> Bool[np.ndarray, "h w"]:
+    """Drawn pixels whose centre is within `width_px` (Euclidean) of the centre of one on a border line."""
+    lines = border_lines(labels)
+    if not lines.any():
+        return lines
+    distance = cv2.distanceTransform((~lines).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return (distance <= width_px) & (labels >= 0)
+
+
+def blocks_shown(labels: Int16[np.ndarray, "h w"], blocks: int) -> list[int]:
+    """The blocks that own at least LEAST_SHARE of the view."""
+    counts = np.bincount(labels[labels >= 0].astype(np.int64), minlength=blocks)
+    return np.flatnonzero(counts >= max(1.0, LEAST_SHARE * labels.size)).tolist()
+
+
+class BlockMetrics:
+    """Squared errors of named renders, pooled by block; `add` each test view, then read `rows`."""
+
+    def __init__(self, blocks: int, names: Sequence[str]) -> None:
+        self._pixels = np.zeros(blocks, np.int64)
+        self._sums = {name: np.zeros(blocks) for name in names}
+
+    def add(
+        self,
+        labels: Int16[np.ndarray, "h w"],
+        squared_errors: Mapping[str, Float[np.ndarray, "h w"]],
+        mask: Bool[np.ndarray, "h w"] | None = None,
+    ) -> None:
+        """Count one view. Only blocks of `blocks_shown` take part, so that all renders are measured on the same pixels;
+        a name whose errors are NaN there has no figure for that block."""
+        counted = np.isin(labels, blocks_shown(labels, len(self._pixels)))
+        if mask is not None:
+            counted &= mask
+        keys = labels[counted].astype(np.int64)
+        self._pixels += np.bincount(keys, minlength=len(self._pixels))
+        for name, total in self._sums.items():
+            total += np.bincount(keys, weights=squared_errors[name][counted], minlength=len(total))
+
+    def rows(self) -> list[dict[str, Any]]:
+        """For each block: block, pixels, and `psnr_NAME` in dB of each render, NaN where it has none."""
+        return [{"block": index, **self._figures([index])} for index in range(len(self._pixels))]
+
+    def everywhere(self) -> dict[str, Any]:
+        """The same over the pixels of all blocks."""
+        return self._figures(list(range(len(self._pixels))))
+
+    def _figures(self, chosen: list[int]) -> dict[str, Any]:
+        pixels = int(self._pixels[chosen].sum())
+        means = {name: float(sums[chosen].sum()) / pixels if pixels else np.nan for name, sums in self._sums.items()}
+        return {"pixels": pixels, **{f"psnr_{name}": psnr_of(mean) for name, mean in means.items()}}
+
+
+class SeamMetrics:
+    """Errors at the borders of blocks against errors elsewhere; `add` each test view, then read `figures`."""
+
+    #: The renders that are compared. The coarse one has no seams: it says how hard the places at the borders are.
+    NAMES = ("coarse", "merged")
+
+    def __init__(self) -> None:
+        self._pixels = np.zeros(2, np.int64)
+        self._sums = {f"{kind}_{name}": np.zeros(2) for kind in ("mae", "mse") for name in self.NAMES}
+
+    def add(
+        self,
+        labels: Int16[np.ndarray, "h w"],
+        errors: Mapping[str, Float[np.ndarray, "h w"]],
+        mask: Bool[np.ndarray, "h w"] | None = None,
+    ) -> None:
+        """Count one view: absolute errors `mae_coarse`, `mae_merged`, squared `mse_coarse`, `mse_merged`."""
+        drawn = labels >= 0 if mask is None else mask & (labels >= 0)
+        at_border = border_pixels(labels)
+        for place, where in enumerate((drawn & at_border, drawn & ~at_border)):
+            self._pixels[place] += np.count_nonzero(where)
+            for name, sums in self._sums.items():
+                sums[place] += errors[name][where].sum()
+
+    def figures(self) -> dict[str, Any]:
+        """Means at the border and elsewhere, their ratio for each render, and `seam_mae`, `seam_mse`: the ratio of the
+        merged render over that of the coarse one. Above 1, merging left seams; NaN where there are no borders."""
+        result: dict[str, Any] = {"border_pixels": int(self._pixels[0]), "other_pixels": int(self._pixels[1])}
+        for name, sums in self._sums.items():
+            border, elsewhere = (_ratio(float(sums[place]), float(self._pixels[place])) for place in (0, 1))
+            result[name] = {"border": border, "elsewhere": elsewhere, "ratio": _ratio(border, elsewhere)}
+        for kind in ("mae", "mse"):
+            coarse, merged = (result[f"{kind}_{name}"]["ratio"] for name in self.NAMES)
+            result[f"seam_{kind}"] = _ratio(merged, coarse)
+        return result
+
+
+def _ratio(value: float, reference: float) -> float:
+    return value / reference if reference > 0 else float("nan")

@@ -1,0 +1,248 @@
+"""Evaluate what the cut into blocks gained and what its seams cost, with pictures of the worst places to look.
+
+OUTPUT/by_block.json    PSNR of each block: coarse, trained alone, merged; errors at borders against elsewhere
+OUTPUT/seams/NAME.png   coarse | merged | merged with the borders of blocks | error, where borders show most
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int16, UInt8
+from PIL import Image, ImageDraw
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from vdgs.cameras import Camera
+from vdgs.captures.capture import View
+from vdgs.errors import RunError
+from vdgs.evaluation import pictures, saving
+from vdgs.evaluation.by_block import (
+    BORDER_PX,
+    BlockMetrics,
+    SeamMetrics,
+    blocks_shown,
+    border_lines,
+    border_pixels,
+    label_map,
+)
+from vdgs.evaluation.metrics import masked_mean, psnr_of, squared_error, to_8bit
+from vdgs.evaluation.tables import shown
+from vdgs.kernels.types import Raster
+from vdgs.partition.blocks import Blocks
+
+#: Renders that are measured by block: without blocks, the block as it was trained, all blocks together.
+RENDERS = ("coarse", "alone", "merged")
+#: Pictures drawn at most: the views with the most border pixels.
+SEAM_VIEWS = 6
+#: Borders of blocks and their numbers: bright on a dark rim, so that they show on any ground.
+LINE_COLOUR, RIM_COLOUR = (255, 236, 64), (20, 20, 20)
+
+
+@dataclass(frozen=True, eq=False)
+class SeamView:
+    """What the picture of a view shows: renders and photograph in 8 bits, the label of each pixel."""
+
+    name: str
+    stem: str
+    coarse: UInt8[np.ndarray, "h w 3"]
+    merged: UInt8[np.ndarray, "h w 3"]
+    reference: UInt8[np.ndarray, "h w 3"]
+    mask: Bool[np.ndarray, "h w"] | None
+    labels: Int16[np.ndarray, "h w"]
+    #: Pixels near a border, those that the mask drops left out.
+    border: Bool[np.ndarray, "h w"]
+
+    @property
+    def border_pixels(self) -> int:
+        return int(np.count_nonzero(self.border))
+
+
+@dataclass(frozen=True, eq=False)
+class _Inputs:
+    """Where the images of a view come from."""
+
+    load_image: Callable[[View], UInt8[np.ndarray, "h w 3"]]
+    load_mask: Callable[[View], Bool[np.ndarray, "h w"] | None]
+    render_coarse: Callable[[Camera], Raster]
+    render_merged: Callable[[Camera], Raster]
+    render_block: Callable[[int, Camera], Raster | None]
+    blocks: Blocks
+
+
+@dataclass(eq=False)
+class _Gathered:
+    """What accumulates over the views; of the pictures, only the best so far."""
+
+    by_block: BlockMetrics
+    seams: SeamMetrics = field(default_factory=SeamMetrics)
+    views: list[dict[str, Any]] = field(default_factory=list)
+    worth_seeing: list[SeamView] = field(default_factory=list)
+
+
+def evaluate_blocks(
+    views: Sequence[View],
+    load_image: Callable[[View], UInt8[np.ndarray, "h w 3"]],
+    load_mask: Callable[[View], Bool[np.ndarray, "h w"] | None],
+    render_coarse: Callable[[Camera], Raster],
+    render_merged: Callable[[Camera], Raster],
+    render_block: Callable[[int, Camera], Raster | None],
+    blocks: Blocks,
+    output: Path,
+) -> dict[str, Any]:
+    """Measure every test view, write `output`, and return what `by_block.json` holds. One view is in memory at a time,
+    and those that are drawn.
+
+    `render_merged` draws depth, from which the labels follow. `render_block(index, camera)` is the image of a block as
+    it was trained, among its frozen surroundings; None where the block was not trained, whose figure is then null.
+    Raises RunError without views.
+    """
+    if not views:
+        raise RunError(f"{output}: there are no test views. Hold some out when the capture is read.")
+    inputs = _Inputs(load_image, load_mask, render_coarse, render_merged, render_block, blocks)
+    gathered = _Gathered(BlockMetrics(len(blocks), RENDERS))
+    for view, stem in zip(views, saving.file_stems([view.name for view in views]), strict=True):
+        _measure(view, stem, inputs, gathered)
+    result = saving.jsonable(
+        {
+            "blocks": gathered.by_block.rows(),
+            "all": gathered.by_block.everywhere(),
+            "seams": {"border_px": BORDER_PX, **gathered.seams.figures()},
+            "views": gathered.views,
+        }
+    )
+    for seen in gathered.worth_seeing:
+        saving.write_png(output / "seams" / f"{seen.stem}.png", np.asarray(seam_picture(seen)))
+    saving.write_json(output / "by_block.json", result)  # last: where it stands, the pictures are complete
+    return result
+
+
+def _measure(view: View, stem: str, inputs: _Inputs, gathered: _Gathered) -> None:
+    reference, mask = inputs.load_image(view), inputs.load_mask(view)
+    drawn = inputs.render_merged(view.camera)
+    labels = label_map(drawn, view.camera, inputs.blocks)
+    coarse, merged = _eight_bits(inputs.render_coarse(view.camera)), _eight_bits(drawn)
+    squared = {"coarse": squared_error(coarse, reference), "merged": squared_error(merged, reference)}
+    alone = _alone(view.camera, labels, reference, inputs)
+    gathered.by_block.add(labels, squared | {"alone": alone}, mask)
+    errors = {f"mse_{name}": values for name, values in squared.items()}
+    errors["mae_coarse"] = pictures.absolute_error(coarse, reference)
+    errors["mae_merged"] = pictures.absolute_error(merged, reference)
+    gathered.seams.add(labels, errors, mask)
+    kept = border_pixels(labels) if mask is None else border_pixels(labels) & mask
+    seen = SeamView(view.name, stem, coarse, merged, reference, mask, labels, kept)
+    best = sorted([*gathered.worth_seeing, seen], key=lambda each: -each.border_pixels)
+    gathered.worth_seeing = [each for each in best[:SEAM_VIEWS] if each.border_pixels]
+    gathered.views.append(
+        {
+            "name": view.name,
+            "border_pixels": seen.border_pixels,
+            **{f"psnr_{name}": psnr_of(masked_mean(values, mask)) for name, values in squared.items()},
+            **{f"psnr_{name}_border": _psnr_within(values, kept) for name, values in squared.items()},
+        }
+    )
+
+
+def _psnr_within(values: Float[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"]) -> float | None:
+    return psnr_of(float(values[where].mean())) if where.any() else None
+
+
+def _alone(
+    camera: Camera, labels: Int16[np.ndarray, "h w"], reference: UInt8[np.ndarray, "h w 3"], inputs: _Inputs
+) -> Float[np.ndarray, "h w"]:
+    """Squared error of each block's own render where the block is shown, NaN where there is none."""
+    errors = np.full(labels.shape, np.nan)
+    for index in blocks_shown(labels, len(inputs.blocks)):
+        rendered = inputs.render_block(index, camera)
+        if rendered is not None:
+            own = labels == index
+            errors[own] = squared_error(_eight_bits(rendered), reference)[own]
+    return errors
+
+
+def _eight_bits(rendered: Raster) -> UInt8[np.ndarray, "h w 3"]:
+    return to_8bit(rendered.image.detach().cpu().numpy())
+
+
+def seam_picture(view: SeamView) -> Image.Image:
+    """Coarse | merged | merged with the borders of blocks | error of the merged render, labelled."""
+    height, width = view.labels.shape
+    size = pictures.panel_size(width, height, pictures.PANEL_MIN_PX, pictures.PANEL_MAX_PX)
+    error = pictures.absolute_error(view.merged, view.reference)
+    if view.mask is not None:
+        error = np.where(view.mask, error, np.nan)
+    panels = [
+        pictures.Panel(pictures.resize(view.coarse, size), "coarse", _caption(view.coarse, view)),
+        pictures.Panel(pictures.resize(view.merged, size), "merged", _caption(view.merged, view)),
+        pictures.Panel(with_borders(view.merged, view.labels, size), "borders of blocks"),
+        pictures.Panel(
+            pictures.resize(pictures.colourise(error, pictures.ERROR_LIMIT), size), "absolute error of merged"
+        ),
+    ]
+    return pictures.row_of_panels(panels, view.name, pictures.ERROR_LIMIT)
+
+
+def _caption(image: UInt8[np.ndarray, "h w 3"], view: SeamView) -> str:
+    errors = squared_error(image, view.reference)
+    near = _psnr_within(errors, view.border)
+    return f"{psnr_of(masked_mean(errors, view.mask)):.2f} dB, near borders {shown(near, '{:.2f}')}"
+
+
+def with_borders(
+    image: UInt8[np.ndarray, "h w 3"], labels: Int16[np.ndarray, "h w"], size: tuple[int, int]
+) -> Image.Image:
+    """The picture at `size` (width, height) with thin lines between blocks and the number of each block."""
+    shown_labels = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
+    lines = border_lines(shown_labels)
+    rim = cv2.dilate(lines.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    pixels = np.asarray(pictures.resize(image, size)).copy()
+    pixels[rim], pixels[lines] = RIM_COLOUR, LINE_COLOUR
+    picture = Image.fromarray(pixels)
+    draw, face = ImageDraw.Draw(picture), pictures.font(max(12, size[0] // 34), bold=True)
+    for index in blocks_shown(shown_labels, int(shown_labels.max(initial=-1)) + 1):
+        place = _roomiest_place(shown_labels == index)
+        draw.text(place, str(index), LINE_COLOUR, face, anchor="mm", stroke_width=2, stroke_fill=RIM_COLOUR)
+    return picture
+
+
+def _roomiest_place(region: Bool[np.ndarray, "h w"]) -> tuple[int, int]:
+    """x, y of the pixel farthest from the region's edge and from the edge of the picture."""
+    padded = np.pad(region.astype(np.uint8), 1)
+    distance = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    row, column = divmod(int(distance.argmax()), region.shape[1])
+    return column, row
+
+
+def block_table(result: Mapping[str, Any]) -> RenderableType:
+    """What `by_block.json` holds, for the console."""
+    table = Table(box=box.SIMPLE_HEAD, title="PSNR (dB) by block, over test pixels", title_justify="left")
+    for column in ("block", "pixels", *RENDERS, "merged − coarse"):
+        table.add_column(column, justify="right")
+    for row in result["blocks"]:
+        table.add_row(str(row["block"]), *_cells(row))
+    table.add_section()
+    table.add_row("all", *_cells(result["all"]))
+    return Group(table, Text(_seam_line(result["seams"]), style="dim"))
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    coarse, alone, merged = (row[f"psnr_{name}"] for name in RENDERS)
+    gain = None if coarse is None or merged is None else merged - coarse
+    return [f"{row['pixels']:,}", *(shown(each, "{:.2f}") for each in (coarse, alone, merged)), shown(gain, "{:+.2f}")]
+
+
+def _seam_line(seams: Mapping[str, Any]) -> str:
+    if not seams["border_pixels"]:
+        return "no border between blocks is in sight"
+    coarse, merged = (shown(seams[f"mae_{name}"]["ratio"], "{:.3f}") for name in SeamMetrics.NAMES)
+    return (
+        f"error within {seams['border_px']:.0f} px of a border over error elsewhere: merged {merged}, coarse {coarse} "
+        f"(which has no seams); merged over coarse {shown(seams['seam_mae'], '{:.3f}')}"
+    )

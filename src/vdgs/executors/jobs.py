@@ -1,0 +1,161 @@
+"""One block's command, what it says of itself while it runs, and how it ended."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from vdgs.run import StageFolder
+
+State = Literal["queued", "running", "done", "failed", "stopped"]
+#: Readings of a status file between which the speed is measured.
+WINDOW = 20
+
+
+@dataclass(frozen=True)
+class Job:
+    """A command that trains one block, continues it after an interruption, and does nothing once it is done."""
+
+    index: int
+    folder: StageFolder
+    """The command locks it and keeps its status file; its output is appended to `output.log` there."""
+    command: list[str]
+    environment: dict[str, str] = field(default_factory=dict)
+    """Variables on top of those of this process."""
+
+    @property
+    def name(self) -> str:
+        return f"block {self.index:02d}"
+
+    @property
+    def output(self) -> Path:
+        return self.folder.path / "output.log"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended."""
+
+    index: int
+    state: Literal["done", "failed", "stopped"]
+    attempts: int
+    why: str = ""
+    """Empty when done."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a status file says; None where it says nothing that can be used."""
+
+    iteration: int | None = None
+    iterations: int | None = None
+    psnr: float | None = None
+    anchors: int | None = None
+    seconds_left: float | None = None
+    memory_bytes: int | None = None
+
+
+def read_figures(status_file: Path) -> Figures | None:
+    """The figures in a status file; None if it is missing or damaged. Never raises: a table is not worth a run."""
+    try:
+        status = json.loads(status_file.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not isinstance(status, dict):
+        return None
+    return Figures(
+        iteration=_count(status.get("iteration")),
+        iterations=_count(status.get("iterations")),
+        psnr=_number(status.get("psnr_training")),
+        anchors=_count(status.get("anchors")),
+        seconds_left=_number(status.get("seconds_left")),
+        memory_bytes=_count(status.get("peak_memory_bytes")),
+    )
+
+
+def _number(value: Any) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) and number >= 0 else None
+
+
+def _count(value: Any) -> int | None:
+    number = _number(value)
+    return None if number is None else int(number)
+
+
+class JobProgress:
+    """What is known of a job while the others run."""
+
+    def __init__(self, index: int):
+        self.index = index
+        self.state: State = "queued"
+        self.attempts = 0
+        self.figures = Figures()
+        self._readings: deque[tuple[float, int]] = deque(maxlen=WINDOW)
+
+    def observe(self, figures: Figures | None, now: float) -> None:
+        """Take what was read at `now` (seconds of any steady clock); what could not be read changes nothing."""
+        if figures is None:
+            return
+        self.figures = figures
+        if figures.iteration is None or self.state != "running":
+            return
+        if self._readings and figures.iteration < self._readings[-1][1]:
+            self._readings.clear()  # a new attempt continues from an earlier state
+        if not self._readings or figures.iteration > self._readings[-1][1]:
+            self._readings.append((now, figures.iteration))
+
+    def started(self) -> None:
+        """A new attempt begins: earlier readings say nothing of its speed."""
+        self.state, self.attempts = "running", self.attempts + 1
+        self._readings.clear()
+
+    @property
+    def speed(self) -> float | None:
+        """Iterations a second over the last readings; None before there are two."""
+        if len(self._readings) < 2:
+            return None
+        (began, first), (ended, last) = self._readings[0], self._readings[-1]
+        return (last - first) / (ended - began) if ended > began else None
+
+    @property
+    def seconds_left(self) -> float | None:
+        """What the job says itself, else what follows from its speed; None where neither is known."""
+        if self.figures.seconds_left is not None:
+            return self.figures.seconds_left
+        iteration, iterations, speed = self.figures.iteration, self.figures.iterations, self.speed
+        if iteration is None or iterations is None or not speed:
+            return None
+        return max(iterations - iteration, 0) / speed
+
+
+def seconds_left_overall(rows: list[JobProgress], at_once: int) -> float | None:
+    """Estimated time until all jobs are done; None before anything is known (complexity: one pass).
+
+    Jobs that wait are taken to be as fast, and where they say nothing as long, as those that ran.
+    """
+    speeds = [row.speed for row in rows if row.speed]
+    lengths = [row.figures.iterations for row in rows if row.figures.iterations]
+    speed = sum(speeds) / len(speeds) if speeds else None
+    length = sum(lengths) / len(lengths) if lengths else None
+    left = []
+    for row in rows:
+        if row.state not in ("queued", "running"):
+            continue
+        seconds = row.seconds_left if row.state == "running" else None
+        if seconds is None:
+            iterations = row.figures.iterations or length
+            if speed is None or iterations is None:
+                return None
+            seconds = max(iterations - (row.figures.iteration or 0), 0) / speed
+        left.append(seconds)
+    return max(*left, sum(left) / at_once) if left else 0.0

@@ -1,0 +1,165 @@
+"""What a person sees of jobs that run side by side: a live table on a terminal, lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+
+from rich import box
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from vdgs.executors.jobs import JobProgress, State, seconds_left_overall
+
+#: Seconds between two summary lines where there is no terminal to redraw.
+PLAIN_SECONDS = 15.0
+#: Lines of the table that are not rows of jobs: head, rules, totals, and one to spare for the prompt.
+FRAME_LINES = 7
+STYLES: dict[State, str] = {"queued": "dim", "running": "cyan", "done": "green", "failed": "red", "stopped": "yellow"}
+
+
+class Board:
+    """Shows rows until it is closed. Everything printed meanwhile goes through it, above the table."""
+
+    def __init__(self, console: Console, rows: list[JobProgress], at_once: int):
+        self._console, self._rows, self._at_once = console, rows, at_once
+        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        self._last_line = time.monotonic()
+
+    def __enter__(self) -> Board:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live is not None:
+            self.show()
+            self._live.stop()
+
+    def say(self, text: str, style: str = "") -> None:
+        """A line that stays."""
+        self._console.print(text, style=style, highlight=False, markup=False)
+
+    def note(self, text: str) -> None:
+        """A line about what the live table shows anyway: only where there is none."""
+        if self._live is None:
+            self.say(text)
+
+    def show(self) -> None:
+        """Redraw the table, or print the summary line if it is time."""
+        if self._live is not None:
+            table = progress_table(self._rows, self._at_once, self._console.height - FRAME_LINES)
+            self._live.update(table, refresh=True)
+        elif time.monotonic() - self._last_line >= PLAIN_SECONDS:
+            self._last_line = time.monotonic()
+            self.say(progress_line(self._rows, self._at_once))
+
+
+def progress_table(rows: list[JobProgress], at_once: int, most: int) -> Table:
+    """One row for each job and one with totals; of more than `most` jobs, those that wait or are done are counted."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in ("block", "state", "iteration", "PSNR (dB)", "anchors", "it/s", "left", "memory", "attempt"):
+        table.add_column(column, justify="left" if column == "state" else "right", no_wrap=True)
+    shown = _chosen(rows, max(most, 1))
+    for row in shown:
+        table.add_row(*_cells(row), style=STYLES[row.state])
+    if len(shown) < len(rows):
+        hidden = [row for row in rows if row not in shown]
+        table.add_row("…", _states(hidden), style="dim")
+    table.add_section()
+    table.add_row(*_totals(rows, at_once), style="bold")
+    return table
+
+
+def progress_line(rows: list[JobProgress], at_once: int) -> str:
+    """The table in one line: counts, the jobs that run, the time left."""
+    running = [
+        f"{row.index:02d}: {_iteration(row)}" + (f" {row.figures.psnr:.2f} dB" if row.figures.psnr is not None else "")
+        for row in rows
+        if row.state == "running"
+    ]
+    left = seconds_left_overall(rows, at_once)
+    parts = [f"blocks: {_states(rows)}", *running] + ([f"about {duration(left)} left"] if left is not None else [])
+    return " · ".join(parts)
+
+
+def duration(seconds: float) -> str:
+    """h:mm:ss."""
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+
+
+def _chosen(rows: list[JobProgress], most: int) -> list[JobProgress]:
+    if len(rows) <= most:
+        return rows
+    urgency = {"running": 0, "failed": 1, "stopped": 2, "queued": 3, "done": 4}
+    urgent = sorted(rows, key=lambda row: urgency[row.state])[:most]
+    return [row for row in rows if row in urgent]
+
+
+def _states(rows: Sequence[JobProgress]) -> str:
+    count = Counter(row.state for row in rows)
+    return ", ".join(f"{count[state]} {state}" for state in STYLES if count[state])
+
+
+def _iteration(row: JobProgress) -> str:
+    figures = row.figures
+    if figures.iteration is None:
+        return "starting" if row.state == "running" else "–"
+    return f"{figures.iteration:,}" + (f"/{figures.iterations:,}" if figures.iterations is not None else "")
+
+
+def _cells(row: JobProgress) -> list[str]:
+    figures, running = row.figures, row.state == "running"
+    return [
+        f"{row.index:02d}",
+        row.state,
+        _iteration(row),
+        _shown(figures.psnr, "{:.2f}"),
+        _shown(figures.anchors, "{:,}"),
+        _shown(row.speed if running else None, "{:.1f}"),
+        _shown(row.seconds_left if running else None),
+        _gigabytes(figures.memory_bytes),
+        str(row.attempts) if row.attempts else "–",
+    ]
+
+
+def _totals(rows: list[JobProgress], at_once: int) -> list[str]:
+    running = [row for row in rows if row.state == "running"]
+    done = sum(row.state == "done" for row in rows)
+    speeds = [row.speed for row in running if row.speed is not None]
+    memory = [row.figures.memory_bytes for row in running if row.figures.memory_bytes is not None]
+    anchors = [row.figures.anchors for row in rows if row.figures.anchors is not None]
+    return [
+        "all",
+        f"{done}/{len(rows)} done",
+        _percent(rows),
+        "",
+        _shown(sum(anchors) if anchors else None, "{:,}"),
+        _shown(sum(speeds) if speeds else None, "{:.1f}"),
+        _shown(seconds_left_overall(rows, at_once)),
+        _gigabytes(sum(memory) if memory else None),
+        str(sum(row.attempts for row in rows)),
+    ]
+
+
+def _percent(rows: list[JobProgress]) -> str:
+    """Share of the work done, a job that says nothing counting as one that has not begun."""
+    shares = []
+    for row in rows:
+        iteration, iterations = row.figures.iteration, row.figures.iterations
+        share = min((iteration or 0) / iterations, 1.0) if iterations else 0.0
+        shares.append(1.0 if row.state == "done" else share)
+    return f"{100 * sum(shares) / len(shares):.0f} %" if shares else "–"
+
+
+def _shown(value: float | None, form: str | None = None) -> str:
+    if value is None:
+        return "–"
+    return form.format(value) if form else duration(value)
+
+
+def _gigabytes(count: int | None) -> str:
+    return "–" if count is None else f"{count / 1e9:.1f} GB"

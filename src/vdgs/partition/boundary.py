@@ -1,0 +1,169 @@
+"""From clusters of anchors to boundaries on the plane: components, α-shapes, disjoint cores, widened blocks (fig. 3)."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from jaxtyping import Float, Int64
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import Delaunay, QhullError, cKDTree
+
+#: A cell is this many times the distance to a neighbour (its rank) that so large a share of the anchors has within.
+CELL_FACTOR, CELL_NEIGHBOUR, CELL_QUANTILE, CELL_SAMPLE = 2.0, 8, 0.95, 20_000
+#: A block of average size is at least so many cells across; the whole scene at most so many.
+LEAST_CELLS, MOST_CELLS = 6, 512
+#: Components are looked for between these quantiles of the anchors, widened by half; what lies beyond is an outlier.
+WINDOW, WINDOW_MARGIN = (0.01, 0.99), 0.5
+#: An α-shape is drawn through at most so many anchors.
+OUTLINE_POINTS = 20_000
+#: α in cells to begin with, and its growth until the shape is one polygon.
+ALPHA_CELLS, ALPHA_GROWTH = 1.0, 1.25
+EIGHT = np.ones((3, 3), bool)
+
+
+def cores_of(
+    places: Float[np.ndarray, "n 2"], labels: Int64[np.ndarray, " n"], count: int
+) -> list[shapely.Polygon | None]:
+    """The core of every cluster: polygons without common area. None for a cluster that is the strongest nowhere.
+
+    The largest connected component of each cluster, its α-shape with holes filled, simplified. Where two shapes
+    overlap the smaller keeps its place: a dense centre becomes a hole in the core of the outskirts about it.
+    """
+    cell = cell_size(places, count)
+    shapes = {label: _outline(members, cell) for label, members in _components(places, labels, count, cell).items()}
+    cores: list[shapely.Polygon | None] = [None] * count
+    taken = shapely.Polygon()
+    for label in sorted(shapes, key=lambda label: (shapes[label].area, label)):
+        core = _without_slivers(largest_part(shapes[label].difference(taken)), cell / 4)
+        if not core.is_empty:
+            cores[label] = core
+            taken = taken.union(core)
+    return cores
+
+
+def widen(core: shapely.Polygon, expansion: float) -> shapely.Polygon:
+    """The block's boundary: its core widened by `expansion` times the radius of a disc of its area (section III-B).
+
+    For a disc that is a factor of 1 + expansion about its centre (choice); it is defined for any other shape too, and
+    always holds the core.
+    """
+    distance = expansion * float(np.sqrt(core.area / np.pi))
+    if distance <= 0:
+        return core
+    # The core lies a hundred times deeper inside than simplifying can cut.
+    return largest_part(core.buffer(distance).simplify(distance / 100))
+
+
+def cell_size(places: Float[np.ndarray, "n 2"], count: int) -> float:
+    """Edge of the cells on which components are found (choice): twice the distance within which 95 % of the anchors have
+    eight neighbours, so that cells of sparse outskirts are seldom empty; within bounds set by the size of the scene.
+    """
+    low, high = np.quantile(places, WINDOW, axis=0)
+    extent = float((high - low).max()) or float(np.ptp(places, axis=0).max())
+    rank = min(CELL_NEIGHBOUR, len(places) - 1)
+    sample = places[:: -(-len(places) // CELL_SAMPLE)]
+    distances = cKDTree(places).query(sample, k=[rank + 1])[0]
+    wanted = CELL_FACTOR * float(np.quantile(distances, CELL_QUANTILE))
+    return float(np.clip(wanted, extent / MOST_CELLS, extent / (LEAST_CELLS * np.sqrt(count))))
+
+
+def _components(places: np.ndarray, labels: np.ndarray, count: int, cell: float) -> dict[int, Float[np.ndarray, "m 2"]]:
+    """The anchors of each cluster's largest component: most anchors, over cells in which the cluster is strongest."""
+    low, high = np.quantile(places, WINDOW, axis=0)
+    margin = WINDOW_MARGIN * (high - low) + cell
+    inside = ((places >= low - margin) & (places <= high + margin)).all(axis=1)
+    places, labels = places[inside], labels[inside]
+    # Two empty cells about everything: a closing reaches no border.
+    index = ((places - places.min(axis=0)) / cell).astype(np.int64) + 2
+    rows, columns = index.max(axis=0) + 3
+    flat = index[:, 0] * columns + index[:, 1]
+    most = np.zeros(rows * columns, np.int64)
+    strongest = np.full(rows * columns, -1, np.int64)
+    for label in range(count):
+        anchors = np.bincount(flat[labels == label], minlength=rows * columns)
+        strongest[anchors > most] = label
+        most = np.maximum(most, anchors)
+    found = {}
+    for label in range(count):
+        at_home = np.flatnonzero((labels == label) & (strongest[flat] == label))
+        if len(at_home) == 0:
+            continue
+        held = (strongest == label).reshape(rows, columns)
+        component = ndimage.label(ndimage.binary_closing(held, EIGHT), EIGHT)[0].ravel()[flat[at_home]]
+        found[label] = places[at_home[component == np.bincount(component).argmax()]]
+    return found
+
+
+def _outline(points: Float[np.ndarray, "m 2"], cell: float) -> shapely.Polygon:
+    """The α-shape of a component, simplified to what a cell can tell. One or two points, or a line, get a small buffer."""
+    spacing = cell / 4
+    thinned = points
+    while True:
+        _, first = np.unique(np.floor(points / spacing).astype(np.int64), axis=0, return_index=True)
+        thinned = points[np.sort(first)]
+        if len(thinned) <= OUTLINE_POINTS:
+            break
+        spacing *= np.sqrt(2)
+    shape = alpha_shape(thinned, ALPHA_CELLS * cell)
+    if shape is None or shape.area < (cell / 4) ** 2:
+        return shapely.MultiPoint(thinned).convex_hull.buffer(cell / 2)
+    return largest_part(shape.simplify(cell / 4))
+
+
+def alpha_shape(points: Float[np.ndarray, "m 2"], alpha: float) -> shapely.Polygon | None:
+    """The union of the Delaunay triangles of circumradius up to α, without holes; None if the points span no area.
+
+    α grows until the triangles hang together by their edges and every point is a corner of one.
+    """
+    if len(points) < 3:
+        return None
+    try:
+        mesh = Delaunay(points)
+    except QhullError:
+        return None
+    radii = _circumradii(points[mesh.simplices])
+    corners = np.unique(mesh.simplices[np.isfinite(radii)])
+    if len(corners) == 0:
+        return None
+    widest = radii[np.isfinite(radii)].max()
+    while alpha < widest:
+        kept = radii <= alpha
+        if len(np.unique(mesh.simplices[kept])) == len(corners) and _hang_together(mesh.neighbors, kept):
+            break
+        alpha *= ALPHA_GROWTH
+    kept = radii <= alpha
+    shape = largest_part(shapely.coverage_union_all(shapely.polygons(points[mesh.simplices[kept]])))
+    return largest_part(shapely.Polygon(shape.exterior).buffer(0))
+
+
+def _circumradii(triangles: Float[np.ndarray, "t 3 2"]) -> Float[np.ndarray, " t"]:
+    """abc / 4A of each triangle; infinite for one without area."""
+    sides = triangles - np.roll(triangles, 1, axis=1)
+    lengths = np.linalg.norm(sides, axis=2)
+    twice_area = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
+    flat = twice_area <= 1e-12 * lengths.max(axis=1) ** 2
+    return np.where(flat, np.inf, lengths.prod(axis=1) / np.where(flat, 1.0, 2 * twice_area))
+
+
+def _hang_together(neighbours: np.ndarray, kept: np.ndarray) -> bool:
+    """Whether the kept triangles are connected through common edges."""
+    start = np.repeat(np.arange(len(kept)), 3)
+    end = neighbours.ravel()
+    edges = (end >= 0) & kept[start] & kept[end]
+    graph = coo_array((np.ones(edges.sum(), bool), (start[edges], end[edges])), shape=(len(kept), len(kept)))
+    labels = connected_components(graph, directed=False)[1]
+    return len(np.unique(labels[kept])) == 1
+
+
+def _without_slivers(shape: shapely.Polygon, width: float) -> shapely.Polygon:
+    """The largest part of the shape that is more than twice `width` wide everywhere; a narrow shape stays as it is."""
+    opened = largest_part(shape.buffer(-width).buffer(width, quad_segs=4).intersection(shape))
+    return shape if opened.area < shape.area / 2 else opened
+
+
+def largest_part(shape: shapely.Geometry) -> shapely.Polygon:
+    """The polygon of largest area in any geometry; an empty one if there is none."""
+    parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon"]
+    return max(parts, key=lambda part: part.area, default=shapely.Polygon())

@@ -1,0 +1,125 @@
+"""The scene cut into blocks (section III-B, fig. 3): clusters, boundaries, and how many blocks there should be."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from jaxtyping import Float, Int
+
+from vdgs.config import PartitionConfig
+from vdgs.errors import VdgsError
+from vdgs.partition.blocks import Block, Blocks
+from vdgs.partition.boundary import cores_of, widen
+from vdgs.partition.cluster import cluster, features_of
+from vdgs.partition.plane import principal_plane
+
+#: A block that would own less than this share of the anchors of an average block is not worth training.
+LEAST_SHARE = 0.05
+
+#: What `--blocks auto` reckons with (choices): the paper's number of blocks, photographs that an average block needs,
+#: bytes in training per anchor of the block and of the scene about it, per pixel, and growth of a block in training.
+USUAL_BLOCKS = 8
+CAMERAS_PER_BLOCK = 50
+BYTES_PER_ANCHOR, BYTES_PER_CONTEXT_ANCHOR, BYTES_PER_PIXEL = 4_000, 1_000, 200
+ANCHOR_GROWTH = 3
+
+
+def cut_scene(
+    positions: Float[np.ndarray, "n 3"], views: Int[np.ndarray, " n"], config: PartitionConfig, seed: int
+) -> tuple[Blocks, list[str]]:
+    """Cut a scene into blocks by the places of its anchors and their visibility V; and warnings for people.
+
+    Every place has exactly one owner (`Blocks.owner`). The cut turns, moves and scales with the scene and does not
+    depend on the order of the anchors. Blocks are numbered along the longer axis of the scene. There are fewer blocks
+    than asked for, and a warning, where a cluster is the strongest nowhere on the plane (choice: its anchors join the
+    blocks about them). Raises VdgsError if the anchors cannot be cut; ValueError if the number of blocks is still "auto"
+    (`choose_block_count`).
+    """
+    ground = _checked(positions, views)
+    if config.blocking and config.blocks == "auto":
+        raise ValueError("the number of blocks is still 'auto': choose_block_count first")
+    count = int(config.blocks) if config.blocking else 1
+    if count < 1:
+        raise VdgsError(f"--blocks {count}: a scene is cut into at least 1 block")
+    if count == 1:
+        return _whole(ground, config.expansion), []
+    ground, views = _sorted(ground, np.asarray(views, np.int64))
+    plane = principal_plane(ground)
+    places, views = _sorted(plane.places(ground), views)
+    features = features_of(places, views, config.lambda_vis)
+    labels = cluster(features, count, seed, config.balanced)
+    cores = [core for core in cores_of(places, labels, count) if core is not None]
+    cores = _worth_training(sorted(cores, key=lambda core: (core.centroid.x, core.centroid.y)), places, count)
+    warnings = []
+    if len(cores) < count:
+        warnings.append(
+            f"the scene is cut into {len(cores)} blocks instead of {count}: the anchors of the other clusters are "
+            "scattered among those of their neighbours. A smaller --partition.lambda-vis or fewer blocks avoid this."
+        )
+    if len(cores) == 1:
+        return _whole(ground, config.expansion), warnings
+    grounded = [plane.to_ground(core) for core in cores]
+    return Blocks(tuple(Block(core, widen(core, config.expansion)) for core in grounded)), warnings
+
+
+def choose_block_count(n_anchors: int, n_cameras: int, image_pixels: int, config: PartitionConfig) -> int:
+    """The number of blocks that `config` asks for; for "auto" it follows from the scene and the memory.
+
+    Choice: the paper's eight blocks, or as many as keep a block within `block_memory_gb` in training, where a block's
+    anchors grow threefold and the rest of the scene stands about it; but never fewer than 50 photographs for an average
+    block (33 photographs make 1 block, 145 make 2, 400 and more make 8).
+    """
+    if not config.blocking:
+        return 1
+    if config.blocks != "auto":
+        return config.blocks
+    fixed = BYTES_PER_CONTEXT_ANCHOR * n_anchors + BYTES_PER_PIXEL * image_pixels
+    free = config.block_memory_gb * 1e9 - fixed
+    grown = ANCHOR_GROWTH * BYTES_PER_ANCHOR * n_anchors
+    most = max(1, n_cameras // CAMERAS_PER_BLOCK)
+    # Where even the scene about a block does not fit, smaller blocks help as far as the photographs allow.
+    wanted = most if free <= 0 else max(USUAL_BLOCKS, int(np.ceil(grown / free)))
+    return max(1, min(most, wanted, n_anchors))
+
+
+def area_of_blocks(blocks: Blocks) -> Float[np.ndarray, " k"]:
+    """The area of every core, in squared units of the ground frame."""
+    return np.array([block.core.area for block in blocks.items], np.float64)
+
+
+def _checked(positions: np.ndarray, views: np.ndarray) -> Float[np.ndarray, "n 2"]:
+    """x, y of the anchors in float64."""
+    ground = np.asarray(positions, np.float64)[:, :2]
+    if len(ground) == 0:
+        raise VdgsError("the coarse model holds no anchors: there is nothing to cut into blocks. Train it again.")
+    if not np.isfinite(ground).all():
+        raise VdgsError("the coarse model holds anchors at places that are not finite numbers. Train it again.")
+    if len(views) != len(ground):
+        raise ValueError(f"{len(views)} counts of views for {len(ground)} anchors")
+    return ground
+
+
+def _sorted(places: np.ndarray, views: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A canonical order, so that sums and draws do not depend on the order of the anchors."""
+    order = np.lexsort((views, places[:, 1], places[:, 0]))
+    return places[order], views[order]
+
+
+def _whole(ground: np.ndarray, expansion: float) -> Blocks:
+    """One block whose core holds every anchor; it owns every place."""
+    low, high = ground.min(axis=0), ground.max(axis=0)
+    margin = 0.01 * (high - low).max() + 1e-6 * np.abs(ground).max() + 1e-6
+    core = shapely.box(*(low - margin), *(high + margin))
+    return Blocks((Block(core, widen(core, expansion)),))
+
+
+def _worth_training(cores: list[shapely.Polygon], places: np.ndarray, count: int) -> list[shapely.Polygon]:
+    """The cores that own more than a trifle of the anchors; at least one."""
+    while len(cores) > 1:
+        owner = Blocks(tuple(Block(core, core) for core in cores)).owner(places)
+        owned = np.bincount(owner, minlength=len(cores))
+        least = int(owned.argmin())
+        if owned[least] >= LEAST_SHARE * len(places) / count:
+            break
+        cores = cores[:least] + cores[least + 1 :]
+    return cores

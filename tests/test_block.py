@@ -1,0 +1,194 @@
+"""Block training: what is frozen keeps its bits, and a block of everything is the scene."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+import torch
+
+from checkerboard import Photographs
+from vdgs.anchors import Anchors, initial_anchors
+from vdgs.config import (
+    AnchorConfig,
+    BlockConfig,
+    CompensationConfig,
+    GrowthConfig,
+    MethodConfig,
+    TrainConfig,
+    block_training,
+)
+from vdgs.decoder import Decoder
+from vdgs.partition.blocks import Block, Blocks
+from vdgs.render import gather_visible
+from vdgs.stages.block import drawn_by, holds, places, ramp, split_anchors
+from vdgs.training import Stage, TrainingState, from_saved, start_state, to_saved, train, views_in_cycle
+
+CONFIG = TrainConfig(
+    iterations=40,
+    anchors=AnchorConfig(offsets=4),
+    growth=GrowthConfig(
+        interval=10, statistics_from=0, start=10, until=1.0, threshold=1e-6, coarsest_cell=4.0, gate=0.05
+    ),
+    compensation=CompensationConfig(t_low=0.5),
+)
+#: West, where blocks are cut at x = 0, and east.
+BLOCKS = Blocks(
+    (
+        Block(shapely.box(-4, -4, 0, 4), shapely.box(-5, -5, 1, 5)),
+        Block(shapely.box(0, -4, 4, 4), shapely.box(-1, -5, 5, 5)),
+    )
+)
+
+
+def coarse() -> tuple[Anchors, Decoder]:
+    x, y = np.meshgrid(np.arange(-3.9, 4, 0.4), np.arange(-3.1, 3.2, 0.4))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    anchors, _ = initial_anchors(points, np.zeros((x.size, 3), np.uint8), [], AnchorConfig(offsets=4, voxel=0.4))
+    generator = torch.Generator().manual_seed(0)
+    anchors = replace(
+        anchors,
+        features=torch.randn(len(anchors), 32, generator=generator) * 0.3,
+        offsets=torch.randn(len(anchors), 4, 3, generator=generator) * 0.3,
+    )
+    return anchors, Decoder.initial(4, False, 0, 8, generator)
+
+
+def block_stage(config: BlockConfig, index: int = 0, training: TrainConfig = CONFIG) -> tuple[Stage, TrainingState]:
+    anchors, decoder = coarse()
+    photographs = Photographs()
+    own, around = split_anchors(anchors, BLOCKS, index, config)
+    surroundings = anchors.select(around & drawn_by(anchors, photographs.cameras))
+    stage = Stage(
+        training, photographs, 8, 0.4, 5.0, frozen_decoder=True, surroundings=surroundings,
+        may_hold=holds(BLOCKS, index, config), mobility=ramp(BLOCKS.items[index], config),
+    )  # fmt: skip
+    return stage, start_state(anchors.select(own), decoder, stage)
+
+
+def finish(stage: Stage, state: TrainingState, until: int = 1000) -> TrainingState:
+    train(state, stage, stop=lambda: state.iteration >= until, after_step=lambda *_: None)
+    return state
+
+
+def rows_of(anchors: Anchors) -> dict[bytes, bytes]:
+    """All that an anchor holds, by its position."""
+    return {
+        position.numpy().tobytes(): b"".join(t[i].numpy().tobytes() for t in anchors.tensors().values())
+        for i, position in enumerate(anchors.positions)
+    }
+
+
+def test_ring_context_and_decoder_keep_their_bits():
+    stage, state = block_stage(BlockConfig())
+    around, decoder = rows_of(stage.surroundings), {n: t.clone() for n, t in state.decoder.tensors().items()}
+    own = rows_of(state.anchors)
+    finish(stage, state)
+    assert rows_of(stage.surroundings) == around
+    assert all(torch.equal(tensor, decoder[name]) for name, tensor in state.decoder.tensors().items())
+    after = rows_of(state.anchors)
+    assert sum(after.get(position) != row for position, row in own.items()) > 0.5 * len(own)
+
+
+def test_new_anchors_stand_in_the_core():
+    stage, state = block_stage(BlockConfig())
+    before = len(state.anchors)
+    finish(stage, state)
+    assert len(state.anchors) > before
+    assert (BLOCKS.owner(places(state.anchors.positions)) == 0).all()
+
+
+def test_every_anchor_is_own_or_around_and_only_what_cameras_draw_is_held():
+    anchors, _ = coarse()
+    own, around = split_anchors(anchors, BLOCKS, 0, BlockConfig())
+    assert torch.equal(own, ~around)
+    cameras = Photographs().cameras
+    drawn = drawn_by(anchors, cameras)
+    for camera in cameras:
+        assert drawn[gather_visible(anchors, camera).rows].all()
+    far = replace(anchors, positions=anchors.positions + 100)
+    assert not drawn_by(far, cameras).any()
+
+
+def test_without_context_only_the_ring_is_drawn():
+    anchors, _ = coarse()
+    _, around = split_anchors(anchors, BLOCKS, 0, BlockConfig(context=False))
+    x = anchors.positions[around, 0]
+    assert len(x) > 0
+    assert float(x.min()) >= 0
+    assert float(x.max()) <= 1
+
+
+def test_a_free_ring_moves_and_a_ramp_moves_it_less():
+    moved = {}
+    for ring in ("free", "ramp"):
+        stage, state = block_stage(BlockConfig(ring=ring), training=replace(CONFIG, growth=GrowthConfig(levels=0)))
+        before = state.anchors.features.clone()
+        ring_rows = state.anchors.positions[:, 0] > 0.5  # beyond the middle of the ring
+        finish(stage, state, until=10)
+        moved[ring] = float((state.anchors.features - before)[ring_rows].abs().mean())
+    assert 0 < moved["ramp"] < 0.7 * moved["free"]
+
+
+def test_the_ramp_falls_from_core_to_boundary():
+    mobility = ramp(BLOCKS.items[0], BlockConfig(ring="ramp"))
+    assert mobility is not None
+    at = torch.tensor([[-2.0, 0, 0], [0.25, 0, 0], [0.5, 0, 0], [0.75, 0, 0], [-50, 0, 0]])
+    expected = torch.tensor([1.0, 0.75, 0.5, 0.25, 1.0])
+    torch.testing.assert_close(mobility(at), expected, atol=0.02, rtol=0)
+
+
+def test_one_block_without_surroundings_is_plain_training():
+    whole = Blocks((Block(shapely.box(-9, -9, 9, 9), shapely.box(-10, -10, 10, 10)),))
+    anchors, decoder = coarse()
+    own, around = split_anchors(anchors, whole, 0, BlockConfig())
+    assert own.all()
+    states = []
+    for surroundings, may_hold in ((None, None), (anchors.select(around), holds(whole, 0, BlockConfig()))):
+        stage = Stage(
+            CONFIG, Photographs(), 8, 0.4, 5.0, frozen_decoder=True, surroundings=surroundings, may_hold=may_hold
+        )
+        copied = anchors.select(torch.arange(len(anchors)))
+        states.append(finish(stage, start_state(copied, decoder, stage)))
+    assert rows_of(states[0].anchors) == rows_of(states[1].anchors)
+
+
+def test_a_stopped_and_continued_block_has_the_same_bits():
+    stage, state = block_stage(BlockConfig())
+    unbroken = finish(stage, state)
+    stage, state = block_stage(BlockConfig())
+    for until in (7, 10, 25):
+        finish(stage, state, until)
+        state = from_saved(to_saved(state), stage)
+    finish(stage, state)
+    for name, tensor in to_saved(unbroken).tensors.items():
+        assert torch.equal(tensor, to_saved(state).tensors[name]), name
+
+
+@pytest.mark.parametrize("change", [{"beta_g": 0.0}, {"t_low": 0.0}])
+def test_compensation_that_adds_nothing_is_plain_growth_bit_for_bit(change):
+    results = []
+    for compensation in (CompensationConfig(enabled=False), replace(CONFIG.compensation, **change)):
+        stage, state = block_stage(BlockConfig(), training=replace(CONFIG, compensation=compensation))
+        results.append(finish(stage, state))
+    plain, compensated = results
+    assert len(plain.anchors) > 170
+    assert rows_of(plain.anchors) == rows_of(compensated.anchors)
+
+
+def test_a_cycle_lasts_from_decision_to_decision():
+    stage = Stage(replace(CONFIG, growth=GrowthConfig(interval=3, statistics_from=0, start=6)), Photographs(), 8, 1, 1)
+    assert len(views_in_cycle(6, stage)) == 6  # the first cycle counts since the statistics began
+    assert len(views_in_cycle(12, stage)) == 3  # steps 10 to 12, within one epoch, which has no view twice
+    assert not {*views_in_cycle(12, stage)} & {*views_in_cycle(15, stage)}
+
+
+def test_rates_restart_lower_and_iterations_scale():
+    method = MethodConfig(block=BlockConfig(scale_iterations=0.1))
+    config = block_training(method, 500)
+    assert config.iterations == 5000
+    assert config.growth.start == 100
+    assert config.rates.offsets == pytest.approx((0.004, 4e-5))
+    assert config.rates.log_scales == pytest.approx((0.0056, 0.0056))
+    assert config.rates.features == method.training.rates.features
+    assert block_training(replace(method, block=BlockConfig(iterations=0)), 33).iterations == 1500

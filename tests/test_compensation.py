@@ -1,0 +1,298 @@
+"""Laws of compensated growth: what is remembered, what is added, and that nothing else changes."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vdgs.anchors import Anchors
+from vdgs.compensation import (
+    Compensation,
+    begin_cycle,
+    compensate,
+    cycle_facts,
+    cycle_gradient,
+    low_visibility,
+    update_cache,
+)
+from vdgs.config import CompensationConfig, GrowthConfig
+from vdgs.growth import Statistics, decide
+
+K = 3
+PAPER = CompensationConfig()
+GROWTH = GrowthConfig(threshold=1.0, levels=2, coarsest_cell=1.0)
+ALL, NONE = torch.ones(1, dtype=torch.bool), torch.zeros(1, dtype=torch.bool)
+
+
+def some_anchors(n: int, seed: int = 0) -> Anchors:
+    g = torch.Generator().manual_seed(seed)
+    return Anchors(
+        positions=torch.rand(n, 3, generator=g) * 40 - 20,
+        features=torch.randn(n, 32, generator=g),
+        offsets=torch.randn(n, K, 3, generator=g),
+        log_scales=torch.zeros(n, 6),
+    )
+
+
+def see(statistics: Statistics, times: torch.Tensor, mean: torch.Tensor) -> None:
+    """A cycle in which each offset is drawn so many times with that mean gradient."""
+    statistics.drawn += times
+    statistics.gradient += times * mean
+    statistics.seen += times.amax(1)
+    statistics.opacity += times.sum(1)
+
+
+def one_offset(times: float = 0.0, mean: float = 0.0) -> Statistics:
+    statistics = Statistics.zeros(1, 1)
+    see(statistics, torch.tensor([[times]]), torch.tensor([[mean]]))
+    return statistics
+
+
+def simulate(config: CompensationConfig | None, seed: int, cycles: int = 4, growth: GrowthConfig = GROWTH):
+    """Anchors and statistics after some cycles of random views; without compensation where config is None."""
+    anchors = some_anchors(25, seed)
+    statistics, memory = Statistics.zeros(25, K), Compensation.zeros(25, K)
+    for cycle in range(cycles):
+        g = torch.Generator().manual_seed(1000 * seed + cycle)
+        n = len(anchors)
+        share = torch.rand(n, generator=g)
+        see(statistics, torch.floor(60 * share[:, None] * torch.rand(n, K, generator=g)), torch.rand(n, K, generator=g))
+        change = None
+        if config is not None:
+            low, threshold = low_visibility(share, config)
+            update_cache(memory, statistics, low, config)
+            change = compensate(memory, low, threshold, growth, config)
+        decision = decide(anchors, statistics, 1.0, growth, g, compensated=change)
+        count = len(decision.added)
+        kept = torch.cat([decision.kept, torch.ones(count, dtype=torch.bool)])
+        anchors = anchors.extended(decision.added).select(kept)
+        statistics, memory = statistics.extended(count).select(kept), memory.extended(count).select(kept)
+        begin_cycle(memory, statistics)
+    return anchors, statistics, memory
+
+
+def bits(anchors: Anchors, statistics: Statistics) -> list[bytes]:
+    return [tensor.numpy().tobytes() for tensor in (*anchors.tensors().values(), *statistics.tensors().values())]
+
+
+@settings(deadline=None, max_examples=10)
+@given(
+    seed=st.integers(0, 1000),
+    config=st.sampled_from(
+        [replace(PAPER, beta_g=0.0), replace(PAPER, t_low=0.0), replace(PAPER, cap=1e-9, beta_g=0.0)]
+    ),
+)
+def test_without_weight_or_threshold_it_is_plain_growth_bit_for_bit(seed, config):
+    growth = replace(GROWTH, threshold=0.6, gate=0.2)
+    plain, compensated = simulate(None, seed, growth=growth), simulate(config, seed, growth=growth)
+    assert bits(*plain[:2]) == bits(*compensated[:2])
+    assert len(plain[0]) > 25
+
+
+def test_with_the_papers_weights_more_grows_and_twice_the_same():
+    plain, once, again = simulate(None, 5), simulate(PAPER, 5), simulate(PAPER, 5)
+    assert len(once[0]) > len(plain[0])
+    assert bits(*once[:2]) == bits(*again[:2])
+    assert torch.equal(once[2].cache, again[2].cache)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    cycles=st.lists(st.tuples(st.booleans(), st.integers(0, 50), st.floats(0, 1)), min_size=1, max_size=12),
+    beta=st.sampled_from([0.0, 1.0, 2.0, 3.0]),
+    gamma=st.sampled_from([0.0, 0.5, 0.9, 1.0]),
+    cap=st.sampled_from([0.0, 0.7]),
+)
+def test_the_cache_follows_the_recursion(cycles, beta, gamma, cap):
+    config = CompensationConfig(beta_g=beta, gamma=gamma, cap=cap)
+    statistics, memory, expected = one_offset(), Compensation.zeros(1, 1), 0.0
+    for low, times, mean in cycles:
+        see(statistics, torch.tensor([[float(times)]]), torch.tensor([[mean]]))
+        update_cache(memory, statistics, ALL if low else NONE, config)
+        begin_cycle(memory, statistics)
+        expected = gamma * expected + (beta * mean if low and times else 0.0)
+        expected = min(expected, cap) if cap else expected
+        assert float(memory.cache) == pytest.approx(expected, rel=1e-3, abs=1e-4)
+    assert not cap or float(memory.cache) <= np.float32(cap)
+
+
+def test_two_cycles_by_hand():
+    statistics, memory = one_offset(times=10, mean=0.5), Compensation.zeros(1, 1)
+    update_cache(memory, statistics, ALL, PAPER)
+    assert float(memory.cache) == 1.0  # 2 x 0.5
+    begin_cycle(memory, statistics)
+    update_cache(memory, statistics, ALL, PAPER)  # nothing seen in this cycle: only decay
+    assert float(memory.cache) == pytest.approx(0.9)
+    see(statistics, torch.tensor([[4.0]]), torch.tensor([[0.25]]))
+    update_cache(memory, statistics, NONE, PAPER)  # seen, but by enough cameras: only decay
+    assert float(memory.cache) == pytest.approx(0.81)
+
+
+def test_fed_steadily_the_statistic_tends_to_21_times_its_size():
+    memory, sizes = Compensation.zeros(1, 1), []
+    for _ in range(150):
+        statistics = one_offset(times=10, mean=0.5)
+        begin_cycle(memory, Statistics.zeros(1, 1))
+        update_cache(memory, statistics, ALL, PAPER)
+        sizes.append(float(memory.cache) + 0.5)
+    assert sizes[0] == pytest.approx(3 * 0.5)
+    assert sizes == sorted(sizes)
+    assert sizes[-1] == pytest.approx(0.5 * (1 + PAPER.beta_g / (1 - PAPER.gamma)), rel=1e-4)
+
+
+def test_what_is_not_judged_keeps_counting_and_the_cycle_is_still_its_own():
+    statistics, memory = one_offset(times=30, mean=2.0), Compensation.zeros(1, 1)
+    anchors = some_anchors(1)
+    anchors = replace(anchors, offsets=anchors.offsets[:, :1])
+    decide(anchors, statistics, 1.0, GROWTH, torch.Generator())  # 30 times is not 40: carried over
+    begin_cycle(memory, statistics)
+    see(statistics, torch.tensor([[5.0]]), torch.tensor([[0.5]]))
+    assert float(statistics.drawn) == 35
+    assert float(cycle_gradient(memory, statistics)) == pytest.approx(0.5)
+    see(statistics, torch.tensor([[10.0]]), torch.tensor([[0.5]]))
+    decide(anchors, statistics, 1.0, GROWTH, torch.Generator())  # 45 times: judged
+    begin_cycle(memory, statistics)
+    assert float(statistics.drawn) == 0
+    see(statistics, torch.tensor([[3.0]]), torch.tensor([[0.7]]))
+    assert float(cycle_gradient(memory, statistics)) == pytest.approx(0.7)
+
+
+def test_fewer_than_the_threshold_means_fewer():
+    share = torch.tensor([0.0, 19 / 100, 20 / 100, 21 / 100, 1.0])
+    low, threshold = low_visibility(share, PAPER)
+    assert low.tolist() == [True, True, False, False, False]
+    assert threshold == 0.2
+
+
+@given(shares=st.lists(st.integers(0, 20), max_size=30), quantile=st.sampled_from([0.1, 0.25, 0.5, 0.9]))
+def test_a_quantile_counts_the_anchors_that_some_camera_sees(shares, quantile):
+    share = torch.tensor(shares, dtype=torch.float32) / 20
+    low, threshold = low_visibility(share, replace(PAPER, t_low_quantile=quantile))
+    seen = share > 0
+    assert int((low & seen).sum()) <= quantile * (int(seen.sum()) - 1) + 1
+    if seen.any():
+        assert low[~seen].all()
+        assert threshold == pytest.approx(float(np.quantile(share[seen].numpy(), quantile)))
+    else:
+        assert not low.any()
+
+
+@pytest.mark.parametrize(
+    ("gate", "interval", "expected"),
+    [("scaled", 100, 8.0), ("literal", 100, 40.0), ("scaled", 10, 2.0), ("scaled", 2, 0.8)],
+)
+def test_the_gate_of_low_visibility(gate, interval, expected):
+    growth, config = replace(GROWTH, interval=interval), replace(PAPER, gate=gate)
+    change = compensate(Compensation.zeros(1, 1), ALL, config.t_low, growth, config)
+    assert change.gate == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("gate", "judged"), [("scaled", True), ("literal", False)])
+def test_an_offset_drawn_nine_times_is_judged_only_by_the_scaled_gate(gate, judged):
+    config = replace(PAPER, gate=gate)
+    n = 30
+    anchors, statistics, memory = some_anchors(n), Statistics.zeros(n, K), Compensation.zeros(n, K)
+    see(statistics, torch.full((n, K), 9.0), torch.full((n, K), 0.5))
+    low = torch.arange(n) < 20
+    update_cache(memory, statistics, low, config)
+    change = compensate(memory, low, 0.2, GROWTH, config)
+    decision = decide(anchors, statistics, 1.0, GROWTH, torch.Generator().manual_seed(0), compensated=change)
+    assert (len(decision.added) > 0) == judged
+    assert (statistics.drawn == 0).all(1).tolist() == [judged and bool(each) for each in low]
+
+
+def test_a_poorly_seen_place_grows_where_plain_growth_sees_nothing():
+    n = 200
+    anchors = some_anchors(n)
+    east = anchors.positions[:, 0] > 0
+    results = {}
+    for name, config in (("plain", None), ("compensated", PAPER)):
+        statistics, memory = Statistics.zeros(n, K), Compensation.zeros(n, K)
+        # East: 12 of 100 views, west: 60; everywhere 80 % of the gradient that asks for an anchor.
+        times = torch.where(east, 12.0, 60.0)[:, None].expand(n, K)
+        see(statistics, times, torch.full((n, K), 0.8))
+        change = None
+        if config is not None:
+            low, threshold = low_visibility(torch.where(east, 0.12, 0.6), config)
+            update_cache(memory, statistics, low, config)
+            change = compensate(memory, low, threshold, GROWTH, config)
+        decision = decide(anchors, statistics, 1.0, GROWTH, torch.Generator().manual_seed(0), compensated=change)
+        results[name] = decision, change
+    assert len(results["plain"][0].added) == 0
+    decision, change = results["compensated"]
+    assert len(decision.added) > 50
+    assert float(decision.added.positions[:, 0].min()) > -5  # offsets reach some units beyond their anchor
+    facts = cycle_facts(change, 0.2, decision)
+    assert facts["grown_low"] == len(decision.added)
+    assert facts["grown_other"] == 0
+    assert facts["low_share"] == pytest.approx(float(east.float().mean()))
+    assert facts["mean_cache"] == facts["max_cache"] == pytest.approx(1.6)
+    assert len(decision.added.log_scales.unique()) == 2  # both levels grew
+    assert json.loads(json.dumps(facts)) == facts
+
+
+def test_what_is_remembered_is_added_only_where_few_cameras_see():
+    memory = Compensation.zeros(3, K)
+    memory.cache += 0.5
+    change = compensate(memory, torch.tensor([True, False, True]), 0.2, GROWTH, PAPER)
+    assert change.added.tolist() == [[0.5] * K, [0.0] * K, [0.5] * K]
+
+
+def test_what_grows_plainly_grows_compensated_too():
+    growth = replace(GROWTH, levels=1)  # finer levels see the anchors of coarser ones
+    n = 300
+    anchors, memory = some_anchors(n), Compensation.zeros(n, K)
+    g = torch.Generator().manual_seed(1)
+    times, mean = torch.full((n, K), 50.0), 2 * torch.rand(n, K, generator=g)
+    low = torch.arange(n) % 3 == 0
+    statistics = [Statistics.zeros(n, K), Statistics.zeros(n, K)]
+    for each in statistics:
+        see(each, times, mean)
+    update_cache(memory, statistics[1], low, PAPER)
+    change = compensate(memory, low, 0.2, growth, PAPER)
+    plain = decide(anchors, statistics[0], 1.0, growth, torch.Generator().manual_seed(2))
+    more = decide(anchors, statistics[1], 1.0, growth, torch.Generator().manual_seed(2), compensated=change)
+    plain_cells, more_cells = ({tuple(row) for row in d.added.positions.tolist()} for d in (plain, more))
+    assert plain_cells < more_cells
+    assert more.grown_low + more.grown_other == len(more.added)
+    assert more.grown_other > 0
+    assert plain.grown_low == 0
+    assert plain.grown_other == len(plain.added)
+
+
+def test_facts_without_low_visibility_are_null():
+    anchors, statistics, memory = some_anchors(2), Statistics.zeros(2, K), Compensation.zeros(2, K)
+    change = compensate(memory, torch.zeros(2, dtype=torch.bool), 0.2, GROWTH, PAPER)
+    facts = cycle_facts(change, 0.2, decide(anchors, statistics, 1.0, GROWTH, torch.Generator(), compensated=change))
+    assert facts["mean_cache"] is None
+    assert facts["low_share"] == 0
+    assert not any(isinstance(value, float) and math.isnan(value) for value in facts.values())
+
+
+def test_select_and_extend_keep_rows_together():
+    memory = Compensation(*(torch.arange(12.0).reshape(4, 3) + 100 * i for i in range(3)))
+    moved = memory.extended(2).select(torch.tensor([5, 2, 0]))
+    for i, tensor in enumerate(moved.tensors().values()):
+        expected = torch.stack([torch.zeros(3), torch.arange(6.0, 9) + 100 * i, torch.arange(0.0, 3) + 100 * i])
+        assert torch.equal(tensor, expected)
+
+
+def test_statistics_of_other_anchors_are_refused():
+    memory, statistics = Compensation.zeros(2, K), Statistics.zeros(3, K)
+    with pytest.raises(ValueError, match=r"\[2, 3\].*\[3, 3\]"):
+        begin_cycle(memory, statistics)
+    with pytest.raises(ValueError, match=r"\[2, 3\].*\[3, 3\]"):
+        update_cache(memory, statistics, torch.ones(2, dtype=torch.bool), PAPER)
+
+
+def test_the_snapshots_are_copies():
+    statistics, memory = one_offset(times=5, mean=1.0), Compensation.zeros(1, 1)
+    begin_cycle(memory, statistics)
+    see(statistics, torch.tensor([[1.0]]), torch.tensor([[3.0]]))
+    assert float(memory.drawn_before) == 5
+    assert float(cycle_gradient(memory, statistics)) == pytest.approx(3.0)
