@@ -91,4 +91,5 @@ def checksum(tensors: Mapping[str, Tensor]) -> int:
 
 def _bytes_of(tensor: Tensor) -> memoryview:
     """The memory of a contiguous tensor."""
-    return memoryview(tensor.reshape(-1).view(torch.uint8).numpy()) if tensor.numel() else memoryview(bytearray())
+    # An empty array has no memory to view; and numpy's types do not say that an array is a buffer.
+    return memoryview(tensor.reshape(-1).view(torch.uint8).numpy() if tensor.numel() else bytearray())  # type: ignore[arg-type]
