@@ -4,7 +4,8 @@
 
 A random anchor scene seen from above, in which all anchors are visible, with about half of the opacities positive
 (what a fresh decoder gives). Prints the median of each phase. Memory is the slope of the peak resident size of fresh
-processes over the number of anchors: of those in view, with all that a step makes of them, and of those out of view.
+processes over the number of anchors: of those in view, with all that a step makes of them, and of those out of view;
+and for a model half in view the whole process without what it imports. Saving is what it adds to the resident size.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ import os
 import statistics as stats
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -26,14 +29,15 @@ import torch
 from machine import describe
 from vdgs.anchors import TRAINED, Anchors
 from vdgs.cameras import Camera
+from vdgs.checkpoints import save_state
 from vdgs.config import TrainConfig
 from vdgs.decoder import Decoder
 from vdgs.kernels import native as kernels
 from vdgs.kernels.native.module import set_threads
+from vdgs.memory import forget_peak, peak_memory_bytes
 from vdgs.optimiser import rates_at
-from vdgs.progress import peak_memory_bytes
 from vdgs.render import decode_visible, draw, gather_visible
-from vdgs.training import start_state
+from vdgs.training import Stage, start_state, to_saved
 
 PHASES = ("cull", "decode", "rasterise", "loss", "backward", "adam", "statistics")
 
@@ -96,7 +100,9 @@ def one_step(
 
 def prepare(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Any, Camera, torch.Tensor]:
     anchors, camera = scene(visible, width, height, hidden)
-    state = start_state(anchors, Decoder.initial(10, False, 0, 1, torch.Generator().manual_seed(0)))
+    decoder = Decoder.initial(10, False, 0, 1, torch.Generator().manual_seed(0))
+    nothing: Any = None  # no photographs: a random target instead
+    state = start_state(anchors, decoder, Stage(TrainConfig(), nothing, 1, 1.0, 1.0))
     target = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
     return state, camera, target
 
@@ -112,24 +118,34 @@ def measure(visible: int, width: int, height: int, repeats: int) -> None:
     print(f"{width}x{height}  {seen} visible anchors, {splats} splats: {total:.1f} ms a step   ({parts})", flush=True)
 
 
-def peak_bytes(visible: int, hidden: int) -> int:
-    """Peak resident size of a fresh process that makes three steps."""
+def peaks(visible: int, hidden: int) -> tuple[int, int, int]:
+    """Bytes of a fresh process: once all is imported, at most during three steps, and what saving adds after them."""
     asked = [sys.executable, __file__, "--peak", str(visible), str(hidden)]
-    return int(subprocess.run(asked, check=True, capture_output=True, text=True).stdout)
+    imported, steps, saving = subprocess.run(asked, check=True, capture_output=True, text=True).stdout.split()
+    return int(imported), int(steps), int(saving)
 
 
-def print_peak(visible: int, hidden: int) -> None:
+def print_peaks(visible: int, hidden: int) -> None:
+    imported = peak_memory_bytes()
     state, camera, target = prepare(visible, 400, 300, hidden)
     for step in range(1, 4):
         one_step(state, camera, target, step, {phase: [] for phase in PHASES})
-    print(peak_memory_bytes())
+    steps = peak_memory_bytes()
+    forget_peak()
+    before = peak_memory_bytes()
+    with tempfile.TemporaryDirectory() as folder:
+        save_state(Path(folder), to_saved(state))
+    print(imported, steps, peak_memory_bytes() - before)
 
 
 def report_memory(step: int = 100_000) -> None:
-    base = peak_bytes(step, 0)
-    in_view = (peak_bytes(2 * step, 0) - base) / step
-    out_of_view = (peak_bytes(step, 4 * step) - base) / (4 * step)
+    imported, base, saving = peaks(step, 0)
+    in_view = (peaks(2 * step, 0)[1] - base) / step
+    out_of_view = (peaks(step, 4 * step)[1] - base) / (4 * step)
+    half = (peaks(step, step)[1] - imported) / (2 * step)
     print(f"memory: {in_view:.0f} B for each anchor in view, {out_of_view:.0f} B for each out of view")
+    print(f"        {half:.0f} B an anchor where half of {2 * step:,} are in view: the whole process but its imports")
+    print(f"        {saving / step:.0f} B an anchor more while a state is saved ({saving / 1e6:.1f} MB)")
 
 
 def main() -> None:
@@ -140,7 +156,7 @@ def main() -> None:
     parser.add_argument("--peak", type=int, nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.peak:
-        print_peak(*arguments.peak)
+        print_peaks(*arguments.peak)
         return
     set_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)

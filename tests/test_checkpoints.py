@@ -1,10 +1,10 @@
 """States are whole or absent; a damaged one is noticed and the one before it used."""
 
 import json
+import resource
 
 import pytest
 import torch
-from safetensors import SafetensorError
 
 from vdgs.checkpoints import SavedState, load_newest, remove_leftovers, save_state
 from vdgs.errors import VdgsError
@@ -74,15 +74,16 @@ def test_leftovers_of_a_cut_off_write_are_removed(tmp_path):
     assert json.loads((tmp_path / "00000001.json").read_text())["iteration"] == 1
 
 
-def test_a_refusing_disk_is_reported_and_loses_nothing(tmp_path, monkeypatch):
+def test_a_refusing_disk_is_reported_and_loses_nothing(tmp_path):
     save_state(tmp_path, state(1))
-
-    def full(*_args, **_kwargs):
-        raise SafetensorError("No space left on device")  # what safetensors makes of the system's error
-
-    monkeypatch.setattr("vdgs.checkpoints.save_file", full)
-    with pytest.raises(VdgsError, match=r"No space left.*continues"):
-        save_state(tmp_path, state(2))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300, before[1]))  # writes beyond fail, as on a full disk
+    try:
+        with pytest.raises(VdgsError, match=r"00000002\.safetensors: cannot be written.*continues"):
+            save_state(tmp_path, state(2))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["00000001.json", "00000001.safetensors"]
     loaded, _ = load_newest(tmp_path)
     assert loaded is not None
     assert same(loaded, state(1))

@@ -3,47 +3,64 @@
 #include "decode.h"
 
 #include <mutex>
+#include <vector>
 
 #include "threads.h"
 
 namespace vdgs {
 namespace {
 
-constexpr int64_t kPiece = 256;                      // anchors per task
-constexpr int64_t kStoredSplats = int64_t{1} << 20;  // 64 MiB, the most that the store keeps
+constexpr int64_t kPiece = 256;  // anchors per task
 
-// Memory of pieces that are done. Never destroyed: views may outlive everything else.
-struct Store {
-  std::mutex mutex;
-  std::vector<Piece> pieces;
-  int64_t capacity = 0;
+// A splat on its way out of the decoder, in one piece of sixteen words, so that sixteen splats are a
+// transpose and one splat is one register.
+struct Splat {
+  float x, y, conic_xx, conic_xy, conic_yy, depth, red, green, blue, opacity, volume;
+  int32_t source;
+  float unused[4];
+};
+static_assert(sizeof(Splat) == 16 * sizeof(float));
 
-  Piece take(int64_t wanted) {
-    {
-      const std::lock_guard<std::mutex> lock(mutex);
-      if (!pieces.empty() && pieces.back().capacity >= wanted) {
-        Piece piece = std::move(pieces.back());
-        pieces.pop_back();
-        capacity -= piece.capacity;
-        return piece;
-      }
-    }
-    return {std::unique_ptr<Splat[]>(new Splat[static_cast<size_t>(wanted)]), wanted, 0};
-  }
-
-  void give_back(Piece piece) {
-    const std::lock_guard<std::mutex> lock(mutex);
-    if (capacity + piece.capacity > kStoredSplats) return;
-    capacity += piece.capacity;
-    piece.count = 0;
-    pieces.push_back(std::move(piece));
-  }
+// Room for the splats of a piece of consecutive anchors.
+struct Piece {
+  std::unique_ptr<Splat[]> splats;
+  int64_t capacity = 0, count = 0;
 };
 
-Store& store_of_pieces() {
-  static Store* const store = new Store;
-  return *store;
-}
+// The pieces of a wave: as many as keep all threads busy, few enough to stay in the caches and to be kept
+// for the next view. (The system asks for more time to hand out fresh pages than it takes to fill them.)
+class Wave {
+ public:
+  Wave(int64_t pieces, int64_t capacity) {
+    const std::lock_guard<std::mutex> lock(mutex());
+    pieces_.swap(kept());
+    while (static_cast<int64_t>(pieces_.size()) < pieces) pieces_.emplace_back();
+    for (Piece& piece : pieces_)
+      if (piece.capacity < capacity)
+        piece = {std::unique_ptr<Splat[]>(new Splat[static_cast<size_t>(capacity)]), capacity, 0};
+  }
+  ~Wave() {
+    const std::lock_guard<std::mutex> lock(mutex());
+    if (kept().size() < pieces_.size()) kept().swap(pieces_);
+  }
+  Wave(const Wave&) = delete;
+  Wave& operator=(const Wave&) = delete;
+
+  Piece& operator[](int64_t i) { return pieces_[static_cast<size_t>(i)]; }
+
+ private:
+  // Never destroyed: a thread may decode while the process ends.
+  static std::mutex& mutex() {
+    static auto* const mutex = new std::mutex;
+    return *mutex;
+  }
+  static std::vector<Piece>& kept() {
+    static auto* const pieces = new std::vector<Piece>;
+    return *pieces;
+  }
+
+  std::vector<Piece> pieces_;
+};
 
 struct alignas(64) Outputs {
   float opacity[kMaxOffsets * kLanes];
@@ -132,46 +149,47 @@ void decode_piece(const AnchorArrays& anchors, WeightLayout layout, const float*
   }
 }
 
+// Writes the splats of a piece as rows from m on.
+void write_piece(const Piece& piece, size_t m, const DecodedView& out) {
+  float *means_px = out.means_px.data(), *conics = out.conics.data(), *colours = out.colours.data();
+  float *depths = out.depths.data(), *opacities = out.opacities.data(), *volumes = out.volumes.data();
+  int32_t* source = out.source.data();
+  for (int64_t j = 0; j < piece.count; ++j) {
+    const Splat& s = piece.splats[static_cast<size_t>(j)];
+    means_px[2 * m] = s.x, means_px[2 * m + 1] = s.y;
+    conics[3 * m] = s.conic_xx, conics[3 * m + 1] = s.conic_xy, conics[3 * m + 2] = s.conic_yy;
+    colours[3 * m] = s.red, colours[3 * m + 1] = s.green, colours[3 * m + 2] = s.blue;
+    depths[m] = s.depth, opacities[m] = s.opacity, volumes[m] = s.volume;
+    source[m] = s.source;
+    ++m;
+  }
+}
+
 }  // namespace
 
-DecodedView::~DecodedView() {
-  for (Piece& piece : pieces)
-    if (piece.splats) store_of_pieces().give_back(std::move(piece));
-}
-
 DecodedView decode(const AnchorArrays& anchors, WeightLayout layout, const float* weights, const Camera& camera) {
-  DecodedView view;
-  const int64_t n = (anchors.count + kPiece - 1) / kPiece;
-  view.pieces.resize(static_cast<size_t>(n));
-  parallel_for(n, [&](int64_t i) {
-    Piece& piece = view.pieces[static_cast<size_t>(i)];
-    piece = store_of_pieces().take(kPiece * layout.k);
-    decode_piece(anchors, layout, weights, camera, i * kPiece, std::min(anchors.count, (i + 1) * kPiece), piece);
-  });
-  for (const Piece& piece : view.pieces) view.count += piece.count;
-  return view;
-}
-
-void write_splats(const DecodedView& view, const SplatArrays& out) {
-  std::vector<int64_t> begins(view.pieces.size());
-  int64_t total = 0;
-  for (size_t i = 0; i < begins.size(); ++i) {
-    begins[i] = total;
-    total += view.pieces[i].count;
-  }
-  parallel_for(static_cast<int64_t>(begins.size()), [&](int64_t i) {
-    int64_t m = begins[static_cast<size_t>(i)];
-    const Piece& piece = view.pieces[static_cast<size_t>(i)];
-    for (int64_t j = 0; j < piece.count; ++j) {
-      const Splat& s = piece.splats[static_cast<size_t>(j)];
-      out.means_px[2 * m] = s.x, out.means_px[2 * m + 1] = s.y;
-      out.conics[3 * m] = s.conic_xx, out.conics[3 * m + 1] = s.conic_xy, out.conics[3 * m + 2] = s.conic_yy;
-      out.colours[3 * m] = s.red, out.colours[3 * m + 1] = s.green, out.colours[3 * m + 2] = s.blue;
-      out.depths[m] = s.depth, out.opacities[m] = s.opacity, out.volumes[m] = s.volume;
-      out.source[m] = s.source;
-      ++m;
+  DecodedView view(static_cast<size_t>(anchors.count * layout.k));
+  const int64_t pieces = (anchors.count + kPiece - 1) / kPiece;
+  const int64_t at_once = std::min(pieces, std::max<int64_t>(32, 8 * threads()));
+  Wave wave(at_once, kPiece * layout.k);
+  std::vector<size_t> begins(static_cast<size_t>(at_once));
+  for (int64_t first = 0; first < pieces; first += at_once) {
+    const int64_t n = std::min(at_once, pieces - first);
+    parallel_for(n, [&](int64_t i) {
+      const int64_t begin = (first + i) * kPiece;
+      wave[i].count = 0;
+      decode_piece(anchors, layout, weights, camera, begin, std::min(anchors.count, begin + kPiece), wave[i]);
+    });
+    for (int64_t i = 0; i < n; ++i) {
+      begins[static_cast<size_t>(i)] = view.count;
+      view.count += static_cast<size_t>(wave[i].count);
     }
-  });
+    parallel_for(n, [&](int64_t i) { write_piece(wave[i], begins[static_cast<size_t>(i)], view); });
+  }
+  const size_t m = view.count;
+  view.means_px.fit(2 * m), view.conics.fit(3 * m), view.depths.fit(m), view.colours.fit(3 * m);
+  view.opacities.fit(m), view.volumes.fit(m), view.source.fit(m);
+  return view;
 }
 
 }  // namespace vdgs

@@ -48,24 +48,29 @@ Floats pack_weights(const nb::list& arrays, WeightLayout layout) {
   return packed;
 }
 
-DecodedView decode_forward(const Rows<const float>& positions, const Rows<const float>& features,
-                           const Rows<const float>& offsets, const Rows<const float>& log_scales,
-                           const nb::list& weights, const Rows<const float>& camera) {
+// The first rows of a column, which the array owns from now on.
+template <class T, class... Size>
+auto hand_over(Column<T>& column, Size... shape) {
+  T* const data = column.data();
+  const nb::capsule owner(column.release(), [](void* memory) noexcept { std::free(memory); });
+  return nb::ndarray<nb::numpy, T, nb::c_contig>(data, {shape...}, owner);
+}
+
+nb::tuple decode_forward(const Rows<const float>& positions, const Rows<const float>& features,
+                         const Rows<const float>& offsets, const Rows<const float>& log_scales,
+                         const nb::list& weights, const Rows<const float>& camera) {
   const AnchorArrays anchors = anchor_arrays(positions, features, offsets, log_scales);
   const WeightLayout layout{anchors.k};
   const Floats packed = pack_weights(weights, layout);
-  const Camera view = unpack_camera(camera.data());
-  const nb::gil_scoped_release unlocked;
-  return decode(anchors, layout, packed.get(), view);
-}
-
-void write_view(const DecodedView& view, const Rows<float>& means_px, const Rows<float>& conics,
-                const Rows<float>& depths, const Rows<float>& colours, const Rows<float>& opacities,
-                const Rows<float>& volumes, const Rows<int32_t>& source) {
-  const SplatArrays out = {means_px.data(), conics.data(), depths.data(), colours.data(),
-                           opacities.data(), volumes.data(), source.data()};
-  const nb::gil_scoped_release unlocked;
-  write_splats(view, out);
+  DecodedView view = [&] {
+    const Camera seen_by = unpack_camera(camera.data());
+    const nb::gil_scoped_release unlocked;
+    return decode(anchors, layout, packed.get(), seen_by);
+  }();
+  const size_t m = view.count, two = 2, three = 3;
+  return nb::make_tuple(hand_over(view.means_px, m, two), hand_over(view.conics, m, three), hand_over(view.depths, m),
+                        hand_over(view.colours, m, three), hand_over(view.opacities, m), hand_over(view.volumes, m),
+                        hand_over(view.source, m));
 }
 
 const float* data(const MaybeGradient& array) { return array ? array->data() : nullptr; }
@@ -99,7 +104,6 @@ void backward(const Rows<const float>& positions, const Rows<const float>& featu
 
 VDGS_BIND(decode) {
   using namespace vdgs;
-  nb::class_<DecodedView>(m, "DecodedView").def_ro("count", &DecodedView::count).def("write", &write_view);
   m.def("decode", &decode_forward);
   m.def("decode_backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
         nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none());

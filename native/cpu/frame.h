@@ -48,9 +48,9 @@ struct TileGrid {
 // Culled splats: those that reach a pixel, by chunks of the input (chunk c begins at c * kChunk).
 struct Candidates {
   static constexpr int64_t kChunk = 8192;
-  Buffer<float> depth;
-  Buffer<int32_t> splat;
-  Buffer<int32_t> columns, rows;  // of tiles: first | last << 16
+  float* depth = nullptr;  // these four are in Frame::work, and gone once the backward pass begins
+  int32_t* splat = nullptr;
+  int32_t *columns = nullptr, *rows = nullptr;  // of tiles: first | last << 16
   std::vector<int64_t> chunk_count;
   std::vector<double> chunk_tiles;  // how many tiles their boxes hold, summed
   int64_t count = 0;
@@ -70,14 +70,10 @@ struct SlabPart {
   int64_t begin = 0, count = 0;  // of its picks among those of the slab
   int64_t n_entries = 0;
   Buffer<int32_t> splat;            // [count] of each pick, ascending
-  Buffer<DepthKey> order, scratch;  // [count] the picks by depth
+  Buffer<DepthKey> order, scratch;  // [count] the picks by depth; room to sort, and for the backward pass
   Buffer<uint32_t> first;           // [count + 1] where the entries of a pick begin in `where`, by depth
   Buffer<uint32_t> where;           // [n_entries] by depth: first the tile, then the entry's place in it
   Buffer<uint32_t> cursor;          // [tiles] where this part's next entry of a tile goes
-};
-
-struct alignas(64) PickSums {
-  float sum[16];
 };
 
 // A range of depth: its splats, and for every tile the entries, front to back, that reach it.
@@ -91,8 +87,7 @@ struct Slab {
   Buffer<uint32_t> entries;     // [n_entries] which record
   Buffer<uint16_t> touched;     // [n_entries] blocks in which the entry contributed
   Buffer<uint32_t> visited;     // [tiles] entries looked at before the tile was finished
-  Buffer<float> sums;           // [n_entries, n_sums] of the backward pass, where touched
-  Buffer<PickSums> pick_sums;   // [count] added up
+  float* sums = nullptr;        // [n_entries, n_sums] of the backward pass, where touched; in Frame::work
 };
 
 // The pixels of one tile, block by block.
@@ -118,6 +113,7 @@ struct Frame {
   int64_t n_splats = 0;
   bool with_depth = false;
   Candidates candidates;
+  Buffer<float> work;  // what only the forward pass needs, then what only the backward pass needs
   std::vector<std::unique_ptr<Slab>> slabs;  // all ever made, reused; the first n_slabs are in use
   int n_slabs = 0;
   Buffer<TileState> state;        // [tiles]
@@ -151,7 +147,7 @@ class Stopwatch {
 };
 
 // The phases, in order.
-void cull(const Splats& splats, const TileGrid& grid, Candidates& out);
+void cull(const Splats& splats, const TileGrid& grid, Buffer<float>& work, Candidates& out);
 
 // Cuts the candidates into slabs; see rasterise_slabs.cpp.
 struct DepthSample {

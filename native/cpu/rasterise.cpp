@@ -57,7 +57,7 @@ void forward(Frame& frame, const Splats& splats, const float background[3], int 
              const Picture& out, bool counting) {
   Stopwatch watch;
   begin_frame(frame, splats, width, height, out.depth != nullptr);
-  cull(splats, frame.grid, frame.candidates);
+  cull(splats, frame.grid, frame.work, frame.candidates);
   frame.stats.candidates = frame.candidates.count;
   frame.seconds[kCull] = watch.lap();
   const DepthSample sample = sample_depths(frame.candidates);
@@ -92,11 +92,9 @@ void backward(Frame& frame, const float background[3], const PictureGradients& i
 }
 
 size_t Frame::bytes() const {
-  size_t total = candidates.depth.bytes() + candidates.splat.bytes() + candidates.columns.bytes() +
-                 candidates.rows.bytes() + transmittance.bytes() + stop.bytes() + unfinished.bytes();
+  size_t total = work.bytes() + transmittance.bytes() + stop.bytes() + unfinished.bytes();
   for (const auto& slab : slabs) {
-    total += slab->records.bytes() + slab->entries.bytes() + slab->touched.bytes() + slab->sums.bytes() +
-             slab->pick_sums.bytes();
+    total += slab->records.bytes() + slab->entries.bytes() + slab->touched.bytes();
     for (const auto& part : slab->parts)
       total += part->splat.bytes() + part->order.bytes() + part->scratch.bytes() + part->first.bytes() +
                part->where.bytes() + part->cursor.bytes();

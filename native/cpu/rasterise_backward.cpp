@@ -111,7 +111,7 @@ void slab_gradients(const Frame& frame, Slab& slab, int tile, uint32_t& seen, Ti
   const uint32_t n = slab.visited[tile];
   const uint32_t* entries = slab.entries.data() + begin;
   const uint16_t* touched = slab.touched.data() + begin;
-  float* sums = slab.sums.data() + begin * kStride;
+  float* sums = slab.sums + begin * kStride;
   seen -= n;
   for (uint32_t i = n; i-- > 0;) {
     if (i >= 12) __builtin_prefetch(slab.records.data() + entries[i - 12]);
@@ -139,9 +139,13 @@ void backward_tiles(Frame& frame, const float background[3], const PictureGradie
   constexpr int kTilesPerTask = 4;
   const int tiles = frame.grid.tiles();
   frame.background_sums.reserve(3 * static_cast<size_t>(tiles));
+  const size_t stride = static_cast<size_t>(n_sums(frame.with_depth));
+  size_t entries = 0;
+  for (int s = 0; s < frame.n_slabs; ++s) entries += frame.slabs[s]->n_entries;
+  float* sums = frame.work.reserve(entries * stride);
   for (int s = 0; s < frame.n_slabs; ++s) {
-    Slab& slab = *frame.slabs[s];
-    slab.sums.reserve(slab.n_entries * static_cast<size_t>(n_sums(frame.with_depth)));
+    frame.slabs[s]->sums = sums;
+    sums += frame.slabs[s]->n_entries * stride;
   }
   const auto gradients = frame.with_depth ? tile_gradients<true> : tile_gradients<false>;
   parallel_for((tiles + kTilesPerTask - 1) / kTilesPerTask, [&](int64_t task) {

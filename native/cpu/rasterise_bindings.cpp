@@ -108,6 +108,7 @@ nb::dict statistics(const Frame& frame) {
 
 VDGS_BIND(rasterise) {
   nb::class_<Frame>(m, "Frame", "A drawn picture, as its backward pass needs it.")
+      .def_prop_ro("bytes", &Frame::bytes, "Memory that it holds on to.")
       .def_prop_ro("seconds", &seconds, "How long each phase took.")
       .def_prop_ro("statistics", &statistics, "Counts of a picture drawn with counting=True.");
   m.attr("ALPHA_MIN") = std::exp2(vdgs::kLog2AlphaMin);

@@ -37,10 +37,10 @@ VDGS_INLINE int cull_sixteen(F16 x, F16 y, F16 a, F16 b, F16 c, F16 opacity, F16
   tiles = tiles + zero_unless(valid, (columns.last - columns.first + one) * (rows.last - rows.first + one));
   alignas(64) static constexpr int32_t kLaneIndex[16] = {0, 1, 2,  3,  4,  5,  6,  7,
                                                          8, 9, 10, 11, 12, 13, 14, 15};
-  compress_store(out.depth.data() + at, valid, depth);
-  compress_store(out.splat.data() + at, valid, splat(static_cast<int32_t>(i)) + load(kLaneIndex));
-  compress_store(out.columns.data() + at, valid, pack(columns.first, columns.last));
-  compress_store(out.rows.data() + at, valid, pack(rows.first, rows.last));
+  compress_store(out.depth + at, valid, depth);
+  compress_store(out.splat + at, valid, splat(static_cast<int32_t>(i)) + load(kLaneIndex));
+  compress_store(out.columns + at, valid, pack(columns.first, columns.last));
+  compress_store(out.rows + at, valid, pack(rows.first, rows.last));
   return __builtin_popcount(bits(valid));
 }
 
@@ -77,10 +77,12 @@ void cull_chunk(const Splats& s, const TileGrid& grid, int64_t chunk, Candidates
 
 }  // namespace
 
-void cull(const Splats& splats, const TileGrid& grid, Candidates& out) {
+void cull(const Splats& splats, const TileGrid& grid, Buffer<float>& work, Candidates& out) {
   const int64_t chunks = (splats.count + Candidates::kChunk - 1) / Candidates::kChunk;
   const size_t room = static_cast<size_t>(splats.count);
-  out.depth.reserve(room), out.splat.reserve(room), out.columns.reserve(room), out.rows.reserve(room);
+  out.depth = work.reserve(4 * room);
+  out.splat = reinterpret_cast<int32_t*>(out.depth + room);
+  out.columns = out.splat + room, out.rows = out.columns + room;
   out.chunk_count.assign(static_cast<size_t>(chunks), 0);
   out.chunk_tiles.assign(static_cast<size_t>(chunks), 0.0);
   parallel_for(chunks, [&](int64_t chunk) { cull_chunk(splats, grid, chunk, out); });

@@ -16,22 +16,26 @@ void clear(const SplatGradients& out, int64_t begin, int64_t end) {
   if (out.depths) std::memset(out.depths + begin, 0, 4 * n);
 }
 
-// Adds up the entries of every splat of a part: front to back, as they lie in the tiles.
+// Says of a pick that it has no entry.
+constexpr uint32_t kNowhere = UINT32_MAX;
+alignas(64) constexpr float kZeros[32] = {};
+
+// Adds up the entries of every splat of a part, front to back, as they lie in the tiles. The total takes the
+// place of the splat's first entry; part.scratch says of each pick where that is.
 template <bool with_depth>
-void add_entries(Slab& slab, const SlabPart& part) {
+void add_entries(const Slab& slab, SlabPart& part) {
   constexpr size_t kStride = n_sums(with_depth);
   constexpr uint32_t kAhead = 24;
-  alignas(64) static constexpr float kZeros[32] = {};
   const uint32_t *first = part.first.data(), *where = part.where.data();
   const uint32_t n_entries = static_cast<uint32_t>(part.n_entries);
   const uint16_t* touched = slab.touched.data();
-  const float* sums = slab.sums.data();
+  float* sums = slab.sums;
   // What was not touched has no sums; to look elsewhere is cheaper than to branch.
   const auto row = [&](uint32_t k) { return touched[where[k]] ? sums + where[k] * kStride : kZeros; };
-  PickSums* out = slab.pick_sums.data() + part.begin;
+  DepthKey* total_of = part.scratch.reserve(static_cast<size_t>(part.count));
   for (int64_t i = 0; i < part.count; ++i) {
-    if (i + 8 < part.count) __builtin_prefetch(out + part.order[i + 8].pick, 1);
-    F16 total = splat(0.0f);  // its first kStride lanes; the others add up what nobody reads
+    // The first kStride lanes; in the others is what lies behind a row, which nobody reads.
+    F16 total = splat(0.0f);
     for (uint32_t k = first[i]; k < first[i + 1]; ++k) {
       if (k + 2 * kAhead < n_entries) {
         __builtin_prefetch(touched + where[k + 2 * kAhead]);
@@ -41,7 +45,9 @@ void add_entries(Slab& slab, const SlabPart& part) {
       }
       total = total + loadu(row(k));
     }
-    store(out[part.order[i].pick].sum, total);
+    const uint32_t place = first[i] < first[i + 1] ? where[first[i]] : kNowhere;
+    if (place != kNowhere) store_first(sums + place * kStride, static_cast<int>(kStride), total);
+    total_of[part.order[i].pick].pick = place;
   }
 }
 
@@ -65,11 +71,20 @@ VDGS_INLINE void write_gradients(const Record& r, const float* sum, int64_t i, c
   if (out.depths) out.depths[i] = sum[kSumDepth];
 }
 
-void write_part(const Slab& slab, const SlabPart& part, const SplatGradients& out) {
-  for (size_t k = 0; k < static_cast<size_t>(part.count); ++k) {
-    const size_t pick = static_cast<size_t>(part.begin) + k;
-    const Record& record = slab.records[pick];
-    if (record.columns != kNoTiles) write_gradients(record, slab.pick_sums[pick].sum, part.splat[k], out);
+void write_part(const Slab& slab, const SlabPart& part, size_t stride, const SplatGradients& out) {
+  constexpr size_t kAhead = 16;
+  const size_t count = static_cast<size_t>(part.count);
+  const auto total = [&](size_t k) {
+    const uint32_t place = part.scratch[k].pick;
+    return place == kNowhere ? kZeros : slab.sums + place * stride;
+  };
+  for (size_t k = 0; k < count; ++k) {
+    if (k + kAhead < count) {
+      __builtin_prefetch(total(k + kAhead));
+      __builtin_prefetch(total(k + kAhead) + stride - 1);
+    }
+    const Record& record = slab.records[static_cast<size_t>(part.begin) + k];
+    if (record.columns != kNoTiles) write_gradients(record, total(k), part.splat[k], out);
   }
 }
 
@@ -81,11 +96,10 @@ void reduce_gradients(Frame& frame, const SplatGradients& out) {
   const auto add = frame.with_depth ? add_entries<true> : add_entries<false>;
   for (int s = 0; s < frame.n_slabs; ++s) {
     Slab& slab = *frame.slabs[s];
-    slab.pick_sums.reserve(static_cast<size_t>(slab.count));
     parallel_for(slab.n_parts, [&](int64_t p) {
-      const SlabPart& part = *slab.parts[p];
+      SlabPart& part = *slab.parts[p];
       add(slab, part);
-      write_part(slab, part, out);
+      write_part(slab, part, static_cast<size_t>(n_sums(frame.with_depth)), out);
     });
   }
   for (size_t c = 0; c < 3; ++c) {

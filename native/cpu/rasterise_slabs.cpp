@@ -50,7 +50,7 @@ void select(const Frame& frame, float low, float high, bool first_slab, SlabPart
     const size_t begin = chunk * Candidates::kChunk;
     const size_t end = begin + static_cast<size_t>(all.chunk_count[chunk]);
     for (size_t i = begin; i < end; i += kLanes) {
-      const F16 depth = load_first(all.depth.data() + i, static_cast<int>(std::min<size_t>(kLanes, end - i)));
+      const F16 depth = load_first(all.depth + i, static_cast<int>(std::min<size_t>(kLanes, end - i)));
       unsigned chosen = bits(ge(depth, low16) & lt(depth, high16));
       if (end - i < kLanes) chosen &= (1u << (end - i)) - 1u;
       if (!chosen) continue;

@@ -7,7 +7,6 @@ Equations: Scaffold-GS eqs. 3-8; VDGS section III-B.
 from __future__ import annotations
 
 import json
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -28,6 +26,7 @@ from vdgs.errors import VdgsError
 from vdgs.files import write_atomically
 from vdgs.gaps import gap_points
 from vdgs.kernels.decode_types import FEATURE_SIZE
+from vdgs.tensor_files import checksum, write_tensors
 
 FORMAT = "vdgs-anchors-1"
 #: An outlier is known by its distance to this neighbour: small clusters of false matches are outliers too.
@@ -79,13 +78,13 @@ class AnchorModel:
 
     def save(self, path: Path) -> None:
         """Write one safetensors file, atomically."""
-        tensors = {f"anchors.{k}": v.contiguous() for k, v in self.anchors.tensors().items()}
-        tensors |= {f"decoder.{k}": v.detach().contiguous() for k, v in self.decoder.tensors().items()}
+        tensors = {f"anchors.{k}": v for k, v in self.anchors.tensors().items()}
+        tensors |= {f"decoder.{k}": v for k, v in self.decoder.tensors().items()}
         facts = {
-            "voxel": self.voxel, "background": self.background, "facts": dict(self.facts), "crc32": _checksum(tensors),
+            "voxel": self.voxel, "background": self.background, "facts": dict(self.facts), "crc32": checksum(tensors),
         }  # fmt: skip
         header = {FORMAT: json.dumps(facts)}  # a single key: several would be written in an order that varies
-        write_atomically(path, lambda temporary: save_file(tensors, temporary, metadata=header))
+        write_atomically(path, lambda temporary: write_tensors(temporary, tensors, header))
 
     @staticmethod
     def load(path: Path) -> AnchorModel:
@@ -99,7 +98,7 @@ class AnchorModel:
                 {name.removeprefix("decoder."): t for name, t in tensors.items() if name.startswith("decoder.")}
             )
             known = json.loads(header[FORMAT])
-            if known["crc32"] != _checksum(tensors):
+            if known["crc32"] != checksum(tensors):
                 raise ValueError("its checksum does not agree")
             red, green, blue = (float(value) for value in known["background"])
             model = AnchorModel(anchors, decoder, float(known["voxel"]), (red, green, blue), known["facts"])
@@ -124,14 +123,6 @@ class AnchorModel:
             if not bool(torch.isfinite(tensor).all()):
                 raise ValueError(f"{name} holds numbers that are not finite")
         self.decoder.check(k)
-
-
-def _checksum(tensors: Mapping[str, Tensor]) -> int:
-    """CRC-32 over the bytes of all tensors, in the order of their names."""
-    crc = 0
-    for name in sorted(tensors):
-        crc = zlib.crc32(tensors[name].contiguous().numpy().tobytes(), crc)
-    return crc
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

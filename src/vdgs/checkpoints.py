@@ -8,17 +8,15 @@ damaged write is noticed and the state before it is used.
 from __future__ import annotations
 
 import json
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safetensors.torch import load as load_bytes
-from safetensors.torch import save_file
 from torch import Tensor
 
 from vdgs.files import write_atomically, write_json
+from vdgs.tensor_files import read_whole, size_and_checksum, write_tensors
 
 KEPT = 2
 
@@ -35,10 +33,9 @@ class SavedState:
 def save_state(folder: Path, state: SavedState) -> None:
     """Write a state and remove all but the newest two. Raises VdgsError if the disk refuses."""
     path = folder / f"{state.iteration:08d}.safetensors"
-    write_atomically(
-        path, lambda temporary: save_file({k: v.contiguous() for k, v in state.tensors.items()}, temporary)
-    )
-    size, crc = _size_and_crc(path)
+    write_atomically(path, lambda temporary: write_tensors(temporary, state.tensors))
+    # Of what the disk has, not of what was meant: read again, from the system's cache.
+    size, crc = size_and_checksum(path)
     sidecar = {"iteration": state.iteration, "bytes": size, "crc32": crc, "facts": dict(state.facts)}
     write_json(path.with_suffix(".json"), sidecar)
     for old in sorted(folder.glob("*.json"))[:-KEPT]:
@@ -58,15 +55,6 @@ def load_newest(folder: Path) -> tuple[SavedState | None, list[str]]:
     return None, complaints
 
 
-def _size_and_crc(path: Path) -> tuple[int, int]:
-    """Bytes and CRC-32 of a file, read piece by piece: states are large."""
-    size = crc = 0
-    with path.open("rb") as file:
-        while piece := file.read(1 << 20):
-            size, crc = size + len(piece), zlib.crc32(piece, crc)
-    return size, crc
-
-
 def discard_after(folder: Path, iteration: int) -> None:
     """Delete states beyond `iteration`: damaged ones, which would count among those that are kept."""
     for sidecar in folder.glob("*.json"):
@@ -78,12 +66,12 @@ def discard_after(folder: Path, iteration: int) -> None:
 def _read(sidecar: Path) -> SavedState:
     facts = json.loads(sidecar.read_text(encoding="utf-8"))
     path = sidecar.with_suffix(".safetensors")
-    data = path.read_bytes()
-    if len(data) != facts["bytes"]:
-        raise ValueError(f"{len(data)} bytes instead of {facts['bytes']}")
-    if zlib.crc32(data) != facts["crc32"]:
+    size, crc = size_and_checksum(path)
+    if size != facts["bytes"]:
+        raise ValueError(f"{size} bytes instead of {facts['bytes']}")
+    if crc != facts["crc32"]:
         raise ValueError("its checksum does not agree")
-    return SavedState(int(facts["iteration"]), facts["facts"], load_bytes(data))
+    return SavedState(int(facts["iteration"]), facts["facts"], read_whole(path))
 
 
 def remove_leftovers(folder: Path) -> None:

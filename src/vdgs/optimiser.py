@@ -13,6 +13,23 @@ from vdgs.decoder import Decoder
 from vdgs.kernels import native as kernels
 
 
+def rebuild(tensors: dict[str, Tensor], more: dict[str, Tensor], kept: Tensor) -> None:
+    """Append to each tensor the rows of its name in `more`, then keep the `kept` rows (mask or order); in place.
+
+    Each old tensor is let go before the next is made: if nothing else holds it, no more than one is there twice.
+    """
+    for name in list(tensors):
+        before, added = tensors.pop(name), more[name]
+        if kept.dtype != torch.bool:
+            tensors[name] = (torch.cat([before, added]) if len(added) else before).index_select(0, kept)
+            continue
+        old, new = kept[: len(before)], kept[len(before) :]
+        stays, comes = int(old.sum()), int(new.sum())
+        tensors[name] = before.new_empty(stays + comes, *before.shape[1:])
+        torch.index_select(before, 0, old.nonzero()[:, 0], out=tensors[name][:stays])
+        torch.index_select(added, 0, new.nonzero()[:, 0], out=tensors[name][stays:])
+
+
 @dataclass
 class Moments:
     """First and second moments of each named parameter, shaped like it."""
@@ -33,9 +50,7 @@ class Moments:
         Tensor by tensor, so that no more than one is there twice.
         """
         for tensors in (self.first, self.second):
-            for name in list(tensors):
-                before = tensors.pop(name)
-                tensors[name] = torch.cat([before, before.new_zeros(added, *before.shape[1:])])[kept]
+            rebuild(tensors, {name: t.new_zeros(added, *t.shape[1:]) for name, t in tensors.items()}, kept)
 
 
 @dataclass

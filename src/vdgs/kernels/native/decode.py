@@ -49,11 +49,7 @@ class _Decode(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, camera: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
         inputs = [t.detach() for t in tensors]
-        decoded = module.native().decode(*inputs[:4], inputs[4:], camera)
-        m = decoded.count
-        splats = [torch.empty(m, columns) if columns > 1 else torch.empty(m) for columns in (2, 3, 1, 3, 1, 1)]
-        source = torch.empty(m, dtype=torch.int32)
-        decoded.write(*splats, source)
+        *splats, source = map(torch.from_numpy, module.native().decode(*inputs[:4], inputs[4:], camera))
         ctx.save_for_backward(camera, *tensors, source, splats[3], splats[4])
         ctx.mark_non_differentiable(source)
         ctx.set_materialize_grads(False)

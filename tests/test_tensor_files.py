@@ -1,0 +1,112 @@
+"""Files of tensors are those of the format's own library, and are written and read without a second copy."""
+
+import subprocess
+import sys
+import zlib
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from vdgs.tensor_files import DTYPES, checksum, read_whole, size_and_checksum, write_tensors
+
+SHAPES = st.lists(st.integers(0, 4), max_size=3)
+
+
+def tensor(seed: int, dtype: torch.dtype, shape: list[int]) -> torch.Tensor:
+    values = torch.randn(shape, generator=torch.Generator().manual_seed(seed)) * 100
+    return (values > 0) if dtype == torch.bool else values.abs().to(dtype)
+
+
+@settings(max_examples=40)
+@given(
+    kinds=st.dictionaries(st.text(max_size=8), st.tuples(st.sampled_from(list(DTYPES.values())), SHAPES), max_size=6),
+    note=st.none() | st.dictionaries(st.just("key"), st.text(max_size=9), min_size=1),
+)
+def test_the_bytes_are_those_of_the_library(tmp_path_factory, kinds, note):
+    folder = tmp_path_factory.mktemp("files")
+    kinds.pop("__metadata__", None)
+    tensors = {name: tensor(i, *kind) for i, (name, kind) in enumerate(kinds.items())}
+    write_tensors(folder / "ours", tensors, note)
+    save_file(tensors, folder / "theirs", metadata=note)
+    assert (folder / "ours").read_bytes() == (folder / "theirs").read_bytes()
+    ours = read_whole(folder / "ours")
+    assert ours.keys() == tensors.keys()
+    for name, expected in tensors.items():
+        assert ours[name].dtype == expected.dtype
+        assert torch.equal(ours[name], expected)
+
+
+def test_rows_out_of_order_and_the_decoder_are_written_as_they_read(tmp_path):
+    rows = torch.arange(12.0).reshape(3, 4)
+    tensors = {"turned": rows.t(), "every_other": rows[::2], "weights": rows.clone().requires_grad_(True)}
+    write_tensors(tmp_path / "t.safetensors", tensors, {"a": "b"})
+    with safe_open(tmp_path / "t.safetensors", framework="pt") as file:
+        assert file.metadata() == {"a": "b"}
+    read = load_file(tmp_path / "t.safetensors")
+    for name, expected in tensors.items():
+        assert torch.equal(read[name], expected)
+
+
+def test_other_types_are_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(TypeError, match="half"):
+        write_tensors(tmp_path / "t", {"half": torch.zeros(2, dtype=torch.float16)})
+    assert not (tmp_path / "t").exists()
+
+
+@pytest.mark.parametrize("spoil", ["cut", "shape", "header"])
+def test_a_damaged_file_is_an_error(tmp_path, spoil):
+    path = tmp_path / "t"
+    write_tensors(path, {"a": torch.arange(6.0)})
+    data = path.read_bytes()
+    changed = {"cut": data[:-4], "shape": data.replace(b"[6]", b"[7]"), "header": data.replace(b"{", b"!", 1)}
+    path.write_bytes(changed[spoil])
+    with pytest.raises(ValueError, match=r"a has not|Expecting value"):
+        read_whole(path)
+
+
+def test_checksums_are_crc_32(tmp_path):
+    tensors = {"b": torch.arange(5.0), "a": torch.arange(12).reshape(3, 4).t()}
+    path = tmp_path / "t"
+    write_tensors(path, tensors)
+    assert size_and_checksum(path) == (path.stat().st_size, zlib.crc32(path.read_bytes()))
+    raw = tensors["a"].contiguous().numpy().tobytes() + tensors["b"].numpy().tobytes()
+    assert checksum(tensors) == zlib.crc32(raw)
+
+
+TRANSIENT = """
+import sys
+from pathlib import Path
+import torch
+from vdgs.checkpoints import SavedState, load_newest, save_state
+
+def memory(key):
+    with open("/proc/self/status") as status:
+        return next(1024 * int(line.split()[1]) for line in status if line.startswith(key))
+
+def rise(work):
+    with open("/proc/self/clear_refs", "w") as file:
+        file.write("5")  # the largest resident size is taken from here on
+    before = memory("VmRSS")
+    result = work()
+    print(memory("VmHWM") - before)
+    return result
+
+folder = Path(sys.argv[1])
+save_state(folder, SavedState(1, {}, {"a": torch.zeros(9)}))
+tensors = {f"{i}": torch.full((5_000_000,), float(i)) for i in range(4)}
+rise(lambda: save_state(folder, SavedState(2, {}, tensors)))
+state, _ = rise(lambda: load_newest(folder))
+assert all(torch.equal(state.tensors[name], tensor) for name, tensor in tensors.items())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the largest resident size is reset through /proc")
+def test_80_mb_are_saved_and_loaded_without_a_second_copy(tmp_path):
+    done = subprocess.run([sys.executable, "-c", TRANSIENT, str(tmp_path)], check=True, capture_output=True, text=True)
+    saving, loading = map(int, done.stdout.split())
+    assert saving < 10e6
+    assert loading < 95e6  # the tensors themselves
