@@ -26,7 +26,8 @@ from vdgs.errors import TrainingDiverged
 from vdgs.growth import Compensated, Statistics, decide
 from vdgs.kernels import native as kernels
 from vdgs.kernels.decode_types import DecoderWeights, Splats
-from vdgs.optimiser import Moments, Optimiser, rates_at
+from vdgs.memory import return_unused
+from vdgs.optimiser import Moments, Optimiser, rates_at, rebuild
 from vdgs.render import decode_visible, draw, gather_visible
 from vdgs.visibility import share_in_cycle
 
@@ -211,6 +212,7 @@ def _move(state: TrainingState, stage: Stage, rows: Tensor, leaves: dict[str, Te
 def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:
     """Add and remove anchors with their moments and statistics. Returns what StepReport says of it."""
     config = stage.config
+    return_unused()
     generator = torch.Generator().manual_seed(config.seed * 1_000_003 + state.iteration)
     compensated, threshold = _compensate(state, stage)
     decision = decide(
@@ -221,9 +223,7 @@ def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:
     )  # fmt: skip
     added = len(decision.added)
     kept = torch.cat([decision.kept, torch.ones(added, dtype=torch.bool)])
-    state.anchors = state.anchors.extended(decision.added).select(kept)
-    state.statistics = state.statistics.extended(added).select(kept)
-    state.optimiser.anchors.rebuild(added, kept)
+    _rebuild(state, decision.added, kept)
     if state.compensation is not None:
         state.compensation = state.compensation.extended(added).select(kept)
         begin_cycle(state.compensation, state.statistics)
@@ -259,11 +259,23 @@ def views_in_cycle(iteration: int, stage: Stage) -> list[int]:
 def reorder(state: TrainingState) -> None:
     """Put anchors, moments and statistics into Morton order."""
     order = kernels.morton_order(state.anchors.positions)
-    state.anchors = state.anchors.select(order)
-    state.statistics = state.statistics.select(order)
     if state.compensation is not None:
         state.compensation = state.compensation.select(order)
-    state.optimiser.anchors.rebuild(0, order)
+    _rebuild(state, state.anchors.select(order[:0]), order)
+
+
+def _rebuild(state: TrainingState, added: Anchors, kept: Tensor) -> None:
+    """Append anchors, then keep some (mask or order), with moments and statistics; tensor by tensor, for memory."""
+    return_unused()
+    k = added.offsets.shape[1]
+    tensors, state.anchors = state.anchors.tensors(), added
+    rebuild(tensors, added.tensors(), kept)
+    state.anchors = Anchors(**tensors)
+    tensors, state.statistics = state.statistics.tensors(), Statistics.zeros(0, k)
+    rebuild(tensors, Statistics.zeros(len(added), k).tensors(), kept)
+    state.statistics = Statistics(**tensors)
+    state.optimiser.anchors.rebuild(len(added), kept)
+    return_unused()
 
 
 def _background(stage: Stage, iteration: int) -> Tensor:

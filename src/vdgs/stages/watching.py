@@ -14,7 +14,7 @@ from rich.console import Console
 from vdgs.anchors import AnchorModel
 from vdgs.checkpoints import discard_after, load_newest, save_state
 from vdgs.errors import RunError, TrainingDiverged, VdgsError
-from vdgs.memory import peak_memory_bytes
+from vdgs.memory import peak_memory_bytes, return_unused
 from vdgs.run import StageFolder
 from vdgs.run_options import WatchOptions
 from vdgs.stages.progress import TrainingProgress
@@ -136,6 +136,7 @@ def _loop(folder: StageFolder, state: TrainingState, stage: Stage, options: Watc
             clock.tick()
             progress.step(state, report)
             if state.iteration % options.save_every == 0:
+                return_unused()
                 save_state(folder.checkpoints, to_saved(state))
                 progress.flush()
             if time.monotonic() - noted > STATUS_SECONDS:
