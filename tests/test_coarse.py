@@ -44,7 +44,9 @@ def begin(capture: Path, run: Path) -> subprocess.Popen:
     """Start the command and wait until it trains."""
     started = subprocess.Popen(command(capture, run), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     status, before = run / "coarse" / "status.json", time.time()
-    while started.poll() is None and not (status.exists() and status.stat().st_mtime >= before - 0.01):
+    while started.poll() is None and not (
+        status.exists() and status.stat().st_mtime >= before - 0.01 and '"running"' in status.read_text()
+    ):
         time.sleep(0.01)
     return started
 

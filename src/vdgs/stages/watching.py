@@ -77,9 +77,10 @@ def train_watched(
     Raises Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged and VdgsError (out of memory, a photograph
     that is gone, a full disk), each with what is kept.
     """
-    folder.set_status("running", iteration=state.iteration, iterations=stage.config.iterations)
     try:
-        complete = _loop(folder, state, stage, options, console)
+        with stop_requests() as stop:
+            folder.set_status("running", iteration=state.iteration, iterations=stage.config.iterations)
+            complete = _loop(folder, state, stage, options, console, stop)
     except TrainingDiverged as error:
         folder.set_status("failed", iteration=state.iteration, why=str(error))
         raise TrainingDiverged(f"{error} {_kept(folder)} {AFTER_DIVERGENCE}") from error
@@ -126,10 +127,7 @@ def _loop(folder: StageFolder, state: TrainingState, stage: Stage, options: Watc
     """Train until complete (True) or asked to stop."""
     clock, board = _Clock(state), _board(folder, options, state.iteration)
     noted = time.monotonic()
-    with (
-        stop_requests() as stop,
-        TrainingProgress(console, folder, stage.config, state.iteration, board) as progress,
-    ):
+    with TrainingProgress(console, folder, stage.config, state.iteration, board) as progress:
 
         def after_step(state: TrainingState, report: StepReport) -> None:
             nonlocal noted
