@@ -102,8 +102,8 @@ class CompensationConfig:
     gamma: float = 0.9
     """gamma: decay of the cache g from cycle to cycle."""
     gate: Literal["scaled", "literal"] = "scaled"
-    """How often an offset of low visibility must be drawn before it is judged: `scaled` takes T_low times the gate of
-    the others, at least twice (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
+    """Above how many draws an offset of low visibility is judged: `scaled` takes T_low times the gate of the others, at
+    least 2 (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
     cap: float = 0.0
     """Greatest value of g; 0 for none. Without it a statistic that is fed steadily grows to 21 times its size."""
 
