@@ -1,0 +1,220 @@
+"""What figures share: colours, thin axes, and the map from above that shows how often each place is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, PercentFormatter
+
+from vdgs.cameras import Camera
+from vdgs.inspect import THIN
+from vdgs.visibility import views_of
+
+INK, FAINT, ACCENT = "#22262b", "#6c757d", "#c1121f"
+#: From hardly seen (alarming) to seen often (calm); dark enough everywhere to stand on white.
+SEEN = LinearSegmentedColormap.from_list(
+    "seen", ["#9d0208", "#dc2f02", "#f48c06", "#e9c46a", "#8ab17d", "#2a9d8f", "#1f6f8b", "#14395b"]
+)
+DPI = 120
+FIELD_CELLS = 240
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMarks:
+    """Cameras to be marked alike: triangles with a face and an edge, `size` in points²."""
+
+    label: str
+    cameras: Sequence[Camera]
+    face: str
+    edge: str
+    size: float = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class SeenMap:
+    """What a map of V shows: points coloured by V, marked cameras, and (pale) V on level ground."""
+
+    points: Float[np.ndarray, "n 3"]
+    #: V of the points: how many of the cameras of `marks[0]` hold each in their frustum.
+    visibility: Int[np.ndarray, " n"]
+    #: The corners of the map.
+    low: Float[np.ndarray, " 2"]
+    high: Float[np.ndarray, " 2"]
+    #: z of the level ground.
+    ground: float
+    marks: Sequence[CameraMarks]
+    #: What x and y are called, with their unit.
+    x_label: str
+    y_label: str
+    #: What a point is, in the singular and with its article.
+    noun: str
+    #: A bold line, a line of facts, and a line about the colours.
+    titles: tuple[str, str, str]
+
+
+def draw_seen_map(file: Path, seen: SeenMap) -> None:
+    """Points and cameras from above, points coloured by V; beside it the histogram of V. Writes a PNG."""
+    width, height = map_size(seen.low, seen.high)
+    figure = Figure(figsize=(width + 4.7, height + 1.75), dpi=DPI)
+    canvas = FigureCanvasAgg(figure)
+    place = placer(figure)
+    axes = place(0.85, 0.65, width, height)
+    top, norm = steps(seen.visibility)
+    _ground(axes, seen, norm)
+    order = np.argsort(-seen.visibility, kind="stable")  # the poorly seen on top, so that none is hidden
+    size = float(np.clip(6e4 / max(len(seen.points), 1), 0.5, 7.0))
+    axes.scatter(
+        seen.points[order, 0],
+        seen.points[order, 1],
+        c=np.minimum(seen.visibility[order], top),
+        s=size,
+        cmap=SEEN,
+        norm=norm,
+        linewidths=0,
+    )
+    _cameras(axes, seen.marks)
+    axes.set(xlim=(seen.low[0], seen.high[0]), ylim=(seen.low[1], seen.high[1]), aspect="equal")
+    axes.set(xlabel=seen.x_label, ylabel=seen.y_label)
+    start = 0.85 + width + 0.75
+    bar, histogram = place(start, 0.65, 0.2, height), place(start + 0.24, 0.65, 2.3, height)
+    _histogram(bar, histogram, seen.visibility, top, norm, seen.noun)
+    plain(axes)
+    titles(figure, *seen.titles)
+    canvas.print_png(file)  # type: ignore[arg-type]
+
+
+def titles(figure: Figure, name: str, facts: str, note: str) -> None:
+    """Three lines in the upper left corner, above 1.1 inches of free space."""
+    width, height = figure.get_size_inches()
+    figure.text(0.85 / width, 1 - 0.38 / height, name, fontsize=14, fontweight="bold", color=INK)
+    figure.text(0.85 / width, 1 - 0.68 / height, facts, fontsize=10, color=FAINT)
+    figure.text(0.85 / width, 1 - 1.0 / height, note, fontsize=9, color=FAINT)
+
+
+def _ground(axes: Axes, seen: SeenMap, norm: Normalize) -> None:
+    """V on the level ground pale, and its line V = 3: also where there are no points."""
+    low, high, cameras = seen.low, seen.high, seen.marks[0].cameras
+    x = np.linspace(low[0], high[0], FIELD_CELLS)
+    y = np.linspace(low[1], high[1], FIELD_CELLS)
+    grid = np.stack([*np.meshgrid(x, y), np.full((FIELD_CELLS, FIELD_CELLS), seen.ground)], axis=-1)
+    field = views_of(torch.from_numpy(grid.reshape(-1, 3)), cameras).numpy().reshape(FIELD_CELLS, FIELD_CELLS)
+    axes.imshow(
+        np.ma.masked_equal(field, 0),
+        origin="lower",
+        extent=(low[0], high[0], low[1], high[1]),
+        cmap=SEEN,
+        norm=norm,
+        alpha=0.22,
+        interpolation="nearest",
+        zorder=0,
+    )
+    if field.min() < THIN[0] <= field.max():
+        lines = axes.contour(x, y, field, levels=[THIN[0] - 0.5], colors=INK, linewidths=0.7, zorder=1)
+        axes.clabel(lines, fmt=lambda _: f"V = {THIN[0]}", fontsize=8, inline=True)
+
+
+def _cameras(axes: Axes, marks: Sequence[CameraMarks]) -> None:
+    for mark in marks:
+        centres = np.array([camera.position for camera in mark.cameras]).reshape(-1, 3)
+        axes.scatter(
+            centres[:, 0],
+            centres[:, 1],
+            marker="^",
+            s=mark.size,
+            linewidths=0.8,
+            label=mark.label,
+            zorder=3,
+            facecolors=mark.face,
+            edgecolors=mark.edge,
+        )
+    axes.legend(
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        ncols=2,
+        fontsize=9,
+        frameon=False,
+        handletextpad=0.2,
+        columnspacing=1.2,
+        borderaxespad=0.1,
+    )
+
+
+def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: Normalize, noun: str) -> None:
+    """The colour scale, and growing out of it the histogram of V; the last step holds all above it."""
+    levels = np.arange(top + 1)
+    bar.imshow(levels[:, None], origin="lower", extent=(0, 1, -0.5, top + 0.5), aspect="auto", cmap=SEEN, norm=norm)
+    bar.set_xticks([])
+    step = max(1, round(top / 10))
+    ticks = [level for level in levels[::step] if level < top - step / 2] + [top]
+    bar.set_yticks(ticks, [str(level) for level in ticks[:-1]] + [f"≥ {top}"])
+    bar.set_ylabel(f"training cameras that see {noun}, V", labelpad=2)
+    shares = np.bincount(np.minimum(visibility, top), minlength=top + 1) / len(visibility)
+    axes.barh(levels, shares, height=0.86, color=SEEN(norm(levels)))
+    median = min(float(np.median(visibility)), top)
+    axes.plot([0, 1.12 * shares.max()], [median, median], color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
+    axes.text(1.12 * shares.max(), median, " median", va="center", fontsize=9, color=INK)
+    below = float((visibility < THIN[0]).mean())
+    axes.text(
+        shares[: THIN[0]].max() + 0.03 * shares.max(),
+        1,
+        f" {below:.1%} below {THIN[0]}",
+        va="center",
+        fontsize=10,
+        fontweight="bold",
+        color=ACCENT,
+    )
+    axes.set(
+        ylim=(-0.5, top + 0.5), xlim=(0, 1.4 * shares.max()), yticks=[], xlabel=f"share of the {noun.split()[-1]}s"
+    )
+    axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+    for part in (bar, axes):
+        plain(part)
+        part.spines[:].set_visible(False)
+    bar.tick_params(axis="y", length=0)
+
+
+def steps(visibility: np.ndarray) -> tuple[int, Normalize]:
+    """The greatest V that has a colour of its own, and integer colour steps from 0 to it.
+
+    The 99 % quantile: a few points that very many cameras see must not flatten the rest.
+    """
+    top = max(int(np.quantile(visibility, 0.99)), THIN[-1])
+    return top, BoundaryNorm(np.arange(-0.5, top + 1), SEEN.N) if top < SEEN.N else Normalize(0, top)
+
+
+def map_size(low: np.ndarray, high: np.ndarray) -> tuple[float, float]:
+    """Width and height of the map in inches: true to scale, within a page."""
+    across, along = high - low
+    scale = min(8.0 / across, 8.5 / along)
+    return float(max(across * scale, 2.5)), float(max(along * scale, 2.5))
+
+
+def placer(figure: Figure) -> Callable[[float, float, float, float], Axes]:
+    """Places axes by left, bottom, width, height in inches."""
+    width, height = figure.get_size_inches()
+
+    def place(left: float, bottom: float, across: float, up: float) -> Axes:
+        return figure.add_axes((left / width, bottom / height, across / width, up / height))
+
+    return place
+
+
+def plain(axes: Axes) -> None:
+    """Thin ink: no box, faint ticks."""
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(FAINT)
+    axes.tick_params(colors=FAINT, labelcolor=INK, labelsize=9)
+    axes.xaxis.label.set_color(INK)
+    axes.yaxis.label.set_color(INK)
