@@ -201,6 +201,8 @@ class BlockConfig:
     """The rates of the coarse stage start again, those of offsets times this."""
     scale_rate: float = 0.8
     """... and those of log-scales times this."""
+    feature_rate: float = 1.0
+    """... and those of features times this (choice; 1 is the paper's)."""
     ring: Literal["frozen", "ramp", "free"] = "frozen"
     """Anchors between core and widened boundary: `frozen` are drawn and never move (choice for "gradients at the
     boundary are suppressed"); `ramp` move less the farther out they are; `free` as those of the core."""
@@ -258,6 +260,7 @@ def block_training(config: MethodConfig, views: int) -> TrainConfig:
             rates,
             offsets=(block.offset_rate * rates.offsets[0], block.offset_rate * rates.offsets[1]),
             log_scales=(block.scale_rate * rates.log_scales[0], block.scale_rate * rates.log_scales[1]),
+            features=(block.feature_rate * rates.features[0], block.feature_rate * rates.features[1]),
         ),
         growth=replace(
             block.growth,

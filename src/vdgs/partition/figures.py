@@ -109,7 +109,7 @@ def _frame(corners: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
 
 def _cut(axes: Axes, blocks: Blocks, shown: Float[np.ndarray, "n 2"], low: np.ndarray, high: np.ndarray) -> None:
     """Anchors in the colours of their blocks, cores and widened boundaries, and the numbers."""
-    owner = blocks.owner(shown)
+    owner = blocks.owner(shown[:, :2])
     palette = np.array([to_rgb(block_colour(index)) for index in range(len(blocks))])
     size = float(np.clip(3e4 / len(shown), 0.6, 7.0))
     axes.scatter(shown[:, 0], shown[:, 1], c=palette[owner], s=size, linewidths=0, alpha=0.75)
