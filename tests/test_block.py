@@ -191,4 +191,4 @@ def test_rates_restart_lower_and_iterations_scale():
     assert config.rates.offsets == pytest.approx((0.004, 4e-5))
     assert config.rates.log_scales == pytest.approx((0.0056, 0.0056))
     assert config.rates.features == method.training.rates.features
-    assert block_training(replace(method, block=BlockConfig(iterations=0)), 33).iterations == 1500
+    assert block_training(replace(method, block=BlockConfig(iterations=0)), 33).iterations == 500

@@ -192,7 +192,7 @@ class BlockConfig:
     """Training of each block from the coarse anchors of its place. Loss and seed are those of the coarse stage."""
 
     iterations: int = 50_000
-    """Steps for each block; 0 takes thirty for each of its photographs, at least 1500 and at most 15 000 (choice)."""
+    """Steps for each block; 0 takes fifteen for each of its photographs, at least 500 and at most 15 000 (choice)."""
     scale_iterations: float = 1.0
     """Factor on the steps and on the start of statistics and growth, for scenes smaller than the paper's."""
     resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
@@ -203,6 +203,8 @@ class BlockConfig:
     """... and those of log-scales times this."""
     feature_rate: float = 1.0
     """... and those of features times this (choice; 1 is the paper's)."""
+    background_noise: float = 0.0
+    """As in the loss of the coarse stage, but for blocks: there the ground is opaque already (choice)."""
     ring: Literal["frozen", "ramp", "free"] = "frozen"
     """Anchors between core and widened boundary: `frozen` are drawn and never move (choice for "gradients at the
     boundary are suppressed"); `ramp` move less the farther out they are; `free` as those of the core."""
@@ -240,7 +242,7 @@ class MethodConfig:
 
 
 #: How `iterations = 0` follows from the number of training photographs: steps for each, least, most.
-COARSE_STEPS, BLOCK_STEPS = (60, 3_000, 30_000), (30, 1_500, 15_000)
+COARSE_STEPS, BLOCK_STEPS = (60, 3_000, 30_000), (15, 500, 15_000)
 
 
 def with_iterations(config: TrainConfig, training_views: int) -> TrainConfig:
@@ -267,6 +269,7 @@ def block_training(config: MethodConfig, views: int) -> TrainConfig:
             statistics_from=round(scale * block.growth.statistics_from),
             start=round(scale * block.growth.start),
         ),
+        loss=replace(config.training.loss, background_noise=block.background_noise),
         compensation=block.compensation,
     )
 
@@ -283,7 +286,12 @@ PRESETS: dict[str, MethodConfig] = {
             resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
             growth=GrowthConfig(statistics_from=300, start=500, until=0.6, threshold=1e-4),
         ),
-        block=BlockConfig(iterations=0, growth=GrowthConfig(statistics_from=100, start=300, threshold=1e-4)),
+        partition=PartitionConfig(blocks="auto"),
+        block=BlockConfig(
+            iterations=0,
+            growth=GrowthConfig(statistics_from=0, start=100, threshold=1e-4),
+            compensation=CompensationConfig(t_low_quantile=0.25),
+        ),
     ),
 }
 
