@@ -32,8 +32,8 @@ def cut_scene(
     Every place has exactly one owner (`Blocks.owner`). The cut turns, moves and scales with the scene and does not
     depend on the order of the anchors. Blocks are numbered along the longer axis of the scene. There are fewer blocks
     than asked for, and a warning, where a cluster is the strongest nowhere on the plane (choice: its anchors join the
-    blocks about them). Raises VdgsError if the anchors cannot be cut; ValueError if the number of blocks is still "auto"
-    (`choose_block_count`).
+    blocks about them). Raises VdgsError if the anchors cannot be cut; ValueError if the number of blocks is still
+    "auto" (`choose_block_count`).
     """
     ground = _checked(positions, views)
     if config.blocking and config.blocks == "auto":
