@@ -1,9 +1,9 @@
 """Visibility, cut and owners of a large scene, in one run.
 
-OMP_WAIT_POLICY=PASSIVE python benchmarks/partition.py [--anchors 1000000] [--cameras 1000] [--threads 2]
+    OMP_WAIT_POLICY=PASSIVE python benchmarks/partition.py [--anchors 1000000] [--cameras 1000] [--threads 2]
 
-The owners are looked up for places in the cores' own box and in one four times as wide, most of which lies outside every
-core; a part of each is compared with the distances to all cores.
+The owners are looked up for places in the cores' own box and in one four times as wide, most of which lies outside
+every core; a part of each is compared with the distances to all cores.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def test_the_order_of_the_anchors_does_not_matter() -> None:
 
 def test_coordinates_as_large_as_utm() -> None:
     positions, views = town()
-    far = positions + [4.5e5, 5.4e6, 300]
+    far = positions + np.array([4.5e5, 5.4e6, 300])
     blocks = cut(far, views)
     assert np.array_equal(owners(blocks, far), owners(cut(positions, views), positions))
     assert overlap(blocks) < 1e-6 * area_of_blocks(blocks).sum()
@@ -186,10 +186,10 @@ def test_balanced_blocks_hold_about_equally_many_anchors() -> None:
 def test_anchors_that_cannot_be_cut_are_refused() -> None:
     three = np.repeat(np.array([[0.0, 0, 0], [5, 1, 0], [9, 0, 0]]), 4, axis=0)
     views = np.full(12, 3)
-    with pytest.raises(VdgsError, match="--blocks 4: .* only 3 distinct"):
+    with pytest.raises(VdgsError, match=r"--blocks 4: .* only 3 distinct"):
         cut(three, views, 4)
     stacked = np.column_stack([np.ones((12, 2)), np.arange(12.0)])
-    with pytest.raises(VdgsError, match="--blocks 2: .* only 1 distinct"):
+    with pytest.raises(VdgsError, match=r"--blocks 2: .* only 1 distinct"):
         cut(stacked, np.arange(12), 2)
     with pytest.raises(VdgsError, match="no anchors"):
         cut(np.zeros((0, 3)), np.zeros(0, int))

@@ -5,33 +5,21 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from captures_support import look_down
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vdgs.cameras import NEAR, Camera
+from captures_support import look_down
+from vdgs.cameras import NEAR, Camera, CameraModel
 from vdgs.visibility import imbalance, normalised, share_in_cycle, views_of
 
 
-def flight(count: int, model: str = "pinhole", seed: int = 0) -> list[Camera]:
+def flight(count: int, model: CameraModel = "pinhole", seed: int = 0) -> list[Camera]:
     """Tilted views over a square of 20 units; an orthographic camera has 4 px a unit."""
     generator = np.random.default_rng(seed)
     focal = 60.0 if model == "pinhole" else 4.0
-    return [
-        Camera(
-            look_down(
-                np.array([*generator.uniform(0, 20, 2), 8.0]), generator.uniform(0, 80), generator.uniform(0, 360)
-            ),
-            focal,
-            focal,
-            31.5,
-            25.0,
-            64,
-            48,
-            model,
-        )  # fmt: skip
-        for _ in range(count)
-    ]
+    places = generator.uniform(0, 20, (count, 2))
+    poses = [look_down(np.array([*at, 8.0]), generator.uniform(0, 80), generator.uniform(0, 360)) for at in places]
+    return [Camera(pose, focal, focal, 31.5, 25.0, 64, 48, model) for pose in poses]
 
 
 def cloud(n: int, seed: int = 1) -> np.ndarray:
@@ -40,7 +28,7 @@ def cloud(n: int, seed: int = 1) -> np.ndarray:
 
 
 @pytest.mark.parametrize("model", ["pinhole", "orthographic"])
-def test_v_is_the_number_of_frusta_that_hold_an_anchor(model: str) -> None:
+def test_v_is_the_number_of_frusta_that_hold_an_anchor(model: CameraModel) -> None:
     cameras, points = flight(30, model), cloud(3000)
     # float32 rounding decides about places within 1e-3 px of a border: none of them here.
     borderless = np.ones(len(points), bool)
@@ -55,8 +43,8 @@ def test_v_is_the_number_of_frusta_that_hold_an_anchor(model: str) -> None:
     assert views.dtype == torch.int32
     assert views.tolist() == expected.tolist()
     assert len(set(views.tolist())) > 3
-    behind = np.concatenate([camera.position - camera.forward for camera in cameras[:5]]).reshape(-1, 3)
-    alone = [int(views_of(torch.from_numpy(place[None]).float(), [camera])) for place, camera in zip(behind, cameras)]
+    behind = [torch.from_numpy(camera.position - camera.forward).float()[None] for camera in cameras[:5]]
+    alone = [int(views_of(place, [camera])) for place, camera in zip(behind, cameras[:5], strict=True)]
     assert alone == [0] * 5
 
 

@@ -60,7 +60,7 @@ def widen(core: shapely.Polygon, expansion: float) -> shapely.Polygon:
 
 def cell_size(places: Float[np.ndarray, "n 2"], count: int) -> float:
     """Edge of the cells on which components are found (choice): twice the distance within which 95 % of the anchors
-    have eight neighbours, so that cells of sparse outskirts are seldom empty; within bounds set by the size of the scene.
+    have eight neighbours, so that cells of sparse outskirts are seldom empty; within bounds set by the scene's size.
     """
     low, high = np.quantile(places, WINDOW, axis=0)
     extent = float((high - low).max()) or float(np.ptp(places, axis=0).max())

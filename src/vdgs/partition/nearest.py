@@ -16,7 +16,7 @@ import shapely
 from jaxtyping import Bool, Float, Int64
 
 #: A cell is divided into so many by so many.
-DIVISION = 5
+DIVISION = 4
 #: Cells that would hold fewer places than this cost more than the places themselves.
 PLACES_PER_CELL = 2
 #: Rounding of coordinates and distances, as a share of the largest coordinate.
@@ -49,12 +49,6 @@ class Cores:
     def _nearest(self, places: Float[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
         owner = np.full(len(places), -1, np.int64)
         left, candidates = self._decide_cells(places, owner)
-        # Whether a core holds a place is asked much faster than how far it is.
-        for index, shape in enumerate(self.shapes):
-            asked = left[candidates[:, index]]
-            owner[asked[shapely.contains_xy(shape, places[asked])]] = index
-        between = owner[left] < 0
-        left, candidates = left[between], candidates[between]
         owner[left] = self._distances(places[left], candidates).argmin(axis=1)
         return owner
 
@@ -98,9 +92,17 @@ class Cores:
         points = shapely.points(places)
         distance = np.full(candidates.shape, np.inf)
         for index, shape in enumerate(self.shapes):
-            asked = candidates[:, index]
-            distance[asked, index] = shapely.distance(shape, points[asked])
+            asked = np.flatnonzero(candidates[:, index])
+            # Whether a core holds a place is asked much faster than how far it is.
+            held = shapely.contains_xy(shape, places[asked])
+            distance[asked[held], index] = 0.0
+            distance[asked[~held], index] = shapely.distance(self._edges[index], points[asked[~held]])
         return distance
+
+    @cached_property
+    def _edges(self) -> list[shapely.Geometry]:
+        """The edges of each core, holes included."""
+        return [shape.boundary for shape in self.shapes]
 
     @cached_property
     def _box(self) -> Float[np.ndarray, "2 2"]:
