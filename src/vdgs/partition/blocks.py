@@ -68,9 +68,9 @@ def save_blocks(path: Path, blocks: Blocks, facts: Sequence[dict[str, Any]]) -> 
 def save_blocks_wgs84(path: Path, blocks: Blocks, facts: Sequence[dict[str, Any]], ground: GroundFrame) -> None:
     """The same in longitude, latitude (RFC 7946), for maps: every corner at the height of the ground frame's origin.
 
-    Longitudes run on past 180 degrees where a scene lies across the antimeridian. The axes of the ground frame are taken
-    for east and north at its origin; those of a frame whose origin was moved (captures/ground.py) are those of the first
-    origin, and off by the angle between the two: a metre in a kilometre where it was moved by some six.
+    Longitudes run on past 180 degrees where a scene lies across the antimeridian. The axes of the ground frame are
+    taken for east and north at its origin. In a frame whose origin was moved (captures/ground.py) they are of the
+    first origin: at middle latitudes that turns the map by a metre in a kilometre for every six kilometres moved.
     Raises ValueError if the frame is not georeferenced.
     """
     if ground.origin_geo is None:
