@@ -68,8 +68,10 @@ def save_blocks(path: Path, blocks: Blocks, facts: Sequence[dict[str, Any]]) -> 
 def save_blocks_wgs84(path: Path, blocks: Blocks, facts: Sequence[dict[str, Any]], ground: GroundFrame) -> None:
     """The same in longitude, latitude (RFC 7946), for maps: every corner at the height of the ground frame's origin.
 
-    Longitudes run on past 180 degrees where a scene lies across the antimeridian. The ground frame's axes are taken for
-    east and north at its origin. Raises ValueError if the frame is not georeferenced.
+    Longitudes run on past 180 degrees where a scene lies across the antimeridian. The axes of the ground frame are
+    taken for east and north at its origin. In a frame whose origin was moved (captures/ground.py) they are of the
+    first origin: at middle latitudes that turns the map by a metre in a kilometre for every six kilometres moved.
+    Raises ValueError if the frame is not georeferenced.
     """
     if ground.origin_geo is None:
         raise ValueError(f"the ground frame ({ground.how}) is not georeferenced: blocks have no longitude")

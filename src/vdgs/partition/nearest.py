@@ -16,9 +16,9 @@ import shapely
 from jaxtyping import Bool, Float, Int64
 
 #: A cell is divided into so many by so many.
-DIVISION = 8
-#: Cells that hold fewer places than this on average cost more than the places; and so few places need no cells.
-PLACES_PER_CELL, FEW_PLACES = 8, 2_000
+DIVISION = 4
+#: Cells that would hold fewer places than this cost more than the places themselves.
+PLACES_PER_CELL = 2
 #: Rounding of coordinates and distances, as a share of the largest coordinate.
 ROUNDING = 1e-13
 
@@ -36,25 +36,34 @@ class Cores:
         """
         if not np.isfinite(places).all():
             raise ValueError("places that are not finite numbers have no owner")
-        owner = np.full(len(places), 0 if len(self.shapes) == 1 else -1, np.int64)
-        left = np.flatnonzero(owner < 0)
-        if len(left) > FEW_PLACES:
-            left = self._decide_cells(places, owner)
-        owner[left] = self._one_by_one(places[left])
+        owner = np.zeros(len(places), np.int64)
+        if len(self.shapes) == 1:
+            return owner
+        # Far places apart from the others: a box that holds them all would have to be divided many times.
+        far = ((places < self._box[0]) | (places > self._box[1])).any(axis=1)
+        for some in (np.flatnonzero(~far), np.flatnonzero(far)):
+            if len(some):
+                owner[some] = self._nearest(places[some])
+        return owner
+
+    def _nearest(self, places: Float[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
+        owner = np.full(len(places), -1, np.int64)
+        left, candidates = self._decide_cells(places, owner)
+        owner[left] = self._distances(places[left], candidates).argmin(axis=1)
         return owner
 
     def _decide_cells(
         self, places: Float[np.ndarray, "n 2"], owner: Int64[np.ndarray, " n"]
-    ) -> Int64[np.ndarray, " m"]:
-        """Fill in `owner` for the places of cells that belong to one core; the indices of the others.
+    ) -> tuple[Int64[np.ndarray, " m"], Bool[np.ndarray, "m k"]]:
+        """Fill in `owner` for the places of cells that belong to one core; the indices and candidates of the others.
 
-        The cells of the first round cover the box of all places, those of the next the undecided cells of the last.
+        The cells of the first round divide the box of all places, those of the next the undecided cells of the last.
         """
         low, high = places.min(axis=0), places.max(axis=0)
-        edge = float((high - low).max())
+        edge, least = float((high - low).max()), 1e3 * ROUNDING * float(np.abs(places).max())
         left, parents = np.arange(len(places)), np.zeros(len(places), np.int64)
         corners, candidates = low[None], np.ones((1, len(self.shapes)), bool)
-        while edge > 1e3 * ROUNDING * np.abs(places).max():
+        while edge > least and len(left) > PLACES_PER_CELL * len(corners) * DIVISION**2:
             edge /= DIVISION
             within = ((places[left] - corners[parents]) / edge).astype(np.int64).clip(0, DIVISION - 1)
             cells, parents = _occupied(parents * DIVISION**2 + within[:, 0] * DIVISION + within[:, 1], len(corners))
@@ -66,49 +75,40 @@ class Cores:
             owner[left[decided]] = candidates.argmax(axis=1)[parents[decided]]
             left, corners, candidates = left[~decided], corners[~sole], candidates[~sole]
             parents = (np.cumsum(~sole) - 1)[parents[~decided]]
-            if len(left) < PLACES_PER_CELL * len(corners) * DIVISION:
-                break
-        return left
+        return left, candidates[parents]
 
     def _candidates(
         self, centres: Float[np.ndarray, "c 2"], radius: float, candidates: Bool[np.ndarray, "c k"]
     ) -> Bool[np.ndarray, "c k"]:
         """Which of the candidates can be the nearest to a place within `radius` of each centre."""
-        points = shapely.points(centres)
-        distance = np.full(candidates.shape, np.inf)
-        for index, shape in enumerate(self.shapes):
-            asked = candidates[:, index]
-            distance[asked, index] = shapely.distance(shape, points[asked])
-        slack = 2 * radius + ROUNDING * (np.abs(centres).max(initial=0.0) + self._largest_coordinate)
+        distance = self._distances(centres, candidates)
+        slack = 2 * radius + ROUNDING * (np.abs(centres).max() + np.abs(self._box).max())
         return distance <= distance.min(axis=1, keepdims=True) + slack
 
-    def _one_by_one(self, places: Float[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
-        owner = np.full(len(places), -1, np.int64)
+    def _distances(
+        self, places: Float[np.ndarray, "n 2"], candidates: Bool[np.ndarray, "n k"]
+    ) -> Float[np.ndarray, "n k"]:
+        """From every place to its candidates, 0 inside; infinite to all other cores."""
+        points = shapely.points(places)
+        distance = np.full(candidates.shape, np.inf)
         for index, shape in enumerate(self.shapes):
-            free = np.flatnonzero(owner < 0)
-            owner[free[shapely.contains_xy(shape, places[free, 0], places[free, 1])]] = index
-        left = np.flatnonzero(owner < 0)
-        edges, owners = self._edges
-        pairs = edges.query_nearest(shapely.points(places[left]), all_matches=True)
-        nearest = np.full(len(left), len(self.shapes), np.int64)
-        np.minimum.at(nearest, pairs[0], owners[pairs[1]])
-        owner[left] = nearest
-        return owner
+            asked = np.flatnonzero(candidates[:, index])
+            # Whether a core holds a place is asked much faster than how far it is.
+            held = shapely.contains_xy(shape, places[asked])
+            distance[asked[held], index] = 0.0
+            distance[asked[~held], index] = shapely.distance(self._edges[index], points[asked[~held]])
+        return distance
 
     @cached_property
-    def _edges(self) -> tuple[shapely.STRtree, Int64[np.ndarray, " e"]]:
-        """All edges of all cores, holes included, in a search tree; and whose they are."""
-        segments, owners = [], []
-        for index, shape in enumerate(self.shapes):
-            for ring in (shape.exterior, *shape.interiors):
-                corners = np.asarray(ring.coords)
-                segments.append(shapely.linestrings(np.stack([corners[:-1], corners[1:]], axis=1)))
-                owners.append(np.full(len(corners) - 1, index, np.int64))
-        return shapely.STRtree(np.concatenate(segments)), np.concatenate(owners)
+    def _edges(self) -> list[shapely.Geometry]:
+        """The edges of each core, holes included."""
+        return [shape.boundary for shape in self.shapes]
 
     @cached_property
-    def _largest_coordinate(self) -> float:
-        return float(np.abs(shapely.bounds(np.array(self.shapes, object))).max())
+    def _box(self) -> Float[np.ndarray, "2 2"]:
+        """Low and high corner of the box of all cores, widened by its own size to every side."""
+        low, high = shapely.total_bounds(np.array(self.shapes, object)).reshape(2, 2)
+        return np.stack([2 * low - high, 2 * high - low])
 
 
 def _occupied(cell: Int64[np.ndarray, " n"], parents: int) -> tuple[Int64[np.ndarray, " c"], Int64[np.ndarray, " n"]]:
