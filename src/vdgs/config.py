@@ -95,8 +95,8 @@ class CompensationConfig:
     """T_low: an anchor is of low visibility (the set L) when fewer than this share of the cameras of a growth cycle
     hold it in their frustum."""
     t_low_quantile: float = 0.0
-    """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on a
-    large scene nearly every anchor is below a fixed share)."""
+    """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on
+    a large scene nearly every anchor is below a fixed share)."""
     beta_g: float = 2.0
     """beta_g: weight of a cycle's mean gradient in the cache g."""
     gamma: float = 0.9

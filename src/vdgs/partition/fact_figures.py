@@ -31,7 +31,7 @@ def draw_block_facts(
     """
     ours = block_facts(positions, views, blocks)._replace(cameras=assigned.sum(axis=0))
     groups = [ours] if compare is None else [ours, block_facts(positions, views, compare)]
-    rows = [np.arange(len(blocks))]
+    rows = [np.arange(len(blocks), dtype=np.float64)]
     if compare is not None:
         rows.append(len(blocks) + 1.5 + np.arange(len(compare)))
     count = float(rows[-1][-1] + 1)

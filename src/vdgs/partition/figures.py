@@ -68,7 +68,7 @@ def draw_blocks(
     columns, rows = (1 + beside, 1 + (compare is not None and not beside))
     figure = Figure(figsize=(max(0.85 + columns * (width + 0.75), 7.5), 1.7 + rows * (height + 1.1)), dpi=DPI)
     canvas, place = FigureCanvasAgg(figure), placer(figure)
-    shown = sample_points(np.column_stack([positions[:, :2], views]).astype(np.float64), MOST_DRAWN)
+    shown = sample_points(np.column_stack([positions[:, :2], views]).astype(np.float64), MOST_DRAWN)[:, :2]
     cuts = [(blocks, f"λ_vis = {lambda_vis:g}")]
     if compare is not None:
         cuts.append((compare, "λ_vis = 0: cut by place alone (numbers of its own)"))
@@ -76,7 +76,7 @@ def draw_blocks(
         bottom = 0.65 + (rows - 1 - index * (not beside)) * (height + 1.1)
         axes = place(0.85 + index * beside * (width + 0.75), bottom, width, height)
         _cut(axes, cut, shown, low, high)
-        _cameras(axes, _places(cameras), assigned.any(axis=1) if index == 0 else None)
+        _cameras(axes, _places(cameras), np.asarray(assigned.any(axis=1)) if index == 0 else None)
         spread = block_facts(positions, views, cut).spread
         axes.set_title(f"{name}\n{spread_note(spread)}", loc="left", fontsize=10, color=INK)
         axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
@@ -109,7 +109,7 @@ def _frame(corners: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
 
 def _cut(axes: Axes, blocks: Blocks, shown: Float[np.ndarray, "n 2"], low: np.ndarray, high: np.ndarray) -> None:
     """Anchors in the colours of their blocks, cores and widened boundaries, and the numbers."""
-    owner = blocks.owner(shown[:, :2])
+    owner = blocks.owner(shown)
     palette = np.array([to_rgb(block_colour(index)) for index in range(len(blocks))])
     size = float(np.clip(3e4 / len(shown), 0.6, 7.0))
     axes.scatter(shown[:, 0], shown[:, 1], c=palette[owner], s=size, linewidths=0, alpha=0.75)

@@ -19,8 +19,17 @@ def read_mapping(path: Path) -> dict[str, Any] | None:
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
     """A JSON list of objects; what is none is left out."""
-    value = _read(path)
+    return rows_of(_read(path))
+
+
+def rows_of(value: Any) -> list[dict[str, Any]]:
+    """The objects of a list; nothing where it is none."""
     return [row for row in value if isinstance(row, dict)] if isinstance(value, list) else []
+
+
+def words_of(value: Any) -> list[str]:
+    """The texts of a list; nothing where it is none."""
+    return [str(word) for word in value] if isinstance(value, list) else []
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:

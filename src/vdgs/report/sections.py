@@ -16,7 +16,9 @@ from vdgs.report.reading import (
     read_mapping,
     read_rows,
     read_settings,
+    rows_of,
     shown,
+    words_of,
 )
 from vdgs.run import RunFolder, StageFolder
 
@@ -47,7 +49,7 @@ def header(run: RunFolder, models: Models) -> list[str]:
     name = Path(str(get(capture, "root") or run.path)).name
     version = get(settings, "vdgs", "version") or "?"
     commit = str(get(settings, "vdgs", "commit") or "")[:10]
-    train, test = (len(get(capture, key) or []) for key in ("training_views", "test_views"))
+    train, test = (len(words_of(get(capture, key))) for key in ("training_views", "test_views"))
     parts = [
         f"<h1>{page.escape(name)}</h1>",
         page.paragraph(
@@ -91,7 +93,7 @@ def blocks(run: RunFolder) -> list[str]:
         page.picture(run.partition / "blocks.png", "The blocks from above, and the cut that place alone would give"),
         page.picture(run.partition / "block_facts.png", "Anchors, cameras, area and visibility of each block"),
     ]
-    rows = [row for row in get(facts, "blocks") or [] if isinstance(row, dict)]
+    rows = rows_of(get(facts, "blocks"))
     if rows:
         head = (
             "block",
@@ -111,8 +113,8 @@ def blocks(run: RunFolder) -> list[str]:
             for row in rows
         ]  # fmt: skip
         parts.append(page.table(head, cells))
-    for note in [*(get(facts, "warnings") or []), *(get(facts, "complaints") or [])]:
-        parts.append(page.paragraph(str(note), "note"))
+    for note in words_of(get(facts, "warnings")) + words_of(get(facts, "complaints")):
+        parts.append(page.paragraph(note, "note"))
     return parts
 
 
@@ -177,7 +179,7 @@ def quality(models: Models) -> list[str]:
             cells.append([bounds, shown(row.get("pixels"), "{:,.0f}"), *(shown(each.get("psnr")) for each in pair),
                           *(shown(each.get("ssim"), "{:.4f}") for each in pair)])  # fmt: skip
         parts.append(page.table(head, cells))
-    notes = [str(note) for note in (merged or coarse).get("notes") or []]
+    notes = words_of((merged or coarse).get("notes"))
     return parts + [page.paragraph(note, "faint") for note in notes]
 
 
@@ -185,7 +187,7 @@ def seams(run: RunFolder) -> list[str]:
     facts = read_mapping(run.evaluation / "by_block.json")
     if facts is None:
         return [page.missing("Quality by block (a scene of one block has none)")]
-    rows = [row for row in facts.get("blocks") or [] if isinstance(row, dict)]
+    rows = rows_of(facts.get("blocks"))
     parts = [
         page.table(
             ("block", "test pixels", "coarse PSNR", "as trained, alone", "merged PSNR"),
@@ -248,4 +250,4 @@ def _cost(name: str, folder: StageFolder) -> list[str]:
 
 
 def _bins(metrics: dict[str, Any]) -> list[dict[str, Any]]:
-    return [row for row in metrics.get("by_visibility") or [] if isinstance(row, dict)]
+    return rows_of(metrics.get("by_visibility"))
