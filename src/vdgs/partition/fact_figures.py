@@ -31,12 +31,12 @@ def draw_block_facts(
     """
     ours = block_facts(positions, views, blocks)._replace(cameras=assigned.sum(axis=0))
     groups = [ours] if compare is None else [ours, block_facts(positions, views, compare)]
-    rows = [np.arange(len(blocks), dtype=np.float64)]
+    rows: list[np.ndarray] = [np.arange(len(blocks), dtype=np.float64)]
     if compare is not None:
         rows.append(len(blocks) + 1.5 + np.arange(len(compare)))
     count = float(rows[-1][-1] + 1)
     step = float(np.clip(14 / count, 0.13, 0.3))  # inches
-    figure = Figure(figsize=(14.5, 1.85 + step * (count + 1)), dpi=DPI)
+    figure = Figure(figsize=(14.5, 2.15 + step * (count + 1)), dpi=DPI)
     canvas, place = FigureCanvasAgg(figure), placer(figure)
     panels = [place(1.15 + 2.65 * index, 0.65, 2.3, step * (count + 1)) for index in range(5)]
     names = (
@@ -106,7 +106,7 @@ def _panel(axes: Axes, index: int, facts: BlockFacts, rows: Float[np.ndarray, " 
             return 0.0
         right = np.nan_to_num(values.astype(np.float64))
         axes.barh(rows, right, height=0.72, color=colours)
-        text = [_number(value, index) for value in values]
+        text = [_number(float(value), index) for value in values]
     for row, end, label in zip(rows, right, text, strict=True):
         missing = label == "nan"
         axes.annotate(
