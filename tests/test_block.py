@@ -20,7 +20,7 @@ from vdgs.config import (
 )
 from vdgs.decoder import Decoder
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.render import gather_visible
+from vdgs.render import visible_rows
 from vdgs.stages.block import drawn_by, holds, places, ramp, split_anchors
 from vdgs.training import Stage, TrainingState, from_saved, start_state, to_saved, train, views_in_cycle
 
@@ -105,7 +105,7 @@ def test_every_anchor_is_own_or_around_and_only_what_cameras_draw_is_held():
     cameras = Photographs().cameras
     drawn = drawn_by(anchors, cameras)
     for camera in cameras:
-        assert drawn[gather_visible(anchors, camera).rows].all()
+        assert drawn[visible_rows(anchors, camera)].all()
     far = replace(anchors, positions=anchors.positions + 100)
     assert not drawn_by(far, cameras).any()
 
