@@ -23,7 +23,7 @@ COARSE, MERGED, LOSS = "#8a939b", "#1f6f8b", "#c1121f"
 
 @dataclass(frozen=True)
 class Curve:
-    """y over x; None in y is a gap."""
+    """y over x; None in y is a gap. A curve without a name does not stand in the legend."""
 
     name: str
     colour: str
@@ -42,11 +42,17 @@ class Curve:
 
 
 def draw_curves(
-    curves: Sequence[Curve], title: str, *, smooth: int = 1, dots: bool = False, from_zero: bool = False
+    curves: Sequence[Curve],
+    title: str,
+    *,
+    smooth: int = 1,
+    dots: bool = False,
+    from_zero: bool = False,
+    marks: Sequence[float] = (),
 ) -> Picture | None:
-    """Curves over the iteration. `smooth` > 1 draws running medians over so many points, the points paler behind.
+    """Curves over the iteration, with dotted lines at the iterations `marks`.
 
-    None if there is no point to draw.
+    `smooth` > 1 draws running medians over so many points, the points paler behind. None if there is no point to draw.
     """
     curves = [curve for curve in curves if curve.holds_something()]
     if not curves:
@@ -59,15 +65,13 @@ def draw_curves(
         if smooth > 1 and len(x) > smooth:
             axes.plot(x, y, color=curve.colour, linewidth=0.8, alpha=0.3)
             y = running_median(y, smooth)
-        axes.plot(x, y, line, color=curve.colour, linewidth=1.6, marker=marker, markersize=3.5, label=curve.name)
-    axes.set_xlabel("iteration", color=FAINT, fontsize=9)
-    axes.margins(x=0.02)
+        axes.plot(x, y, line, color=curve.colour, linewidth=1.6, marker=marker, markersize=3.5, label=curve.name or "_")
+    for mark in marks:
+        axes.axvline(mark, color=FAINT, linewidth=1.0, linestyle=":")
     if from_zero:
-        axes.set_ylim(bottom=0)
-    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.yaxis.set_major_formatter(EngFormatter(sep="") if _spans_thousands(axes) else axes.yaxis.get_major_formatter())
-    if 1 < len(curves) <= NAMED:
+        axes.set_ylim(0, 1.08 * axes.dataLim.y1 or 1.0)
+    _scale_axes(axes)
+    if 1 < sum(bool(curve.name) for curve in curves) <= NAMED:
         axes.legend(fontsize=8, frameon=False, ncols=1 + len(curves) // 6)
     return _encoded(figure)
 
@@ -116,9 +120,9 @@ def running_median(values: np.ndarray, window: int) -> np.ndarray:
 
 
 def _panel(title: str) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=SIZE_IN, dpi=DPI, layout="constrained")
+    figure = Figure(figsize=SIZE_IN, dpi=DPI)
     FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
+    axes = figure.add_axes((0.115, 0.17, 0.865, 0.735))  # fixed: finding margins takes longer than drawing
     axes.set_title(title, loc="left", fontsize=10, color=INK)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(FAINT)
@@ -133,8 +137,18 @@ def _name_bars(axes: Axes, names: Sequence[str]) -> None:
     axes.tick_params(axis="x", length=0)
 
 
-def _spans_thousands(axes: Axes) -> bool:
-    return axes.get_ylim()[1] >= 2000
+def _scale_axes(axes: Axes) -> None:
+    """Iterations below; large and small numbers without rows of zeros."""
+    axes.set_xlabel("iteration", color=FAINT, fontsize=9)
+    axes.margins(x=0.02)
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    top = axes.get_ylim()[1]
+    if top >= 2000:
+        axes.yaxis.set_major_formatter(EngFormatter(sep=""))
+    elif top < 0.01:
+        axes.ticklabel_format(axis="y", style="sci", scilimits=(0, 0), useMathText=True)
+        axes.yaxis.offsetText.set_fontsize(8)
 
 
 def _encoded(figure: Figure) -> Picture:

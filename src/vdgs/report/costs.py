@@ -47,7 +47,7 @@ def _stages(source: Source, run: RunFolder) -> list[tuple[str, Record]]:
         ("coarse training", source.record("coarse/status.json")),
         ("coarse evaluation", source.record("coarse/evaluation/status.json")),
         ("partition and assignment", source.record("partition/partition.json")),
-        *((f"block {int(name[7:])}", source.record(f"{name}/status.json")) for name in block_names(run)),
+        *((f"block {index}", source.record(f"{name}/status.json")) for index, name in block_names(run)),
         ("merge", Record(merge if merged else {})),
         ("evaluation", source.record("evaluation/status.json")),
     ]

@@ -57,7 +57,7 @@ def reduced(image: Image.Image) -> Picture:
     layer = image.convert("RGBA")
     flat.paste(layer, mask=layer)
     flat = _within(flat, LONGEST_SIDE_PX)
-    drawing = _encoded(flat, "png", optimize=True)
+    drawing = _encoded(flat, "png")
     photograph = _encoded(flat, "jpeg", quality=REDUCTIONS[0][1])
     # JPEG smears the lines of drawings, so PNG may cost a little more before it loses.
     if len(drawing.content) <= min(MOST_BYTES, 2 * len(photograph.content)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +13,8 @@ from vdgs.report.pictures import Picture, PictureError, load_picture
 
 #: Characters of one text, and entries of one list of texts, that a report shows.
 LONGEST_TEXT, MOST_TEXTS = 600, 40
+#: Numbers beyond are damage.
+LARGEST = 1e30
 
 
 @dataclass(frozen=True)
@@ -25,14 +27,11 @@ class Record:
         return bool(self.values)
 
     def number(self, key: str) -> float | None:
-        """A finite number, or None."""
+        """A number that a run may hold, or None: not NaN, infinity or nonsense that no axis can show."""
         value = self.values.get(key)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return None
-        try:
-            return float(value) if math.isfinite(value) else None
-        except OverflowError:  # JSON has integers of any length
-            return None
+        return float(value) if abs(value) <= LARGEST else None
 
     def text(self, key: str) -> str | None:
         value = self.values.get(key)
@@ -61,7 +60,7 @@ class Source:
         self.notes: list[str] = []
 
     def has(self, name: str) -> bool:
-        return (self._root / name).exists()
+        return os.path.exists(self._root / name)  # unlike Path.exists, no error for names that no file can have
 
     def record(self, name: str) -> Record:
         """The JSON object of a file; empty if there is none."""
@@ -92,7 +91,7 @@ class Source:
         """The text of a file; None if there is none."""
         path = self._root / name
         try:
-            return path.read_text(encoding="utf-8", errors="replace") if path.exists() else None
+            return path.read_text(encoding="utf-8", errors="replace") if self.has(name) else None
         except OSError as error:
             self.notes.append(f"{name} cannot be read ({error.strerror or error}).")
             return None
@@ -100,7 +99,7 @@ class Source:
     def picture(self, name: str) -> Picture | None:
         """A PNG of the run, ready to embed; None if there is none."""
         path = self._root / name
-        if not path.exists():
+        if not self.has(name):
             return None
         try:
             return load_picture(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
 
+from vdgs.evaluation.saving import file_stems
 from vdgs.report.charts import draw_gains, draw_pairs
 from vdgs.report.page import Html, details, figure, gallery, paragraph, section, table
 from vdgs.report.reading import Record, Source
@@ -182,7 +183,12 @@ def seams_section(root: Path) -> Html:
         rows.append(_block_row("all", facts.inner("all")))
     head = ["block", "pixels", "PSNR coarse", "PSNR alone", "PSNR merged", "merged − coarse"]
     parts.append(
-        table(head, rows, "Pixels of test views that show a block. Alone: the block as trained, before the merge")
+        table(
+            head,
+            rows,
+            "PSNR pooled over the pixels of test views that show a block (not a mean over views). "
+            "Alone: the block as trained, before the merge",
+        )
     )
     parts.append(paragraph(_seam_sentence(facts.inner("seams"))))
     parts += _seam_pictures(source, facts.rows("views"))
@@ -208,12 +214,14 @@ def _seam_sentence(seams: Record) -> str:
 
 def _seam_pictures(source: Source, views: list[Record]) -> list[Html]:
     """The views in which most pixels lie near a border."""
-    ranked = sorted(views, key=lambda row: -(row.number("border_pixels") or 0))
-    shown: list[Html] = []
-    for row in ranked:
-        name = row.text("name")
-        stem = PurePosixPath(name).stem if name else ""
-        if len(shown) < MOST_SEAMS and stem and source.has(f"{MERGED}/seams/{stem}.png"):
-            picture = source.picture(f"{MERGED}/seams/{stem}.png")
-            shown.append(figure(picture, f"{name}: the model before and after the merge.", f"seams in {name}", True))
-    return shown
+    names = [row.text("name") or "" for row in views]
+    near = [row.number("border_pixels") or 0.0 for row in views]
+    found = [
+        (-pixels, name, f"{MERGED}/seams/{stem}.png")
+        for pixels, name, stem in zip(near, names, file_stems(names), strict=True)
+        if source.has(f"{MERGED}/seams/{stem}.png")
+    ]
+    return [
+        figure(source.picture(file), f"{name}: the model before and after the merge.", f"seams in {name}", True)
+        for _, name, file in sorted(found)[:MOST_SEAMS]
+    ]

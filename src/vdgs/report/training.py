@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from vdgs.partition.figure_words import block_colour
 from vdgs.report.charts import MERGED, Curve, draw_curves
-from vdgs.report.page import Html, figure, gallery, heading, paragraph, section, table
+from vdgs.report.page import Html, figure, gallery, heading, joined, paragraph, section, table
 from vdgs.report.reading import Record, Source
 from vdgs.report.words import count, decibels, figure_of, share
 from vdgs.run import RunFolder
@@ -16,9 +16,10 @@ SMOOTH = 9
 Log = tuple[str, str, list[Record]]
 
 
-def block_names(run: RunFolder) -> list[str]:
-    """The folders of blocks, as blocks/NN."""
-    return [f"blocks/{folder.path.name}" for folder in run.block_folders() if folder.path.name.isdecimal()]
+def block_names(run: RunFolder) -> list[tuple[int, str]]:
+    """Number and folder (blocks/NN) of every block that was begun."""
+    names = [folder.path.name for folder in run.block_folders()]
+    return [(int(name), f"blocks/{name}") for name in names if name.isdecimal()]
 
 
 def training_section(run: RunFolder) -> Html:
@@ -30,30 +31,45 @@ def training_section(run: RunFolder) -> Html:
         parts.append(paragraph("The coarse model has no log yet.", "absent"))
     parts.append(heading("Blocks"))
     names = block_names(run)
-    logs = [
-        (f"block {int(name[7:])}", block_colour(int(name[7:])), source.lines(f"{name}/log.jsonl")) for name in names
-    ]
-    statuses = [source.record(f"{name}/status.json") for name in names]
+    logs = [(f"block {index}", block_colour(index), source.lines(f"{name}/log.jsonl")) for index, name in names]
+    statuses = [(f"block {index}", source.record(f"{name}/status.json")) for index, name in names]
     parts.append(_curves(logs))
     if not any(records for _, _, records in logs):
         parts.append(paragraph("No block has a log yet.", "absent"))
-    parts.append(_states([("coarse", source.record("coarse/status.json")), *_named(logs, statuses)]))
+    parts.append(_states([("coarse", source.record("coarse/status.json")), *statuses]))
     parts += _growth(logs)
     return section("training", "Training", parts, source.notes)
 
 
-def _named(logs: list[Log], statuses: list[Record]) -> list[tuple[str, Record]]:
-    return [(name, status) for (name, _, _), status in zip(logs, statuses, strict=True)]
-
-
 def _curves(logs: list[Log]) -> Html:
-    psnr = draw_curves(_series(logs, "psnr_smoothed"), "training PSNR, smoothed (dB)")
-    anchors = draw_curves(_series(logs, "anchors"), "anchors", from_zero=True)
-    loss = draw_curves(_series(logs, "loss"), f"loss (bold: median of {SMOOTH} log lines)", smooth=SMOOTH)
-    return gallery([figure(psnr, "", "PSNR"), figure(anchors, "", "anchors"), figure(loss, "", "loss")])
+    finer = _finer(logs[0][2]) if len(logs) == 1 else {}
+    marks = list(finer)
+    psnr = draw_curves(_series(logs, "psnr_smoothed"), "training PSNR, smoothed (dB)", marks=marks)
+    anchors = draw_curves(_series(logs, "anchors"), "anchors", from_zero=True, marks=marks)
+    title = f"loss (bold: median of {SMOOTH} log lines)"
+    loss = draw_curves(_series(logs, "loss"), title, smooth=SMOOTH, marks=marks)
+    shown = gallery([figure(psnr, "", "PSNR"), figure(anchors, "", "anchors"), figure(loss, "", "loss")])
+    if not finer:
+        return shown
+    steps = ", ".join(f"1/{downscale:g} from {at:,.0f}" for at, downscale in finer.items())
+    return joined([shown, paragraph(f"Dotted: the photographs get finer, resolution {steps}.", "facts")])
 
 
-def _series(logs: list[Log], key: str, name: str = "", dashed: bool = False) -> list[Curve]:
+def _finer(records: list[Record]) -> dict[float, float]:
+    """Iterations at which the resolution changed, with the downscale from there on."""
+    changes: dict[float, float] = {}
+    before: float | None = None
+    for record in records:
+        at, downscale = record.number("iteration"), record.number("downscale")
+        if at is None or downscale is None:
+            continue
+        if before not in (None, downscale):
+            changes[at] = downscale
+        before = downscale
+    return changes
+
+
+def _series(logs: list[Log], key: str, named: bool = True, dashed: bool = False) -> list[Curve]:
     """One curve for each log, of the records that have an iteration and mention the key."""
     curves = []
     for label, colour, records in logs:
@@ -62,7 +78,9 @@ def _series(logs: list[Log], key: str, name: str = "", dashed: bool = False) -> 
             for record in records
             if key in record.values and (at := record.number("iteration")) is not None
         ]
-        curves.append(Curve(label + name, colour, [at for at, _ in points], [value for _, value in points], dashed))
+        curves.append(
+            Curve(label if named else "", colour, [at for at, _ in points], [value for _, value in points], dashed)
+        )
     return curves
 
 
@@ -89,14 +107,15 @@ def _growth(logs: list[Log]) -> list[Html]:
     ]
     if not cycles:
         return []
-    # Where there are many blocks, the two curves each would hide one another; the table below has the sums.
-    grown = [*_series(cycles, "grown_low", ", low"), *_series(cycles, "grown_other", ", other", dashed=True)]
+    grown = [*_series(cycles, "grown_low"), *_series(cycles, "grown_other", named=False, dashed=True)]
+    limits = _series(cycles, "t_low")
+    moving = len({value for curve in limits for value in curve.y}) > 1  # else the table below says it all
     charts = (
         (draw_curves(_series(cycles, "low_share"), "share of anchors of low visibility", dots=True, from_zero=True),
          "share of low visibility"),
-        (draw_curves(_series(cycles, "t_low"), "T_low: c_k at or below it is low", dots=True, from_zero=True), "T_low"),
+        (draw_curves(limits if moving else [], "T_low: c_k below it is low", dots=True, from_zero=True), "T_low"),
         (draw_curves(_series(cycles, "mean_cache"), "mean gradient added, g", dots=True, from_zero=True), "cache"),
-        (draw_curves(grown, "anchors grown (dashed: other)", dots=True, from_zero=True), "anchors grown"),
+        (draw_curves(grown, "anchors grown: low, dashed the others", dots=True, from_zero=True), "anchors grown"),
     )  # fmt: skip
     return [
         heading("Compensated growth in the blocks"),

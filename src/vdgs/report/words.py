@@ -34,7 +34,7 @@ def gain(after: float | None, before: float | None, form: str = "{:+.2f}") -> st
 
 
 def duration(seconds: float | None) -> str:
-    if seconds is None or seconds < 0:
+    if seconds is None or not 0 <= seconds < 1e9:
         return ABSENT
     if seconds < 10:
         return f"{seconds:.1f} s"

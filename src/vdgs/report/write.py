@@ -8,6 +8,7 @@ from pathlib import Path
 
 import yaml
 
+from vdgs.errors import RunError
 from vdgs.files import write_text
 from vdgs.report.costs import costs_section, settings_section
 from vdgs.report.page import Html, contents, document, escaped, joined, paragraph
@@ -28,8 +29,11 @@ CONTENTS = (
 def write_report(run: RunFolder) -> Path:
     """Write RUN/report.html and return its path: one file that needs no other, of whatever is there so far.
 
-    What is missing or damaged is left out, and a sentence says so. Raises VdgsError if the file cannot be written.
+    What is missing or damaged is left out, and a sentence says so. Raises RunError if there is no such folder,
+    VdgsError if the file cannot be written.
     """
+    if not run.path.is_dir():
+        raise RunError(f"{run.path}: is not a run folder. Train first: vdgs run CAPTURE --output RUN")
     sections = [
         visibility_section(run.path),
         blocks_section(run.path),
