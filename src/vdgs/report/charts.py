@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, MaxNLocator
+from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator
 
 from vdgs.figure_parts import FAINT, INK
 from vdgs.report.pictures import Picture
@@ -122,7 +122,7 @@ def running_median(values: np.ndarray, window: int) -> np.ndarray:
 def _panel(title: str) -> tuple[Figure, Axes]:
     figure = Figure(figsize=SIZE_IN, dpi=DPI)
     FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.115, 0.17, 0.865, 0.735))  # fixed: finding margins takes longer than drawing
+    axes = figure.add_axes((0.135, 0.17, 0.845, 0.735))  # fixed: finding margins takes longer than drawing
     axes.set_title(title, loc="left", fontsize=10, color=INK)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(FAINT)
@@ -147,8 +147,7 @@ def _scale_axes(axes: Axes) -> None:
     if top >= 2000:
         axes.yaxis.set_major_formatter(EngFormatter(sep=""))
     elif top < 0.01:
-        axes.ticklabel_format(axis="y", style="sci", scilimits=(0, 0), useMathText=True)
-        axes.yaxis.offsetText.set_fontsize(8)
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.4g}"))
 
 
 def _encoded(figure: Figure) -> Picture:

@@ -23,7 +23,7 @@ h1 { font-size: 1.7rem; line-height: 1.2; margin: 0.5rem 0; }
 h2 { font-size: 1.25rem; margin: 2.5rem 0 0.5rem; padding-top: 0.75rem; border-top: 1px solid #d5d9dd; }
 h3 { font-size: 1rem; margin: 1.5rem 0 0.25rem; }
 p { margin: 0.5rem 0; max-width: 46rem; }
-.facts, figcaption, caption { color: #59626b; font-size: 0.875rem; }
+.facts, figcaption { color: #59626b; font-size: 0.875rem; }
 .verdict { font-size: 1.15rem; font-weight: 600; margin: 1rem 0; }
 .note { border-left: 4px solid #d08700; padding: 0.3rem 0.8rem; background: #fff8e6; }
 .absent { color: #59626b; font-style: italic; }
@@ -32,7 +32,6 @@ nav a { margin-right: 1rem; white-space: nowrap; }
 a { color: #1f5f8b; }
 .scroll { overflow-x: auto; margin: 0.75rem 0; }
 table { border-collapse: collapse; font-size: 0.9rem; font-variant-numeric: tabular-nums; overflow-wrap: normal; }
-caption { text-align: left; padding-bottom: 0.25rem; }
 th, td { padding: 0.25rem 0.9rem 0.25rem 0; text-align: right; vertical-align: top; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
 table.wordy td:last-child, table.wordy th:last-child { text-align: left; white-space: normal; min-width: 12rem; }
@@ -41,9 +40,9 @@ tbody tr + tr td { border-top: 1px solid #eceff1; }
 figure { margin: 1rem 0; break-inside: avoid; }
 figcaption { margin-top: 0.25rem; }
 img { display: block; max-width: 100%; height: auto; }
-.gallery { display: grid; grid-template-columns: repeat(auto-fit, minmax(17rem, 1fr)); gap: 0.5rem 1.25rem; }
-.gallery figure { margin: 0.5rem 0; }
-.gallery img { max-width: min(100%, 30rem); }
+.tall img { width: 34rem; }
+.gallery { display: flex; flex-wrap: wrap; gap: 0.5rem 1.25rem; }
+.gallery figure { flex: 1 1 17rem; max-width: 30rem; margin: 0.5rem 0; }
 details { margin: 0.75rem 0; }
 summary { cursor: pointer; color: #1f5f8b; }
 pre { overflow-x: auto; background: #f5f7f8; padding: 0.75rem; font-size: 0.8rem; line-height: 1.4; }
@@ -55,7 +54,12 @@ pre { overflow-x: auto; background: #f5f7f8; padding: 0.75rem; font-size: 0.8rem
   h2, h3 { break-after: avoid; }
   tr { break-inside: avoid; }
   .scroll { overflow: visible; }
-  .wide img { max-width: 100%; width: auto; }
+  table { font-size: 8pt; }
+  th, td { padding-right: 0.5rem; }
+  thead th { white-space: normal; vertical-align: bottom; }
+  img { max-height: 17cm; }
+  .wide img, .tall img { max-width: 100%; width: auto; }
+  .gallery figure { flex-basis: 45%; max-width: 48%; }
   pre { white-space: pre-wrap; }
 }
 """
@@ -85,22 +89,29 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "",
     """Numbers stand to the right, but in the first column and, if `wordy`, the last. Nothing if there is no row."""
     if not rows:
         return Html("")
-    title = f"<caption>{escaped(caption)}</caption>" if caption else ""
     cells = "".join(f'<th scope="col">{escaped(cell)}</th>' for cell in head)
     lines = "\n".join("<tr>" + "".join(f"<td>{escaped(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    # The caption stands outside, so that it does not scroll with a wide table.
     return Html(
-        f'<div class="scroll"><table{_class("wordy" if wordy else "")}>{title}\n<thead><tr>{cells}</tr></thead>\n'
+        f"{paragraph(caption, 'facts')}\n"
+        f'<div class="scroll"><table{_class("wordy" if wordy else "")}>\n<thead><tr>{cells}</tr></thead>\n'
         f"<tbody>\n{lines}\n</tbody></table></div>"
     )
 
 
-def figure(picture: Picture | None, caption: str, alt: str, wide: bool = False) -> Html:
-    """A picture that is `wide` is not squeezed to the width of a phone but scrolls. Nothing if there is no picture."""
+def figure(picture: Picture | None, caption: str, alt: str, wide: bool = False, tall: bool = False) -> Html:
+    """A picture that is `wide` is not squeezed to the width of a phone but scrolls; one that is
+    `tall` does not fill a desk.
+
+    Nothing if there is no picture.
+    """
     if picture is None:
         return Html("")
     image = f'<img src="{picture.data_uri()}" width="{picture.width}" height="{picture.height}" alt="{escaped(alt)}">'
     words = f"<figcaption>{escaped(caption)}</figcaption>" if caption else ""
-    return Html(f'<figure{_class("wide" if wide else "")}><div class="scroll">{image}</div>{words}</figure>')
+    return Html(
+        f'<figure{_class("wide" if wide else "tall" if tall else "")}><div class="scroll">{image}</div>{words}</figure>'
+    )
 
 
 def gallery(figures: Iterable[Html]) -> Html:

@@ -75,7 +75,9 @@ def assignment_section(root: Path) -> Html:
     else:
         parts.append(paragraph("No photographs are assigned to blocks yet.", "absent"))
     scores = source.picture("partition/scores.png")
-    parts.append(figure(scores, "Score of every photograph (row) for every block (column).", "matrix of scores"))
+    parts.append(
+        figure(scores, "Score of every photograph (row) for every block (column).", "matrix of scores", tall=True)
+    )
     if rows and not source.has("partition/scores.png"):
         parts.append(paragraph("There is no figure of the scores (partition/scores.png).", "absent"))
     return section("cameras", "Camera assignment", parts, source.notes)

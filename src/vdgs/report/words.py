@@ -27,10 +27,11 @@ def share(value: float | None) -> str:
 
 
 def gain(after: float | None, before: float | None, form: str = "{:+.2f}") -> str:
-    """The difference with its sign; a minus that people expect in print."""
+    """The difference with its sign: a minus as in print, and never one before a zero."""
     if after is None or before is None:
         return ABSENT
-    return form.format(after - before).replace("-", "−")
+    signed = form.format(after - before)
+    return signed.replace("-", "−" if float(signed) else "+")
 
 
 def duration(seconds: float | None) -> str:
