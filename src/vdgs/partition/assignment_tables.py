@@ -50,7 +50,7 @@ def explain(
 def assignment_rows(
     blocks: Blocks, positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray, " n"], assignment: Assignment
 ) -> list[Row]:
-    """A row for each block: cameras by reason, anchors in core and widened block, mean V_i and area of the core.
+    """A row for each block: cameras by reason, anchors in core and widened block, mean and standard deviation of V_i, area of the core.
 
     Areas are in square units of the ground frame; `mean_v` is None for a block without anchors. Ready for JSON.
     """
@@ -69,6 +69,7 @@ def assignment_rows(
                 "anchors_core": int(np.count_nonzero(own)),
                 "anchors_expanded": int(np.count_nonzero(blocks.reaches(index, places))),
                 "mean_v": float(visibility[own].mean()) if own.any() else None,
+                "std_v": float(visibility[own].std()) if own.any() else None,
                 "area": float(block.core.area),
             }
         )

@@ -149,6 +149,6 @@ def _announce(capture: Capture, state: TrainingState, config: TrainConfig, budge
         f"views of {camera.width}x{camera.height}, {len(capture.points):,} points, {len(state.anchors):,} anchors, "
         f"{config.iterations:,} iterations\n"
         f"memory: images {min(budget, 3 * pixels * 4 // 3) / 1e9:.2f} GB (at most {budget / 1e9:.1f}), "
-        "about 1 kB an anchor, 4 kB while it is in view",
+        "about 1 kB an anchor, 2.5 kB while it is in view",
         highlight=False,
     )
