@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -118,14 +118,13 @@ def evaluate(
     facts: ModelFacts | None = None,
     settings: EvaluationSettings | None = None,
     console: Console | None = None,
-    progress: Callable[[Iterable[int], int], Iterable[int]] | None = None,
 ) -> dict[str, Any]:
     """Render and measure every view, write `output`, and return what `metrics.json` holds.
 
     `visibility_map(camera)` is V per pixel [h, w], NaN where the model shows nothing. `lpips_note` says
     why LPIPS is null. `load_mask` reads `view.mask_path` by default (white = keep). A table is printed to
-    `console` if there is one; `progress(indices, total)` may wrap the loop. fps is one over the median
-    time of `render`, which on a GPU includes waiting for it.
+    `console` if there is one. fps is one over the median time of `render`, which on a GPU includes waiting
+    for it.
 
     Raises RunError without views, CaptureError where a photograph or mask does not fit its camera,
     TrainingDiverged where a render is not finite.
@@ -141,9 +140,8 @@ def evaluate(
     gathered = _Gathered(histogram=VisibilityHistogram(names) if visibility_map else None)
     stems = saving.file_stems([view.name for view in views])
     on_sheet = set(np.linspace(0, len(views) - 1, min(len(views), settings.contact_views)).round().astype(int))
-    indices: Iterable[int] = range(len(views))
-    for index in progress(indices, len(views)) if progress else indices:
-        _evaluate_view(views[index], stems[index], index in on_sheet, inputs, gathered)
+    for index, view in enumerate(views):
+        _evaluate_view(view, stems[index], index in on_sheet, inputs, gathered)
     result = _summary(gathered, facts or ModelFacts(), lpips_note, settings)
     _write(output, result, gathered, len(views))
     if console is not None:
