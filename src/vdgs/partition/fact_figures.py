@@ -54,8 +54,9 @@ def draw_block_facts(
         axes.set_ylim(count - 1.3, -1.3)
         axes.set_title(name, loc="left", fontsize=10, color=INK)
         _rows(axes, rows, index == 0, step)
+        axes.xaxis.set_major_locator(MaxNLocator(3, integer=index < 2, min_n_ticks=1))
     note = "mean over the blocks of the standard deviation of V within each: " + _both(groups)
-    captions = ("this cut",) if compare is None else ("this cut", "cut by place alone, λ_vis = 0 (numbers of its own)")
+    captions = ("",) if compare is None else ("this cut", "cut by place alone, λ_vis = 0 (numbers of its own)")
     for places, caption in zip(rows, captions, strict=True):
         panels[0].text(0, places[0] - 0.95, caption, va="center", fontsize=_font(step), fontweight="bold", color=INK)
     lower = "colours and numbers are those of the map of blocks"
@@ -115,7 +116,7 @@ def _panel(axes: Axes, index: int, facts: BlockFacts, rows: Float[np.ndarray, " 
     for row, end, label in zip(rows, right, text, strict=True):
         missing = label == "nan"
         axes.annotate(
-            "no anchors" if missing else label, (0 if missing else end, row), (4, 0), textcoords="offset points",
+            "no anchors" if missing else label, (0 if missing else end, row), (6, 0), textcoords="offset points",
             va="center", fontsize=_font(step), color=FAINT if missing else INK,
         )  # fmt: skip
     return float(np.nanmax(right, initial=0.0))
@@ -124,12 +125,12 @@ def _panel(axes: Axes, index: int, facts: BlockFacts, rows: Float[np.ndarray, " 
 def _rows(axes: Axes, rows: list[Float[np.ndarray, " b"]], named: bool, step: float) -> None:
     """Block numbers at the left, and the ink of one panel."""
     plain(axes)
+    axes.patch.set_visible(False)  # captions reach into the next panel
     places = np.concatenate(rows)
     numbers = [f"block {index}" for group in rows for index in range(len(group))]
     axes.set_yticks(places, numbers if named else [])
     axes.tick_params(axis="y", length=0, labelsize=_font(step))
     axes.spines["left"].set_visible(False)
-    axes.xaxis.set_major_locator(MaxNLocator(3))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
     if len(rows) > 1:
         axes.axhline(rows[1][0] - 1.7, color=FAINT, linewidth=0.6)

@@ -17,7 +17,19 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
 from vdgs.cameras import Camera
-from vdgs.figure_parts import DPI, FAINT, INK, CameraMarks, SeenMap, draw_seen_map, map_size, placer, plain, titles
+from vdgs.figure_parts import (
+    DPI,
+    FAINT,
+    INK,
+    CameraMarks,
+    SeenMap,
+    draw_seen_map,
+    map_size,
+    mark_edge,
+    placer,
+    plain,
+    titles,
+)
 from vdgs.inspect import sample_points
 from vdgs.partition.blocks import Blocks
 from vdgs.partition.fact_figures import block_facts, draw_block_facts, spread_note
@@ -83,7 +95,7 @@ def draw_blocks(
         axes.set_title(f"{name}\n{spread_note(spread)}", loc="left", fontsize=10, color=INK)
         axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
     _heading(figure, blocks, (len(positions), len(shown)), _places(cameras), (low, high))
-    _legend(figure)
+    _legend(figure, bool(assigned.any(axis=1).all()))
     canvas.print_png(file)  # type: ignore[arg-type]
 
 
@@ -93,7 +105,7 @@ def _places(cameras: Sequence[Camera]) -> Float[np.ndarray, "c 2"]:
 
 def _mark_size(cameras: int) -> float:
     """Size of a camera mark in points²: thousands must not hide the map."""
-    return float(np.clip(3000 / max(cameras, 1), 5, 30))
+    return float(np.clip(9000 / max(cameras, 1), 8, 30))
 
 
 def _inner(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 2"]:
@@ -150,9 +162,10 @@ def _room(core: shapely.Polygon, window: shapely.Polygon) -> tuple[float, float]
 
 def _cameras(axes: Axes, places: Float[np.ndarray, "c 2"], used: Bool[np.ndarray, " c"]) -> None:
     """Cameras as small triangles; white those that are not `used`."""
+    size = 0.7 * _mark_size(len(places))
     for chosen, face, edge in ((used, INK, "white"), (~used, "white", INK)):
         axes.scatter(
-            places[chosen, 0], places[chosen, 1], marker="^", s=0.7 * _mark_size(len(places)), linewidths=0.6,
+            places[chosen, 0], places[chosen, 1], marker="^", s=size, linewidths=mark_edge(size),
             facecolors=face, edgecolors=edge, zorder=4,
         )  # fmt: skip
 
@@ -169,7 +182,7 @@ def _heading(
     titles(figure, count_of(len(blocks), "block"), f"{facts}  ·  {seen}", "")
 
 
-def _legend(figure: Figure) -> None:
+def _legend(figure: Figure, all_used: bool) -> None:
     triangle = {"marker": "^", "linestyle": "none", "markersize": 5.5, "markeredgewidth": 0.7}
     lines = [
         Line2D([], [], color=INK, linewidth=1.1, label="core"),
@@ -179,6 +192,6 @@ def _legend(figure: Figure) -> None:
     ]
     width, height = figure.get_size_inches()
     figure.legend(
-        handles=lines, loc="upper left", bbox_to_anchor=(0.85 / width, 1 - 0.84 / height), ncols=4, fontsize=8.5,
-        frameon=False, handletextpad=0.5, columnspacing=1.2, borderaxespad=0, borderpad=0,
+        handles=lines[:3] if all_used else lines, loc="upper left", bbox_to_anchor=(0.85 / width, 1 - 0.84 / height),
+        ncols=4, fontsize=8.5, frameon=False, handletextpad=0.5, columnspacing=1.2, borderaxespad=0, borderpad=0,
     )  # fmt: skip

@@ -38,7 +38,10 @@ def draw_scores(file: Path, scores: Float[np.ndarray, "c b"], assigned: Bool[np.
     norm = Normalize(min(0.0, float(scores.min(initial=0))), max(float(scores.max(initial=0)), 1e-6))
     if cameras:
         extent = (-0.5, blocks - 0.5, cameras - 0.5, -0.5)
-        axes.imshow(_cells(scores[order], assigned[order], norm, width / blocks), aspect="auto", extent=extent)
+        picture = _cells(scores[order], assigned[order], norm, width / blocks)
+        # Sharp where every camera has a row of pixels, else averaged so that none is dropped.
+        smooth = "nearest" if cameras <= height * DPI else "antialiased"
+        axes.imshow(picture, aspect="auto", extent=extent, interpolation=smooth)
         bar = figure.colorbar(ScalarMappable(norm, SCORE), cax=place(1.6 + width + 0.3, 0.65, 0.18, height))
         bar.set_label("score", color=INK, fontsize=9)
         bar.outline.set_visible(False)  # type: ignore[operator]
