@@ -173,11 +173,10 @@ def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: No
     axes.plot([0, 1.12 * shares.max()], [median, median], color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
     axes.text(1.12 * shares.max(), median, " median", va="center", fontsize=9, color=INK)
     below = float((visibility < THIN[0]).mean())
-    share = f"{below:.1%}".replace("100.0", "100")  # the longest text, beside the longest bar
-    axes.text(
+    note = axes.text(
         shares[: THIN[0]].max() + 0.03 * shares.max(),
         1,
-        f" {share} below {THIN[0]}",
+        f" {below:.1%} below {THIN[0]}",
         va="center",
         fontsize=10,
         fontweight="bold",
@@ -186,6 +185,8 @@ def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: No
     axes.set(
         ylim=(-0.5, top + 0.5), xlim=(0, 1.4 * shares.max()), yticks=[], xlabel=f"share of the {noun.split()[-1]}s"
     )
+    if note.get_window_extent().x1 > axes.figure.bbox.x1:  # too long beside the longest bar
+        note.set_text(f" {below:.1%}\n below {THIN[0]}")
     axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=_decimals(100 * axes.get_xticks())))
     for part in (bar, axes):
