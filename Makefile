@@ -13,7 +13,7 @@ export OMP_WAIT_POLICY = PASSIVE
 .PHONY: help setup demo test lint types clean
 
 help:
-	@echo "make demo    generate a small town, train on it, measure it (a few minutes, no GPU)"
+	@echo "make demo    generate a small town, run the whole method on it, report (a few minutes, no GPU)"
 	@echo "make test    lint, types and the whole test suite"
 	@echo "make setup   only install into $(VENV)"
 	@echo "make clean   remove $(VENV), build/ and $(DEMO)/"
@@ -33,13 +33,12 @@ demo: setup
 	rm -rf $(DEMO)
 	$(BIN)/vdgs synth $(DEMO)/capture
 	$(BIN)/vdgs inspect $(DEMO)/capture --output $(DEMO)/inspect
-	$(BIN)/vdgs coarse $(DEMO)/capture --output $(DEMO)/run --preset laptop
-	$(BIN)/vdgs eval $(DEMO)/run
+	$(BIN)/vdgs run $(DEMO)/capture --output $(DEMO)/run --preset laptop --blocks 4
 	@echo
-	@echo "the place from above:  $(DEMO)/inspect/visibility_map.png"
-	@echo "test views:            $(DEMO)/run/evaluation/contact_sheet.png"
-	@echo "metrics:               $(DEMO)/run/evaluation/metrics.json"
-	@echo "model:                 $(DEMO)/run/coarse/model.safetensors"
+	@echo "report:      $(DEMO)/run/report.html"
+	@echo "test views:  $(DEMO)/run/evaluation/contact_sheet.png"
+	@echo "metrics:     $(DEMO)/run/evaluation/metrics.json"
+	@echo "model:       $(DEMO)/run/merged/model.safetensors"
 
 lint: setup
 	$(BIN)/ruff check .

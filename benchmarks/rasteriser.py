@@ -144,15 +144,15 @@ class Prototype:
 
 def scenes_of_run(run: Path, views: int) -> list[tuple[str, Scene]]:
     """What the first test views of a trained run draw."""
+    from vdgs.render import decode_rows, visible_rows
     from vdgs.stages.opening import open_run
-    from vdgs.render import decode_visible, gather_visible
 
     opened, scenes = open_run(run), []
     for view in opened.capture.test_views[:views]:
         camera = view.camera
-        visible = gather_visible(opened.model.anchors, camera)
+        seen = visible_rows(opened.model.anchors, camera)
         with torch.no_grad():
-            splats = decode_visible(visible.anchors, opened.model.decoder.for_image(None), camera)
+            splats = decode_rows(opened.model.anchors, seen, opened.model.decoder.for_image(None), camera)
         rows = (splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths)
         gradient = np.random.default_rng(1).normal(size=(camera.height, camera.width, 3)).astype(np.float32)
         background = np.array(opened.model.background, np.float32)

@@ -1,4 +1,5 @@
-"""Where the time of one whole training step goes: cull, decode, rasterise, loss, backward, Adam, statistics.
+"""Where the time of one whole training step goes: cull, decode, rasterise, loss, its way back to the
+splats, from them to anchors that move, statistics.
 
     python benchmarks/step.py [--threads 2] [--visible 20000]
 
@@ -27,7 +28,7 @@ import numpy as np
 import torch
 
 from machine import describe
-from vdgs.anchors import TRAINED, Anchors
+from vdgs.anchors import Anchors
 from vdgs.cameras import Camera
 from vdgs.checkpoints import save_state
 from vdgs.config import TrainConfig
@@ -36,10 +37,11 @@ from vdgs.kernels import native as kernels
 from vdgs.kernels.native.module import set_threads
 from vdgs.memory import forget_peak, peak_memory_bytes
 from vdgs.optimiser import rates_at
-from vdgs.render import decode_visible, draw, gather_visible
+from vdgs.render import decode_rows, visible_rows
+from vdgs.step import draw_view, move_anchors
 from vdgs.training import Stage, start_state, to_saved
 
-PHASES = ("cull", "decode", "rasterise", "loss", "backward", "adam", "statistics")
+PHASES = ("cull", "decode", "rasterise", "loss", "backward", "move", "statistics")
 
 
 def scene(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Anchors, Camera]:
@@ -78,24 +80,29 @@ def one_step(
 ) -> tuple[int, int]:
     """The work of vdgs.training.train_step, phase by phase."""
     rates = rates_at(TrainConfig().rates, 0.1)
-    visible = timed(times, "cull", lambda: gather_visible(state.anchors, camera))
-    leaves = {name: getattr(visible.anchors, name).requires_grad_(True) for name in TRAINED}
-    splats = timed(times, "decode", lambda: decode_visible(visible.anchors, state.decoder.for_image(0), camera))
-    splats.means_px.retain_grad()
-    raster = timed(times, "rasterise", lambda: draw(splats, camera, torch.zeros(3)))
-    photometric = timed(times, "loss", lambda: kernels.photometric_loss(raster.image, target, None))
-    timed(times, "backward", lambda: (photometric.loss + 0.01 * splats.volumes.mean()).backward())
+    weights = state.decoder.for_image(0)
+    with torch.no_grad():
+        rows = timed(times, "cull", lambda: visible_rows(state.anchors, camera))
+        waiting = [timed(times, "decode", lambda: decode_rows(state.anchors, rows, weights, camera))]
+        view = timed(times, "rasterise", lambda: draw_view(waiting.pop(), camera, torch.zeros(3)))
+    view.image.requires_grad_(True)
 
-    def adam() -> None:
-        gradients = {name: leaf.grad for name, leaf in leaves.items()}
-        state.optimiser.update_anchors(state.anchors, visible.rows, gradients, rates, step)
+    def loss() -> torch.Tensor:
+        photometric = kernels.photometric_loss(view.image, target, None)
+        return torch.autograd.grad(photometric.loss, view.image)[0]
+
+    image_gradient = timed(times, "loss", loss)
+    gradients = timed(times, "backward", lambda: view.backward(image_gradient, 0.01))
+
+    def move() -> None:
+        move_anchors(state.anchors, rows, gradients, weights, camera, state.optimiser, rates, step)
         state.optimiser.update_decoder(state.decoder, rates, step)
 
-    timed(times, "adam", adam)
+    timed(times, "move", move)
     timed(times, "statistics", lambda: state.statistics.add_view(
-        visible.rows, splats.source, splats.opacities.detach(), splats.means_px.grad, camera.width, camera.height
+        rows, view.source, view.opacities, gradients.means_px, camera.width, camera.height
     ))  # fmt: skip
-    return len(visible.rows), len(splats.opacities)
+    return len(rows), len(view.source)
 
 
 def prepare(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Any, Camera, torch.Tensor]:

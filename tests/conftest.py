@@ -16,8 +16,11 @@ CORE = (
     "compensation",
     "decoder",
     "growth",
+    "merging",
     "optimiser",
+    "partition",
     "render",
     "training",
+    "visibility",
 )
 install_import_hook([f"vdgs.{room}" for room in CORE], "typecheck.checked")

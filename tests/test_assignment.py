@@ -29,7 +29,7 @@ from vdgs.partition.assignment_tables import assignment_rows, assignment_table, 
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.saving import load_scores, save_scores
 from vdgs.partition.scores import Scores, reduced, score_matrix, select_splats
-from vdgs.render import decode_visible, gather_visible, render
+from vdgs.render import decode_rows, render, visible_rows
 
 MODES = ("coverage", "literal", "leave_one_out", "frustum")
 RENDERED = MODES[:3]
@@ -105,9 +105,9 @@ def test_the_splats_of_a_block_draw_what_the_block_alone_draws(instructions):
     model, blocks, view = scene(), strips(3), camera(8.0, tilt_deg=30.0)
     places = model.anchors.positions[:, :2].double().numpy()
     with using(instructions), torch.no_grad():
-        visible = gather_visible(model.anchors, view)
-        splats = decode_visible(visible.anchors, model.decoder.weights, view)
-        anchor = visible.rows[splats.source.long() // 4]
+        rows = visible_rows(model.anchors, view)
+        splats = decode_rows(model.anchors, rows, model.decoder.weights, view)
+        anchor = rows[splats.source.long() // 4]
         for index in range(3):
             reached = torch.from_numpy(blocks.reaches(index, places))
             some = select_splats(splats, reached[anchor].nonzero().squeeze(1))

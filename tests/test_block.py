@@ -20,7 +20,7 @@ from vdgs.config import (
 )
 from vdgs.decoder import Decoder
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.render import gather_visible
+from vdgs.render import visible_rows
 from vdgs.stages.block import drawn_by, holds, places, ramp, split_anchors
 from vdgs.training import Stage, TrainingState, from_saved, start_state, to_saved, train, views_in_cycle
 
@@ -105,7 +105,7 @@ def test_every_anchor_is_own_or_around_and_only_what_cameras_draw_is_held():
     cameras = Photographs().cameras
     drawn = drawn_by(anchors, cameras)
     for camera in cameras:
-        assert drawn[gather_visible(anchors, camera).rows].all()
+        assert drawn[visible_rows(anchors, camera)].all()
     far = replace(anchors, positions=anchors.positions + 100)
     assert not drawn_by(far, cameras).any()
 
@@ -191,4 +191,4 @@ def test_rates_restart_lower_and_iterations_scale():
     assert config.rates.offsets == pytest.approx((0.004, 4e-5))
     assert config.rates.log_scales == pytest.approx((0.0056, 0.0056))
     assert config.rates.features == method.training.rates.features
-    assert block_training(replace(method, block=BlockConfig(iterations=0)), 33).iterations == 1500
+    assert block_training(replace(method, block=BlockConfig(iterations=0)), 33).iterations == 500

@@ -85,7 +85,7 @@ def test_a_run_leaves_what_the_documents_say(unbroken):
         "evaluation/contact_sheet.png", "report.html",
     ]  # fmt: skip
     assert [name for name in expected if not (unbroken / name).is_file()] == []
-    assert not [path for path in unbroken.rglob("*.tmp")]
+    assert not list(unbroken.rglob("*.tmp"))
     metrics = {folder: json.loads((unbroken / folder / "metrics.json").read_text())
                for folder in ("coarse/evaluation", "evaluation")}  # fmt: skip
     assert (metrics["coarse/evaluation"]["model"], metrics["evaluation"]["model"]) == ("coarse", "merged")
@@ -247,12 +247,12 @@ def test_damaged_files_of_a_partition_are_named(copied, file):
 def test_the_report_is_one_file_without_links_out(unbroken):
     text = (unbroken / "report.html").read_text()
 
-    class Links(HTMLParser):
-        found: list[str] = []
+    links: list[str] = []
 
+    class Links(HTMLParser):
         def handle_starttag(self, tag, attrs):
-            self.found += [value for name, value in attrs if name in ("src", "href") and value]
+            links.extend(value for name, value in attrs if name in ("src", "href") and value)
 
     Links().feed(text)
-    assert len(Links.found) > 5
-    assert all(link.startswith(("data:", "#")) for link in Links.found)
+    assert len(links) > 5
+    assert all(link.startswith(("data:", "#")) for link in links)

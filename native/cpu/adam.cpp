@@ -1,4 +1,6 @@
 // Adam is bound by memory: one pass over the gradient to see that it is finite, one over everything.
+#include "adam.h"
+
 #include <algorithm>
 #include <atomic>
 #include <cstdint>
@@ -15,11 +17,6 @@ namespace vdgs {
 namespace {
 
 constexpr size_t kTaskFloats = 1 << 15;
-
-// parameter -= rate * m / (sqrt(v) * root + epsilon): both bias corrections are in rate and root.
-struct AdamStep {
-  double rate, root, beta1, beta2, epsilon;
-};
 
 struct Factors {
   F16 rate, root, beta1, beta2, rest1, rest2, epsilon;
@@ -52,53 +49,26 @@ void update_stretch(float* parameter, float* first, float* second, const float* 
   store_first(parameter + i, rest, p), store_first(first + i, rest, m), store_first(second + i, rest, v);
 }
 
-// Rows [begin, end) of the list; neighbours in the list that are neighbours in memory go together.
-void update_rows(float* parameter, const int64_t* rows, size_t begin, size_t end, size_t width,
-                 const float* gradient, float* first, float* second, const Factors& factors) {
-  while (begin < end) {
-    size_t stop = begin + 1;
-    if (rows) {
-      while (stop < end && rows[stop] == rows[stop - 1] + 1) ++stop;
-    } else {
-      stop = end;
-    }
-    const size_t at = (rows ? static_cast<size_t>(rows[begin]) : begin) * width;
-    update_stretch(parameter + at, first + at, second + at, gradient + begin * width, (stop - begin) * width, factors);
-    begin = stop;
-  }
-}
-
-bool stretch_finite(const float* values, size_t size) {
-  uint32_t bad = 0;
-  for (size_t i = 0; i < size; ++i) {
-    uint32_t bits;
-    std::memcpy(&bits, values + i, sizeof bits);
-    bad |= (bits & 0x7f800000u) == 0x7f800000u;
-  }
-  return bad == 0;
-}
-
 int64_t tasks(size_t size, size_t each) { return static_cast<int64_t>((size + each - 1) / each); }
 
-bool all_finite(const float* values, size_t size) {
+bool finite_throughout(const float* values, size_t size) {
   std::atomic<bool> finite{true};
   parallel_for(tasks(size, kTaskFloats), [&](int64_t task) {
     const size_t begin = static_cast<size_t>(task) * kTaskFloats, end = std::min(size, begin + kTaskFloats);
-    if (!stretch_finite(values + begin, end - begin)) finite.store(false, std::memory_order_relaxed);
+    if (!all_finite(values + begin, end - begin)) finite.store(false, std::memory_order_relaxed);
   });
   return finite.load();
 }
 
-// `count` rows of `width` floats. rows ascend without repetition, or null: row i is row i. The gradient holds
-// `count` packed rows; the other three are addressed by row.
-void adam_rows(float* parameter, const int64_t* rows, size_t count, size_t width, const float* gradient, float* first,
-               float* second, const AdamStep& step) {
-  // A row's lanes may be cut differently by different runs of neighbours, but every lane is computed alike.
-  const Factors factors(step);
-  const size_t each = std::max<size_t>(1, kTaskFloats / std::max<size_t>(1, width));
+// As adam_update, threaded; rows ascend without repetition.
+void adam_rows(const AdamRows& state, const int64_t* rows, size_t count, const float* gradient) {
+  const size_t width = state.width, each = std::max<size_t>(1, kTaskFloats / std::max<size_t>(1, width));
   parallel_for(tasks(count, each), [&](int64_t task) {
-    const size_t begin = static_cast<size_t>(task) * each;
-    update_rows(parameter, rows, begin, std::min(count, begin + each), width, gradient, first, second, factors);
+    const size_t begin = static_cast<size_t>(task) * each, n = std::min(count - begin, each);
+    if (rows) return adam_update(state, rows + begin, n, gradient + begin * width);
+    const size_t at = begin * width;
+    adam_update({state.parameter + at, state.first + at, state.second + at, width, state.step}, nullptr, n,
+                gradient + at);
   });
 }
 
@@ -108,13 +78,37 @@ bool bound(State parameter, std::optional<Array<const int64_t, nb::ndim<1>>> row
            Array<const float, nb::ndim<2>> gradient, State first, State second, double rate, double root,
            double beta1, double beta2, double epsilon) {
   nb::gil_scoped_release release;
-  if (!all_finite(gradient.data(), gradient.size())) return false;
-  adam_rows(parameter.data(), rows ? rows->data() : nullptr, gradient.shape(0), gradient.shape(1), gradient.data(),
-            first.data(), second.data(), {rate, root, beta1, beta2, epsilon});
+  if (!finite_throughout(gradient.data(), gradient.size())) return false;
+  const AdamRows state{parameter.data(), first.data(), second.data(), gradient.shape(1),
+                       {rate, root, beta1, beta2, epsilon}};
+  adam_rows(state, rows ? rows->data() : nullptr, gradient.shape(0), gradient.data());
   return true;
 }
 
 }  // namespace
+
+bool all_finite(const float* values, size_t size) {
+  uint32_t bad = 0;
+  for (size_t i = 0; i < size; ++i) {
+    uint32_t bits;
+    std::memcpy(&bits, values + i, sizeof bits);
+    bad |= (bits & 0x7f800000u) == 0x7f800000u;
+  }
+  return bad == 0;
+}
+
+void adam_update(const AdamRows& state, const int64_t* rows, size_t count, const float* gradient) {
+  const Factors factors(state.step);
+  const size_t width = state.width;
+  for (size_t begin = 0, stop = 0; begin < count; begin = stop) {
+    // Neighbours in the list that are neighbours in memory go together.
+    stop = rows ? begin + 1 : count;
+    while (stop < count && rows[stop] == rows[stop - 1] + 1) ++stop;
+    const size_t at = (rows ? static_cast<size_t>(rows[begin]) : begin) * width;
+    update_stretch(state.parameter + at, state.first + at, state.second + at, gradient + begin * width,
+                   (stop - begin) * width, factors);
+  }
+}
 
 VDGS_BIND(adam_rows) {
   m.def("adam_rows", &bound, nb::arg("parameter"), nb::arg("rows").none(), nb::arg("gradient"), nb::arg("first"),

@@ -6,6 +6,8 @@
 // bits come out for any number of threads.
 #include "decode.h"
 
+#include <atomic>
+
 #include "threads.h"
 
 namespace vdgs {
@@ -47,7 +49,7 @@ int64_t collect(const SplatGradients& in, int64_t s, int64_t first, int k, Incom
     put(fields + Incoming::kDepth, lane, in.depths, 1, s);
     put(fields + Incoming::kRed, lane, in.colours, 3, s);
     put(fields + Incoming::kOpacity, lane, in.opacities, 1, s);
-    put(fields + Incoming::kVolume, lane, in.volumes, 1, s);
+    fields[Incoming::kVolume][lane] = in.volumes ? in.volumes[s] : in.volume;
     put(fields + Incoming::kRedValue, lane, in.colour_values, 3, s);
     put(fields + Incoming::kOpacityValue, lane, in.opacity_values, 1, s);
     out.present[j] |= 1u << lane;
@@ -92,8 +94,9 @@ void offset_backward(const Camera& camera, const Batch& batch, const float* cova
   }
 }
 
-void offsets_backward(const Camera& camera, WeightLayout layout, const float* weights, const Batch& batch,
-                      const Incoming& in, Outgoing& out) {
+// Compiled once: inlined in two places, its products and sums might be rounded in two ways.
+[[gnu::noinline]] void offsets_backward(const Camera& camera, WeightLayout layout, const float* weights,
+                                        const Batch& batch, const Incoming& in, Outgoing& out) {
   alignas(64) float covariances[7 * kMaxOffsets * kLanes];
   output_layer(layout, weights, 1, batch, covariances);
   const int k = layout.k;
@@ -142,28 +145,74 @@ void add_weight_gradients(WeightLayout layout, const Batch& batch, const Outgoin
     store(bias_sums + i, load(bias_sums + i) + load(g.outputs + i));
 }
 
+// Gradients of the anchors go into arrays.
+class IntoArrays {
+ public:
+  IntoArrays(const AnchorGradients& out, int k) : out_(out), k_(k) {}
+
+  // Where the rows of the anchors from `first` on are to be written.
+  AnchorGradients room(int64_t first) const {
+    const auto from = [&](float* array, int width) { return array ? array + first * width : nullptr; };
+    return {from(out_.features, kFeatures), from(out_.offsets, 3 * k_), from(out_.log_scales, 6)};
+  }
+  void written(int64_t, int) const {}
+
+ private:
+  AnchorGradients out_;
+  int k_;
+};
+
+// Gradients of the anchors become steps of Adam. No batch reads what another one moves.
+class IntoSteps {
+ public:
+  IntoSteps(const AnchorSteps& steps, const AnchorArrays& anchors, std::atomic<bool>& finite)
+      : steps_(steps), anchors_(anchors), finite_(finite) {}
+
+  AnchorGradients room(int64_t) { return {features_, offsets_, log_scales_}; }
+
+  // The rows of `count` anchors are in their room.
+  void written(int64_t first, int count) {
+    const size_t n = static_cast<size_t>(count);
+    if (!all_finite(features_, n * kFeatures) || !all_finite(log_scales_, n * 6) ||
+        !all_finite(offsets_, n * steps_.offsets.width))
+      return finite_.store(false, std::memory_order_relaxed);
+    int64_t rows[kLanes];
+    for (int i = 0; i < count; ++i) rows[i] = anchors_.row(first + i);
+    adam_update(steps_.features, rows, n, features_);
+    adam_update(steps_.offsets, rows, n, offsets_);
+    adam_update(steps_.log_scales, rows, n, log_scales_);
+  }
+
+ private:
+  const AnchorSteps& steps_;
+  const AnchorArrays& anchors_;
+  std::atomic<bool>& finite_;
+  alignas(64) float features_[kLanes * kFeatures] = {};
+  float offsets_[kLanes * 3 * kMaxOffsets] = {}, log_scales_[kLanes * 6] = {};
+};
+
 // The gradients of the anchors themselves, as rows.
-void write_anchor_gradients(const float* weights, int k, int64_t first, int count, Outgoing& g,
-                            const DecodeGradients& out) {
+void write_anchor_gradients(const float* weights, int k, int count, Outgoing& g, const AnchorGradients& out) {
   if (out.features) {
     multiply<kAllHidden, 1>(
         weights, kFeatures, kAllHidden, g.hidden, [](int) { return splat(0.0f); },
         [&](int r, F16 sum) { store(g.features + r * kLanes, sum); });
-    lanes_to_rows<kFeatures>(g.features, kFeatures, count, out.features + first * kFeatures);
+    lanes_to_rows<kFeatures>(g.features, kFeatures, count, out.features);
   }
-  if (out.offsets) lanes_to_rows<3 * kMaxOffsets>(g.offsets, 3 * k, count, out.offsets + first * 3 * k);
-  if (out.log_scales) lanes_to_rows<kLanes>(g.log_scales, 6, count, out.log_scales + first * 6);
+  if (out.offsets) lanes_to_rows<3 * kMaxOffsets>(g.offsets, 3 * k, count, out.offsets);
+  if (out.log_scales) lanes_to_rows<kLanes>(g.log_scales, 6, count, out.log_scales);
 }
 
-void write_no_gradients(int k, int64_t first, int64_t count, const DecodeGradients& out) {
-  if (out.features) std::fill_n(out.features + first * kFeatures, count * kFeatures, 0.0f);
-  if (out.offsets) std::fill_n(out.offsets + first * 3 * k, count * 3 * k, 0.0f);
-  if (out.log_scales) std::fill_n(out.log_scales + first * 6, count * 6, 0.0f);
+void write_no_gradients(int k, int count, const AnchorGradients& out) {
+  if (out.features) std::fill_n(out.features, count * kFeatures, 0.0f);
+  if (out.offsets) std::fill_n(out.offsets, count * 3 * k, 0.0f);
+  if (out.log_scales) std::fill_n(out.log_scales, count * 6, 0.0f);
 }
 
 // Anchors begin .. end - 1; `sums` (the gradients of the weights, zeroed here) may be null.
+template <class Into>
 void piece_backward(const AnchorArrays& anchors, WeightLayout layout, const float* weights, const Camera& camera,
-                    const SplatGradients& in, const DecodeGradients& out, int64_t begin, int64_t end, float* sums) {
+                    const SplatGradients& in, Into into, int64_t begin, int64_t end, float* sums) {
   const int k = layout.k;
   alignas(64) float bias_sums[kOutputsPerOffset * kMaxOffsets * kLanes];
   if (sums) {
@@ -178,38 +227,54 @@ void piece_backward(const AnchorArrays& anchors, WeightLayout layout, const floa
     const int count = static_cast<int>(std::min<int64_t>(kLanes, end - first));
     bool some;
     s = collect(in, s, first, k, *incoming, some);
-    if (!some) {
-      write_no_gradients(k, first, count, out);
-      continue;
+    const AnchorGradients out = into.room(first);
+    if (some) {
+      load_batch(anchors, camera, first, batch);
+      hidden_layer(weights, batch);
+      offsets_backward(camera, layout, weights, batch, *incoming, outgoing);
+      if (out.features || sums) hidden_backward(layout, weights, batch, outgoing);
+      write_anchor_gradients(weights, k, count, outgoing, out);
+      if (sums) add_weight_gradients(layout, batch, outgoing, sums, bias_sums);
+    } else {
+      write_no_gradients(k, count, out);
     }
-    load_batch(anchors, camera, first, batch);
-    hidden_layer(weights, batch);
-    offsets_backward(camera, layout, weights, batch, *incoming, outgoing);
-    if (out.features || sums) hidden_backward(layout, weights, batch, outgoing);
-    write_anchor_gradients(weights, k, first, count, outgoing, out);
-    if (sums) add_weight_gradients(layout, batch, outgoing, sums, bias_sums);
+    into.written(first, count);
   }
   if (sums)
     for (int i = 0; i < kOutputsPerOffset * k; ++i) sums[layout.bias() + i] = hsum(load(bias_sums + i * kLanes));
 }
 
-}  // namespace
-
-void decode_backward(const AnchorArrays& anchors, WeightLayout layout, const float* weights, const Camera& camera,
-                     const SplatGradients& in, const DecodeGradients& out) {
+template <class Into>
+void backward(const AnchorArrays& anchors, WeightLayout layout, const float* weights, const Camera& camera,
+              const SplatGradients& in, const Into& into, float* weight_gradients) {
   const int64_t share = (anchors.count + kMostPieces - 1) / kMostPieces;
   const int64_t piece = std::max(kSmallestPiece, (share + kLanes - 1) / kLanes * kLanes);
   const int64_t n = (anchors.count + piece - 1) / piece;
   const int64_t size = layout.size();
-  const Floats sums = out.weights ? make_floats(std::max<int64_t>(1, n * size)) : nullptr;
+  const Floats sums = weight_gradients ? make_floats(std::max<int64_t>(1, n * size)) : nullptr;
   parallel_for(n, [&](int64_t i) {
-    piece_backward(anchors, layout, weights, camera, in, out, i * piece, std::min(anchors.count, (i + 1) * piece),
+    piece_backward(anchors, layout, weights, camera, in, into, i * piece, std::min(anchors.count, (i + 1) * piece),
                    sums ? sums.get() + i * size : nullptr);
   });
-  if (!out.weights) return;
-  std::fill_n(out.weights, size, 0.0f);
+  if (!weight_gradients) return;
+  std::fill_n(weight_gradients, size, 0.0f);
   for (int64_t i = 0; i < n; ++i)
-    for (int64_t w = 0; w < size; ++w) out.weights[w] += sums[i * size + w];
+    for (int64_t w = 0; w < size; ++w) weight_gradients[w] += sums[i * size + w];
+}
+
+}  // namespace
+
+void decode_backward(const AnchorArrays& anchors, WeightLayout layout, const float* weights, const Camera& camera,
+                     const SplatGradients& in, const AnchorGradients& out, float* weight_gradients) {
+  backward(anchors, layout, weights, camera, in, IntoArrays(out, layout.k), weight_gradients);
+}
+
+bool decode_backward_adam(const AnchorArrays& anchors, WeightLayout layout, const float* weights,
+                          const Camera& camera, const SplatGradients& in, const AnchorSteps& steps,
+                          float* weight_gradients) {
+  std::atomic<bool> finite{true};
+  backward(anchors, layout, weights, camera, in, IntoSteps(steps, anchors, finite), weight_gradients);
+  return finite.load();
 }
 
 }  // namespace vdgs

@@ -61,14 +61,18 @@ void for_each_weight(WeightLayout layout, const Head<Scalar> (&heads)[kHeads], c
   }
 }
 
-// The arrays of the visible anchors, contiguous.
+// The arrays of the model's anchors, contiguous, and which of them are visible.
 struct AnchorArrays {
   const float *positions, *features, *offsets, *log_scales;
-  int64_t count;
+  int64_t total;        // rows of the arrays
+  const int64_t* rows;  // those of the visible anchors; null: row i is visible anchor i
+  int64_t count;        // visible anchors
   int k;
+
+  int64_t row(int64_t visible) const { return rows ? rows[visible] : visible; }
 };
 
-// Sixteen anchors as lanes; the last of a view are padded with copies of the batch's first.
+// Sixteen anchors as lanes; the last of a view are padded with copies of its last.
 struct alignas(64) Batch {
   float inputs[kInputs * kLanes];
   float hidden[kAllHidden * kLanes];
@@ -77,14 +81,14 @@ struct alignas(64) Batch {
   M16 usable;  // there, and all numbers finite
 };
 
-// Rows of `width` floats become lanes: out[16 column + lane]; lanes from `count` on repeat the last row.
-// `out` holds a multiple of sixteen columns; those behind `width` are filled with anything. Nothing is
-// read behind `end`.
-inline void rows_to_lanes(const float* rows, const float* end, int width, int count, float* out) {
+// Rows of `width` floats become lanes: out[16 column + lane] is of row chosen[lane]. `out` holds a multiple of
+// sixteen columns; those behind `width` are filled with anything. Nothing is read behind `end`.
+inline void rows_to_lanes(const float* rows, const float* end, int width, const int64_t (&chosen)[kLanes],
+                          float* out) {
   alignas(64) float block[kLanes * kLanes];
   for (int column = 0; column < width; column += kLanes) {
     for (int lane = 0; lane < kLanes; ++lane) {
-      const float* from = rows + std::min(lane, count - 1) * width + column;
+      const float* from = rows + chosen[lane] * width + column;
       store(block + lane * kLanes,
             from + kLanes <= end ? loadu(from) : load_first(from, std::min(kLanes, width - column)));
     }
@@ -106,8 +110,10 @@ inline void lanes_to_rows(const float* lanes, int width, int count, float* rows)
 // anchors that are not usable are zero, so that no NaN of theirs meets another's gradient.
 inline void load_batch(const AnchorArrays& anchors, const Camera& camera, int64_t first, Batch& batch) {
   const int count = static_cast<int>(std::min<int64_t>(kLanes, anchors.count - first));
+  int64_t chosen[kLanes];  // the last one again where there are no more
+  for (int lane = 0; lane < kLanes; ++lane) chosen[lane] = anchors.row(first + std::min(lane, count - 1));
   const auto into_lanes = [&](const float* rows, int width, float* out) {
-    rows_to_lanes(rows + first * width, rows + anchors.count * width, width, count, out);
+    rows_to_lanes(rows, rows + anchors.total * width, width, chosen, out);
   };
   alignas(64) float columns[kLanes][kLanes];
   into_lanes(anchors.features, kFeatures, batch.inputs);

@@ -95,15 +95,15 @@ class CompensationConfig:
     """T_low: an anchor is of low visibility (the set L) when fewer than this share of the cameras of a growth cycle
     hold it in their frustum."""
     t_low_quantile: float = 0.0
-    """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on a
-    large scene nearly every anchor is below a fixed share)."""
+    """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on
+    a large scene nearly every anchor is below a fixed share)."""
     beta_g: float = 2.0
     """beta_g: weight of a cycle's mean gradient in the cache g."""
     gamma: float = 0.9
     """gamma: decay of the cache g from cycle to cycle."""
     gate: Literal["scaled", "literal"] = "scaled"
-    """How often an offset of low visibility must be drawn before it is judged: `scaled` takes T_low times the gate of
-    the others, at least twice (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
+    """Above how many draws an offset of low visibility is judged: `scaled` takes T_low times the gate of the others, at
+    least 2 (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
     cap: float = 0.0
     """Greatest value of g; 0 for none. Without it a statistic that is fed steadily grows to 21 times its size."""
 
@@ -192,7 +192,7 @@ class BlockConfig:
     """Training of each block from the coarse anchors of its place. Loss and seed are those of the coarse stage."""
 
     iterations: int = 50_000
-    """Steps for each block; 0 takes thirty for each of its photographs, at least 1500 and at most 15 000 (choice)."""
+    """Steps for each block; 0 takes fifteen for each of its photographs, at least 500 and at most 15 000 (choice)."""
     scale_iterations: float = 1.0
     """Factor on the steps and on the start of statistics and growth, for scenes smaller than the paper's."""
     resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
@@ -201,6 +201,10 @@ class BlockConfig:
     """The rates of the coarse stage start again, those of offsets times this."""
     scale_rate: float = 0.8
     """... and those of log-scales times this."""
+    feature_rate: float = 1.0
+    """... and those of features times this (choice; 1 is the paper's)."""
+    background_noise: float = 0.0
+    """As in the loss of the coarse stage, but for blocks: there the ground is opaque already (choice)."""
     ring: Literal["frozen", "ramp", "free"] = "frozen"
     """Anchors between core and widened boundary: `frozen` are drawn and never move (choice for "gradients at the
     boundary are suppressed"); `ramp` move less the farther out they are; `free` as those of the core."""
@@ -238,7 +242,7 @@ class MethodConfig:
 
 
 #: How `iterations = 0` follows from the number of training photographs: steps for each, least, most.
-COARSE_STEPS, BLOCK_STEPS = (60, 3_000, 30_000), (30, 1_500, 15_000)
+COARSE_STEPS, BLOCK_STEPS = (60, 3_000, 30_000), (15, 500, 15_000)
 
 
 def with_iterations(config: TrainConfig, training_views: int) -> TrainConfig:
@@ -258,12 +262,14 @@ def block_training(config: MethodConfig, views: int) -> TrainConfig:
             rates,
             offsets=(block.offset_rate * rates.offsets[0], block.offset_rate * rates.offsets[1]),
             log_scales=(block.scale_rate * rates.log_scales[0], block.scale_rate * rates.log_scales[1]),
+            features=(block.feature_rate * rates.features[0], block.feature_rate * rates.features[1]),
         ),
         growth=replace(
             block.growth,
             statistics_from=round(scale * block.growth.statistics_from),
             start=round(scale * block.growth.start),
         ),
+        loss=replace(config.training.loss, background_noise=block.background_noise),
         compensation=block.compensation,
     )
 
@@ -280,7 +286,12 @@ PRESETS: dict[str, MethodConfig] = {
             resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
             growth=GrowthConfig(statistics_from=300, start=500, until=0.6, threshold=1e-4),
         ),
-        block=BlockConfig(iterations=0, growth=GrowthConfig(statistics_from=100, start=300, threshold=1e-4)),
+        partition=PartitionConfig(blocks="auto"),
+        block=BlockConfig(
+            iterations=0,
+            growth=GrowthConfig(statistics_from=0, start=100, threshold=1e-4),
+            compensation=CompensationConfig(t_low_quantile=0.25),
+        ),
     ),
 }
 

@@ -16,8 +16,8 @@ def validate(config: MethodConfig) -> list[str]:
     problems += [f"block.{each}" for each in _validate_compensation(block.compensation)]
     if block.iterations < 0 or block.scale_iterations <= 0:
         problems.append("block.iterations must not be negative and block.scale_iterations must be positive")
-    if min(block.offset_rate, block.scale_rate) <= 0:
-        problems.append("block.offset_rate and block.scale_rate must be positive")
+    if min(block.offset_rate, block.scale_rate, block.feature_rate) <= 0:
+        problems.append("block.offset_rate, block.scale_rate and block.feature_rate must be positive")
     if config.partition.blocks != "auto" and config.partition.blocks < 1:
         problems.append(f"blocks is {config.partition.blocks}; it must be at least 1, or auto")
     if min(config.partition.lambda_vis, config.partition.expansion) < 0 or config.partition.block_memory_gb <= 0:

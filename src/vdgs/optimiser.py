@@ -11,6 +11,7 @@ from vdgs.anchors import TRAINED, Anchors
 from vdgs.config import RateConfig
 from vdgs.decoder import Decoder
 from vdgs.kernels import native as kernels
+from vdgs.kernels.decode_types import AdamState
 
 
 def rebuild(tensors: dict[str, Tensor], more: dict[str, Tensor], kept: Tensor) -> None:
@@ -65,23 +66,12 @@ class Optimiser:
         trained = {name: tensor for name, tensor in anchors.tensors().items() if name in TRAINED}
         return Optimiser(Moments.zeros(trained), Moments.zeros(decoder.tensors()))
 
-    def update_anchors(
-        self,
-        anchors: Anchors,
-        rows: Tensor,
-        gradients: dict[str, Tensor | None],
-        rates: dict[str, float],
-        step: int,
-    ) -> bool:
-        """Move the given rows of features, offsets and log-scales, in place. False: a gradient is not finite."""
-        finite = True
-        for name, gradient in gradients.items():
-            if gradient is not None:
-                finite &= kernels.adam_rows(
-                    getattr(anchors, name), rows, gradient, self.anchors.first[name], self.anchors.second[name],
-                    learning_rate=rates[name], step=step,
-                )  # fmt: skip
-        return finite
+    def anchor_states(self, anchors: Anchors, rates: dict[str, float]) -> list[AdamState]:
+        """What moves of the anchors, in the order of `TRAINED`."""
+        return [
+            AdamState(getattr(anchors, name), self.anchors.first[name], self.anchors.second[name], rates[name])
+            for name in TRAINED
+        ]
 
     def update_decoder(self, decoder: Decoder, rates: dict[str, float], step: int) -> bool:
         """Move the decoder's tensors by their `.grad`, in place. False: a gradient is not finite."""

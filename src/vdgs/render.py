@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
@@ -15,40 +13,22 @@ from vdgs.kernels.decode_types import DecoderWeights, Splats
 from vdgs.kernels.types import Raster
 
 
-@dataclass(frozen=True)
-class VisibleAnchors:
-    """The anchors that may touch a view, gathered: `rows` are their indices in the model, ascending."""
-
-    rows: Int64[Tensor, " v"]
-    anchors: Anchors
-
-
-def gather_visible(anchors: Anchors, camera: Camera) -> VisibleAnchors:
-    """Frustum culling, then a copy of the rows that remain."""
-    rows = kernels.cull(anchors.positions, anchors.log_scales, camera)
-    return VisibleAnchors(rows, anchors.select(rows))
+def decode_rows(anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera) -> Splats:
+    """Splats of the anchors of the given rows, as this camera sees them."""
+    return kernels.decode(
+        anchors.positions, anchors.features, anchors.offsets, anchors.log_scales, weights, camera, rows
+    )
 
 
-def decode_visible(visible: Anchors, weights: DecoderWeights, camera: Camera) -> Splats:
-    """Splats of the gathered anchors in this view; differentiable."""
-    return kernels.decode(visible.positions, visible.features, visible.offsets, visible.log_scales, weights, camera)
+def visible_rows(anchors: Anchors, camera: Camera) -> Int64[Tensor, " v"]:
+    """Rows of the anchors that may touch a view, ascending."""
+    return kernels.cull(anchors.positions, anchors.log_scales, camera)
 
 
-def draw(
-    splats: Splats,
-    camera: Camera,
-    background: Float[Tensor, "3"],
-    depth: bool = False,
-    around: Splats | None = None,
-) -> Raster:
-    """Splats to image, alpha and (on request) expected depth; differentiable. `around` are drawn with them."""
-
-    def both(name: str) -> Tensor:
-        own = getattr(splats, name)
-        return own if around is None else torch.cat([own, getattr(around, name)])
-
+def draw(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:
+    """Splats to image, alpha and (on request) expected depth; differentiable."""
     return kernels.rasterise(
-        both("means_px"), both("conics"), both("colours"), both("opacities"), both("depths"),
+        splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths,
         background, camera.width, camera.height, depth=depth,
     )  # fmt: skip
 
@@ -67,8 +47,8 @@ def render(
     `background` replaces the model's own. `image` is the index of a training image whose appearance to use;
     None takes the mean appearance.
     """
-    visible = gather_visible(model.anchors, camera)
-    splats = decode_visible(visible.anchors, model.decoder.for_image(image), camera)
+    rows = visible_rows(model.anchors, camera)
+    splats = decode_rows(model.anchors, rows, model.decoder.for_image(image), camera)
     return draw(splats, camera, torch.tensor(background or model.background), depth)
 
 
@@ -78,11 +58,11 @@ def render_values(model: AnchorModel, values: Float[Tensor, " n"], camera: Camer
 
     Used for visibility maps (V at each pixel).
     """
-    visible = gather_visible(model.anchors, camera)
-    splats = decode_visible(visible.anchors, model.decoder.for_image(None), camera)
+    rows = visible_rows(model.anchors, camera)
+    splats = decode_rows(model.anchors, rows, model.decoder.for_image(None), camera)
     k = model.anchors.offsets.shape[1]
     scale = float(values.max().clamp(min=1)) if len(values) else 1.0
-    of_splat = values[visible.rows][splats.source.long() // k].float() / scale
+    of_splat = values[rows][splats.source.long() // k].float() / scale
     painted = kernels.rasterise(
         splats.means_px, splats.conics, of_splat[:, None].expand(-1, 3).contiguous(), splats.opacities,
         splats.depths, torch.zeros(3), camera.width, camera.height,

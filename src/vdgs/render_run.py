@@ -13,9 +13,9 @@ from vdgs import render_paths
 from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
 from vdgs.evaluation.metrics import to_8bit
-from vdgs.stages.opening import TrainedRun, open_run
 from vdgs.evaluation.saving import file_stems, write_png
 from vdgs.render import render, render_values
+from vdgs.stages.opening import TrainedRun, open_run
 from vdgs.verbs import RenderArguments
 from vdgs.video import VideoWriter
 

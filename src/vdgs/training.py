@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vdgs.anchors import TRAINED, Anchors
+from vdgs.anchors import Anchors
 from vdgs.cameras import Camera
 from vdgs.checkpoints import SavedState
 from vdgs.compensation import Compensation, begin_cycle, compensate, cycle_facts, low_visibility, update_cache
@@ -25,10 +25,11 @@ from vdgs.decoder import Decoder
 from vdgs.errors import TrainingDiverged
 from vdgs.growth import Compensated, Statistics, decide
 from vdgs.kernels import native as kernels
-from vdgs.kernels.decode_types import DecoderWeights, Splats
+from vdgs.kernels.decode_types import DecoderWeights, SplatGradients, Splats
 from vdgs.memory import return_unused
 from vdgs.optimiser import Moments, Optimiser, rates_at, rebuild
-from vdgs.render import decode_visible, draw, gather_visible
+from vdgs.render import decode_rows, visible_rows
+from vdgs.step import draw_view, move_anchors
 from vdgs.visibility import share_in_cycle
 
 #: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
@@ -145,42 +146,36 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     target, mask = stage.images.get(view, downscale)
     camera = stage.images.camera(view, downscale)
 
-    visible = gather_visible(state.anchors, camera)
-    leaves = {name: getattr(visible.anchors, name).requires_grad_(True) for name in TRAINED}
+    rows = visible_rows(state.anchors, camera)
     weights = state.decoder.for_image(view if stage.appearance_of is None else stage.appearance_of[view])
-    splats = decode_visible(visible.anchors, weights, camera)
-    splats.means_px.retain_grad()
     around = _surroundings(stage, weights, camera)
-    raster = draw(splats, camera, _background(stage, iteration), around=around)
-    photometric = kernels.photometric_loss(raster.image, target, mask, ssim_weight=config.loss.ssim_weight)
-    loss = photometric.loss
-    if config.loss.volume_weight and len(splats.volumes):
-        unit = (stage.camera_height / REFERENCE_HEIGHT) ** 3
-        loss = loss + config.loss.volume_weight / unit * splats.volumes.mean()
-    value = float(loss.detach())
+    with torch.no_grad():
+        drawn = draw_view(
+            decode_rows(state.anchors, rows, weights, camera), camera, _background(stage, iteration), around
+        )
+    image = drawn.image.requires_grad_(True)
+    photometric = kernels.photometric_loss(image, target, mask, ssim_weight=config.loss.ssim_weight)
+    volume_weight = _volume_weight(stage)
+    loss = photometric.loss.detach()
+    if volume_weight and len(drawn.source):
+        loss = loss + volume_weight * drawn.volume
+    value = float(loss)
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
-    if loss.requires_grad:
-        loss.backward()
-    _move(state, stage, visible.rows, leaves)
+    (image_gradient,) = torch.autograd.grad(photometric.loss, image)
+    gradients = drawn.backward(image_gradient, volume_weight)
+    _move(state, stage, rows, gradients, weights, camera)
 
     growing = iteration + 1 <= config.growth.until * config.iterations
-    if growing and iteration + 1 > config.growth.statistics_from and splats.means_px.grad is not None:
-        state.statistics.add_view(
-            visible.rows,
-            splats.source,
-            splats.opacities.detach(),
-            splats.means_px.grad,
-            camera.width,
-            camera.height,
-        )
+    if growing and iteration + 1 > config.growth.statistics_from:
+        state.statistics.add_view(rows, drawn.source, drawn.opacities, gradients.means_px, camera.width, camera.height)
     state.iteration += 1
-    report = StepReport(value, float(photometric.l1), float(photometric.ssim), len(visible.rows), len(splats.opacities))
+    report = StepReport(value, float(photometric.l1), float(photometric.ssim), len(rows), len(drawn.source))
     if growing and state.iteration >= config.growth.start and state.iteration % config.growth.interval == 0:
         report = replace(report, **grow(state, stage))
     if state.iteration % REORDER_INTERVAL == 0:
         reorder(state)
-    _smooth(state, value, raster.image.detach(), target, mask)
+    _smooth(state, value, image.detach(), target, mask)
     return report
 
 
@@ -189,24 +184,24 @@ def _surroundings(stage: Stage, weights: DecoderWeights, camera: Camera) -> Spla
     """The splats of the frozen anchors around a block: drawn, but out of autograd's sight."""
     if stage.surroundings is None or not len(stage.surroundings):
         return None
-    return decode_visible(gather_visible(stage.surroundings, camera).anchors, weights, camera)
+    return decode_rows(stage.surroundings, visible_rows(stage.surroundings, camera), weights, camera)
 
 
-def _move(state: TrainingState, stage: Stage, rows: Tensor, leaves: dict[str, Tensor]) -> None:
-    """One step of Adam for the visible anchors (`leaves` hold their values before it) and the decoder."""
+def _volume_weight(stage: Stage) -> float:
+    """Weight of the mean volume in the loss, for the unit of this scene."""
+    return stage.config.loss.volume_weight / (stage.camera_height / REFERENCE_HEIGHT) ** 3
+
+
+def _move(
+    state: TrainingState, stage: Stage, rows: Tensor, gradients: SplatGradients, weights: DecoderWeights, camera: Camera
+) -> None:
+    """One step of Adam for the visible anchors and the decoder."""
     config, step = stage.config, state.iteration + 1
     rates = rates_at(config.rates, state.iteration / config.iterations)
-    gradients = {name: leaf.grad for name, leaf in leaves.items()}
-    finite = state.optimiser.update_anchors(state.anchors, rows, gradients, rates, step)
+    finite = move_anchors(state.anchors, rows, gradients, weights, camera, state.optimiser, rates, step, stage.mobility)
     finite &= state.optimiser.update_decoder(state.decoder, rates, step)
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")
-    if stage.mobility is not None and len(rows):
-        share = stage.mobility(state.anchors.positions[rows])
-        for name, leaf in leaves.items():
-            before, tensor = leaf.detach(), getattr(state.anchors, name)
-            part = share.reshape(-1, *[1] * (before.ndim - 1))
-            tensor[rows] = torch.where(part < 1, before + part * (tensor[rows] - before), tensor[rows])
 
 
 def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:

@@ -56,8 +56,8 @@ def normalised(views: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 def share_in_cycle(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
     """c_k of every anchor: the share of the distinct cameras of a growth cycle whose frustum holds it, float32.
 
-    A view that was drawn twice in the cycle, or at two resolutions, counts once. All offsets of an anchor share its c_k.
-    Raises ValueError without any camera.
+    A view that was drawn twice in the cycle, or at two resolutions, counts once. All offsets of an anchor share its
+    c_k. Raises ValueError without any camera.
     """
     if not cameras:
         raise ValueError("a growth cycle without cameras has no shares")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int32
@@ -103,3 +104,28 @@ class Splats:
     opacities: Float[Tensor, "m"]
     volumes: Float[Tensor, "m"]
     source: Int32[Tensor, "m"]
+
+
+@dataclass(frozen=True, eq=False)
+class SplatGradients:
+    """Derivatives of a loss by the splats of a view (depths have none), and what decoding needs to know of these."""
+
+    means_px: Float[Tensor, "m 2"]
+    conics: Float[Tensor, "m 3"]
+    colours: Float[Tensor, "m 3"]
+    opacities: Float[Tensor, "m"]
+    #: By the volume of each: the same number for all.
+    volume: float
+    #: The splats themselves: see `Splats`.
+    source: Int32[Tensor, "m"]
+    colour_values: Float[Tensor, "m 3"]
+    opacity_values: Float[Tensor, "m"]
+
+
+class AdamState(NamedTuple):
+    """A parameter of the anchors with its moments, shaped alike, and how fast it moves."""
+
+    parameter: Float[Tensor, "n *rest"]
+    first: Float[Tensor, "n *rest"]
+    second: Float[Tensor, "n *rest"]
+    learning_rate: float

@@ -79,22 +79,22 @@ def assignment_rows(
 COLUMNS = (
     ("block", "block", "{}"),
     ("cameras", "cameras", "{:,}"),
-    ("above_threshold", "above\nthreshold", "{:,}"),
-    ("best_block", "best\nblock", "{:,}"),
-    ("topped_up", "topped\nup", "{:,}"),
-    ("anchors_core", "anchors\nin core", "{:,}"),
-    ("anchors_expanded", "anchors\nwidened", "{:,}"),
+    ("added", "added", "{:,}"),
+    ("anchors_core", "anchors", "{:,}"),
+    ("anchors_expanded", "widened", "{:,}"),
     ("mean_v", "mean V", "{:.1f}"),
-    ("area", "area", "{:,.3g}"),
+    ("area", "area", "{:,.0f}"),
 )
 
 
 def assignment_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """The rows of `assignment_rows` for the console; blocks without cameras stand out."""
+    """The rows of `assignment_rows` for the console; blocks without cameras stand out.
+
+    "added" are cameras below the threshold: their best block, or topped up."""
     table = Table(box=box.SIMPLE_HEAD, title="blocks and their cameras", title_justify="left")
     for _, heading, _ in COLUMNS:
         table.add_column(heading, justify="right", vertical="bottom")
-    for row in rows:
+    for row in ({**row, "added": row["best_block"] + row["topped_up"]} for row in rows):
         cells = ["–" if row[key] is None else form.format(row[key]) for key, _, form in COLUMNS]
         table.add_row(*cells, style="" if row["cameras"] else "yellow")
     return table

@@ -1,4 +1,4 @@
-"""From clusters of anchors to boundaries on the plane: components, α-shapes, disjoint cores, widened blocks (fig. 3)."""
+"""From clusters of anchors to boundaries on the plane: components, α-shapes, disjoint cores, widening (fig. 3)."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ WINDOW, WINDOW_MARGIN = (0.01, 0.99), 0.5
 OUTLINE_POINTS = 20_000
 #: α in cells to begin with, and its growth until the shape is one polygon.
 ALPHA_CELLS, ALPHA_GROWTH = 1.0, 1.25
+#: Standard deviation of the weights with which the cells about a cell count for which cluster is the strongest there.
+SMOOTHING_CELLS = 1.5
 EIGHT = np.ones((3, 3), bool)
 
 
@@ -36,7 +38,7 @@ def cores_of(
     cores: list[shapely.Polygon | None] = [None] * count
     taken = shapely.Polygon()
     for label in sorted(shapes, key=lambda label: (shapes[label].area, label)):
-        core = _without_slivers(largest_part(shapes[label].difference(taken)), cell / 4)
+        core = _without_slivers(largest_part(shapes[label].difference(taken)), cell / 2)
         if not core.is_empty:
             cores[label] = core
             taken = taken.union(core)
@@ -57,8 +59,8 @@ def widen(core: shapely.Polygon, expansion: float) -> shapely.Polygon:
 
 
 def cell_size(places: Float[np.ndarray, "n 2"], count: int) -> float:
-    """Edge of the cells on which components are found (choice): twice the distance within which 95 % of the anchors have
-    eight neighbours, so that cells of sparse outskirts are seldom empty; within bounds set by the size of the scene.
+    """Edge of the cells on which components are found (choice): twice the distance within which 95 % of the anchors
+    have eight neighbours, so that cells of sparse outskirts are seldom empty; within bounds set by the scene's size.
     """
     low, high = np.quantile(places, WINDOW, axis=0)
     extent = float((high - low).max()) or float(np.ptp(places, axis=0).max())
@@ -70,7 +72,10 @@ def cell_size(places: Float[np.ndarray, "n 2"], count: int) -> float:
 
 
 def _components(places: np.ndarray, labels: np.ndarray, count: int, cell: float) -> dict[int, Float[np.ndarray, "m 2"]]:
-    """The anchors of each cluster's largest component: most anchors, over cells in which the cluster is strongest."""
+    """The anchors of each cluster's largest component: most anchors, over cells in which the cluster is strongest.
+
+    Strongest about the cell, not only in it: borders drawn through mixed anchors would have fingers.
+    """
     low, high = np.quantile(places, WINDOW, axis=0)
     margin = WINDOW_MARGIN * (high - low) + cell
     inside = ((places >= low - margin) & (places <= high + margin)).all(axis=1)
@@ -79,12 +84,14 @@ def _components(places: np.ndarray, labels: np.ndarray, count: int, cell: float)
     index = ((places - places.min(axis=0)) / cell).astype(np.int64) + 2
     rows, columns = index.max(axis=0) + 3
     flat = index[:, 0] * columns + index[:, 1]
-    most = np.zeros(rows * columns, np.int64)
+    most = np.zeros(rows * columns)
     strongest = np.full(rows * columns, -1, np.int64)
     for label in range(count):
-        anchors = np.bincount(flat[labels == label], minlength=rows * columns)
-        strongest[anchors > most] = label
-        most = np.maximum(most, anchors)
+        anchors = np.bincount(flat[labels == label], minlength=rows * columns).reshape(rows, columns)
+        nearby = ndimage.gaussian_filter(anchors.astype(np.float64), SMOOTHING_CELLS).ravel()
+        strongest[nearby > most] = label
+        most = np.maximum(most, nearby)
+    strongest[np.bincount(flat, minlength=rows * columns) == 0] = -1
     found = {}
     for label in range(count):
         at_home = np.flatnonzero((labels == label) & (strongest[flat] == label))
@@ -97,7 +104,7 @@ def _components(places: np.ndarray, labels: np.ndarray, count: int, cell: float)
 
 
 def _outline(points: Float[np.ndarray, "m 2"], cell: float) -> shapely.Polygon:
-    """The α-shape of a component, simplified to what a cell can tell. One or two points, or a line, get a small buffer."""
+    """The α-shape of a component, simplified to what a cell can tell. One or two points, or a line, get a buffer."""
     spacing = cell / 4
     thinned = points
     while True:

@@ -10,7 +10,7 @@ from vdgs.config import PartitionConfig
 from vdgs.errors import VdgsError
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.boundary import cores_of, widen
-from vdgs.partition.cluster import cluster, features_of
+from vdgs.partition.cluster import cluster, features_of, refuse_too_many
 from vdgs.partition.plane import principal_plane
 
 #: A block that would own less than this share of the anchors of an average block is not worth training.
@@ -32,8 +32,8 @@ def cut_scene(
     Every place has exactly one owner (`Blocks.owner`). The cut turns, moves and scales with the scene and does not
     depend on the order of the anchors. Blocks are numbered along the longer axis of the scene. There are fewer blocks
     than asked for, and a warning, where a cluster is the strongest nowhere on the plane (choice: its anchors join the
-    blocks about them). Raises VdgsError if the anchors cannot be cut; ValueError if the number of blocks is still "auto"
-    (`choose_block_count`).
+    blocks about them). Raises VdgsError if the anchors cannot be cut; ValueError if the number of blocks is still
+    "auto" (`choose_block_count`).
     """
     ground = _checked(positions, views)
     if config.blocking and config.blocks == "auto":
@@ -43,6 +43,7 @@ def cut_scene(
         raise VdgsError(f"--blocks {count}: a scene is cut into at least 1 block")
     if count == 1:
         return _whole(ground, config.expansion), []
+    refuse_too_many(count, ground)
     ground, views = _sorted(ground, np.asarray(views, np.int64))
     plane = principal_plane(ground)
     places, views = _sorted(plane.places(ground), views)

@@ -27,8 +27,8 @@ from vdgs.captures.images import ImageCache
 from vdgs.config import BlockConfig, block_training
 from vdgs.errors import RunError
 from vdgs.kernels import native as kernels
-from vdgs.partition.saving import load_scores
 from vdgs.partition.blocks import Block, Blocks, load_blocks
+from vdgs.partition.saving import load_scores
 from vdgs.run import RunFolder, StageFolder
 from vdgs.run_options import WatchOptions
 from vdgs.stages.coarse import camera_height, image_budget, note_without_growth

@@ -1,8 +1,8 @@
 """The scene cut into blocks, and cameras for each: visibility, partition, assignment (section III-B).
 
-    RUN/visibility/  visibility.json, map.png
-    RUN/partition/   blocks.geojson (ground frame), blocks_wgs84.geojson (if georeferenced), scores.npz,
-                     partition.json, blocks.png, block_facts.png, scores.png
+RUN/visibility/  visibility.json, map.png
+RUN/partition/   blocks.geojson (ground frame), blocks_wgs84.geojson (if georeferenced), scores.npz,
+                 partition.json, blocks.png, block_facts.png, scores.png
 """
 
 from __future__ import annotations

@@ -123,7 +123,10 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or "not enough memory" in str(error) or "bad_alloc" in str(error)
 
 
-def _loop(folder: StageFolder, state: TrainingState, stage: Stage, options: WatchOptions, console: Console) -> bool:
+def _loop(
+    folder: StageFolder, state: TrainingState, stage: Stage, options: WatchOptions, console: Console,
+    stop: Callable[[], bool],
+) -> bool:  # fmt: skip
     """Train until complete (True) or asked to stop."""
     clock, board = _Clock(state), _board(folder, options, state.iteration)
     noted = time.monotonic()

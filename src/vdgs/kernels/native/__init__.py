@@ -4,13 +4,15 @@ from vdgs.kernels.native.adam import adam_rows
 from vdgs.kernels.native.cells import cell_centres, cell_keys, contains, group_cells, group_max, morton_order
 from vdgs.kernels.native.cull import cull
 from vdgs.kernels.native.decode import decode
+from vdgs.kernels.native.decode_adam import decode_backward_adam
 from vdgs.kernels.native.loss import photometric_loss
 from vdgs.kernels.native.project import project
-from vdgs.kernels.native.rasterise import rasterise
+from vdgs.kernels.native.rasterise import Drawing, rasterise, rasterise_by_hand
 from vdgs.kernels.native.statistics import add_view_statistics
 from vdgs.kernels.native.views import count_views, mark_views
 
 __all__ = [
+    "Drawing",
     "adam_rows",
     "add_view_statistics",
     "cell_centres",
@@ -19,6 +21,7 @@ __all__ = [
     "count_views",
     "cull",
     "decode",
+    "decode_backward_adam",
     "group_cells",
     "group_max",
     "mark_views",
@@ -26,4 +29,5 @@ __all__ = [
     "photometric_loss",
     "project",
     "rasterise",
+    "rasterise_by_hand",
 ]

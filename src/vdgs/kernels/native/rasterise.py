@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -44,60 +45,71 @@ def rasterise(
     outside 1 .. 524272. The second derivative is not defined: asking for it raises RuntimeError.
     """
     tensors = (means_px, conics, colours, opacities, depths, background)
+    return Raster(*_Rasterise.apply(width, height, depth, module, *tensors))
+
+
+def rasterise_by_hand(
+    *tensors: Tensor, width: int, height: int, depth: bool = False, module: Any = None
+) -> tuple[Raster, Drawing]:
+    """`rasterise` without autograd, for the same six tensors: the picture, and the way back from it."""
     _check(tensors, width, height)
-    image, alpha, expected_depth = _Rasterise.apply(*tensors, width, height, depth, module or native_module.native())
-    return Raster(image, alpha, expected_depth)
+    module = module or native_module.native()
+    raster = Raster(
+        torch.empty(height, width, 3), torch.empty(height, width), torch.empty(height, width) if depth else None
+    )
+    background = tuple(tensors[5].tolist())
+    frame = module.rasterise_forward(
+        *(t.detach().contiguous().numpy() for t in tensors[:5]), background, width, height,
+        *(None if t is None else t.numpy() for t in raster),
+    )  # fmt: skip
+    return raster, Drawing(frame, module, len(tensors[0]), background, depth)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What is kept of a picture for its backward pass: nothing of the tensors that went in or came out."""
+
+    frame: Any
+    module: Any
+    count: int
+    background: tuple[float, ...]
+    with_depth: bool
+
+    def backward(
+        self,
+        image: Tensor | None,
+        alpha: Tensor | None = None,
+        depth: Tensor | None = None,
+        over: tuple[Tensor, Tensor] | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None, Tensor]:
+        """Gradients of the six tensors, from those of the picture. None: zero. No gradient of depths without depth.
+
+        Those of means_px and conics overwrite the contiguous tensors `over`, if given.
+        """
+        n = self.count
+        means, conics = over or (torch.empty(n, 2), torch.empty(n, 3))
+        colours, opacities, background = torch.empty(n, 3), torch.empty(n), torch.empty(3)
+        depths = torch.empty(n) if self.with_depth else None
+        found = (means, conics, colours, opacities, depths, background)
+        self.module.rasterise_backward(
+            self.frame, self.background,
+            *(None if g is None else g.contiguous().numpy() for g in (image, alpha, depth)),
+            *(None if t is None else t.numpy() for t in found),
+        )  # fmt: skip
+        return found
 
 
 class _Rasterise(torch.autograd.Function):
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any,
-        means_px: Tensor,
-        conics: Tensor,
-        colours: Tensor,
-        opacities: Tensor,
-        depths: Tensor,
-        background: Tensor,
-        width: int,
-        height: int,
-        with_depth: bool,
-        module: Any,
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
-        image = torch.empty(height, width, 3)
-        alpha = torch.empty(height, width)
-        depth = torch.empty(height, width) if with_depth else None
-        rows = [t.detach().contiguous().numpy() for t in (means_px, conics, colours, opacities, depths)]
-        back = tuple(background.tolist())
-        frame = module.rasterise_forward(
-            *rows, back, width, height, image.numpy(), alpha.numpy(), None if depth is None else depth.numpy()
-        )
+    def forward(ctx: Any, width: int, height: int, with_depth: bool, module: Any, *tensors: Tensor) -> Raster:
+        raster, ctx.drawing = rasterise_by_hand(*tensors, width=width, height=height, depth=with_depth, module=module)
         ctx.set_materialize_grads(False)
-        ctx.frame, ctx.background, ctx.module, ctx.n, ctx.with_depth = (
-            frame,
-            back,
-            module,
-            len(depths),
-            with_depth,
-        )
-        return image, alpha, depth
+        return raster
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *picture_gradients: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        received = [None if g is None else g.contiguous().numpy() for g in picture_gradients]
-        means, conics, colours = torch.empty(ctx.n, 2), torch.empty(ctx.n, 3), torch.empty(ctx.n, 3)
-        opacities, background = torch.empty(ctx.n), torch.empty(3)
-        depths = torch.empty(ctx.n) if ctx.with_depth else None
-        ctx.module.rasterise_backward(
-            ctx.frame,
-            ctx.background,
-            *received,
-            *(t.numpy() for t in (means, conics, colours, opacities)),
-            None if depths is None else depths.numpy(),
-            background.numpy(),
-        )
-        return means, conics, colours, opacities, depths, background, None, None, None, None
+    def backward(ctx: Any, *picture_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        return None, None, None, None, *ctx.drawing.backward(*picture_gradients)
 
 
 def _check(tensors: tuple[Tensor, ...], width: int, height: int) -> None:

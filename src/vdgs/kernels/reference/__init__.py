@@ -4,6 +4,7 @@ from vdgs.kernels.reference.adam import adam_rows
 from vdgs.kernels.reference.cells import cell_centres, cell_keys, contains, group_cells, group_max, morton_order
 from vdgs.kernels.reference.cull import cull
 from vdgs.kernels.reference.decode import decode
+from vdgs.kernels.reference.decode_adam import decode_backward_adam
 from vdgs.kernels.reference.loss import photometric_loss
 from vdgs.kernels.reference.project import project
 from vdgs.kernels.reference.rasterise import rasterise
@@ -19,6 +20,7 @@ __all__ = [
     "count_views",
     "cull",
     "decode",
+    "decode_backward_adam",
     "group_cells",
     "group_max",
     "mark_views",

@@ -59,7 +59,9 @@ def adam_rows(
     return True
 
 
-def check_step(learning_rate: float, step: int, beta1: float, beta2: float, epsilon: float) -> StepFactors:
+def check_step(
+    learning_rate: float, step: int, beta1: float = 0.9, beta2: float = 0.999, epsilon: float = 1e-15
+) -> StepFactors:
     """The factors of a step with both bias corrections folded in, or ValueError."""
     if step < 1:
         raise ValueError(f"step counts from 1, got {step}")
@@ -81,17 +83,23 @@ def check_rows(
     for name, tensor in state.items():
         if tensor.ndim == 0 or tensor.shape != parameter.shape:
             raise ValueError(f"{name} is {list(tensor.shape)} but the parameter {list(parameter.shape)}")
-    if rows is not None and rows.dtype != torch.int64:
-        raise TypeError(f"rows must be int64, not {rows.dtype}")
-    if rows is not None and rows.ndim != 1:
-        raise ValueError(f"rows must be [v], not {list(rows.shape)}")
+    if rows is not None:
+        check_indices(rows, parameter.shape[0])
     count = parameter.shape[0] if rows is None else rows.shape[0]
     if gradient.shape != (count, *parameter.shape[1:]):
         expected = [count, *parameter.shape[1:]]
         raise ValueError(f"gradient is {list(gradient.shape)}, not {expected}: one row for each of the rows")
-    if rows is None or count == 0:
+
+
+def check_indices(rows: Tensor, count: int) -> None:
+    """Raise a clear error unless `rows` are int64 [v], ascend without repetition and lie in 0 .. count - 1."""
+    if rows.dtype != torch.int64:
+        raise TypeError(f"rows must be int64, not {rows.dtype}")
+    if rows.ndim != 1:
+        raise ValueError(f"rows must be [v], not {list(rows.shape)}")
+    if not len(rows):
         return
     if not bool((rows[1:] > rows[:-1]).all()):
         raise ValueError("rows must ascend without repetition")
-    if int(rows[0]) < 0 or int(rows[-1]) >= parameter.shape[0]:
-        raise IndexError(f"rows reach from {int(rows[0])} to {int(rows[-1])}, of {parameter.shape[0]}")
+    if int(rows[0]) < 0 or int(rows[-1]) >= count:
+        raise IndexError(f"rows reach from {int(rows[0])} to {int(rows[-1])}, of {count}")

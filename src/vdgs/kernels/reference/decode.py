@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
@@ -13,14 +13,15 @@ from vdgs.kernels.reference.project import project_with_variances
 
 
 def decode(
-    positions: Float[Tensor, "v 3"],
-    features: Float[Tensor, "v 32"],
-    offsets: Float[Tensor, "v k 3"],
-    log_scales: Float[Tensor, "v 6"],
+    positions: Float[Tensor, "n 3"],
+    features: Float[Tensor, "n 32"],
+    offsets: Float[Tensor, "n k 3"],
+    log_scales: Float[Tensor, "n 6"],
     weights: DecoderWeights,
     camera: Camera,
+    rows: Int64[Tensor, "v"] | None = None,
 ) -> Splats:
-    """Decode visible anchors for one camera and project what they spawn.
+    """Decode visible anchors (`rows` of those given; None: all) for one camera and project what they spawn.
 
     With d = (x - c)/|x - c| (orthographic: the viewing direction), each head sees [f, d], or
     [f, d, |x - c|] where its first layer is 36 wide: opacity = tanh(·), covariance, colour =
@@ -31,6 +32,8 @@ def decode(
     everything but the positions. Works in the precision of its arguments.
     """
     k = offsets.shape[1]
+    if rows is not None:
+        positions, features, offsets, log_scales = (t[rows] for t in (positions, features, offsets, log_scales))
     positions = positions.detach()
     viewing = _viewing(positions, camera)
     finite = _finite_rows(positions, viewing, features, log_scales.exp())

@@ -1,0 +1,46 @@
+"""From the gradients of splats to a step of Adam for their anchors: autograd, then Adam parameter by parameter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from vdgs.cameras import Camera
+from vdgs.kernels.decode_types import AdamState, DecoderWeights, SplatGradients
+from vdgs.kernels.reference.adam import adam_rows
+from vdgs.kernels.reference.decode import decode
+
+
+def decode_backward_adam(
+    positions: Float[Tensor, "n 3"],
+    moved: Sequence[AdamState],
+    weights: DecoderWeights,
+    camera: Camera,
+    rows: Int64[Tensor, "v"],
+    gradients: SplatGradients,
+    *,
+    step: int,
+) -> tuple[bool, tuple[Tensor, ...] | None]:
+    """Differentiate `decode(positions, *parameters, weights, camera, rows)`, and move these rows, in place.
+
+    `moved` are features, offsets and log-scales; `gradients` are those of the splats that decoding gave. `step`
+    counts from 1. Returns whether every gradient of an anchor was finite (if not, some may have moved while others
+    have not) and the gradients of the decoder's twelve tensors (None where none of them requires one).
+    """
+    leaves = [state.parameter[rows].detach().requires_grad_(True) for state in moved]
+    decoder = weights.map(lambda t: t.detach().requires_grad_(True))
+    with torch.enable_grad():
+        again = decode(positions[rows], leaves[0], leaves[1], leaves[2], decoder, camera)
+        outputs = (again.means_px, again.conics, again.colours, again.opacities, again.volumes)
+    received = (gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
+                torch.full_like(again.volumes, gradients.volume))  # fmt: skip
+    found = torch.autograd.grad(outputs, [*leaves, *decoder.tensors()], received)
+    finite = True
+    for state, gradient in zip(moved, found, strict=False):
+        finite &= adam_rows(
+            state.parameter, rows, gradient, state.first, state.second, learning_rate=state.learning_rate, step=step
+        )
+    return finite, found[3:] if any(t.requires_grad for t in weights.tensors()) else None

@@ -1,0 +1,101 @@
+"""RUN/report.html, made of files of the run folder alone."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+
+import yaml
+
+from vdgs.errors import RunError
+from vdgs.files import write_text
+from vdgs.report.costs import costs_section, settings_section
+from vdgs.report.page import Html, contents, document, escaped, joined, paragraph
+from vdgs.report.reading import Record, Source
+from vdgs.report.results import by_visibility_section, metrics_of, result_table, seams_section, verdict, views_section
+from vdgs.report.scene import assignment_section, blocks_section, visibility_section
+from vdgs.report.training import training_section
+from vdgs.run import RunFolder
+
+#: name and title of the sections, for the links at the top
+CONTENTS = (
+    ("visibility", "visibility"), ("blocks", "blocks"), ("cameras", "cameras"), ("training", "training"),
+    ("views", "test views"), ("by-visibility", "quality by visibility"), ("seams", "per block"),
+    ("costs", "time and memory"), ("settings", "settings"),
+)  # fmt: skip
+
+
+def write_report(run: RunFolder) -> Path:
+    """Write RUN/report.html and return its path: one file that needs no other, of whatever is there so far.
+
+    What is missing or damaged is left out, and a sentence says so. Raises RunError if there is no such folder,
+    VdgsError if the file cannot be written.
+    """
+    if not run.path.is_dir():
+        raise RunError(f"{run.path}: is not a run folder. Train first: vdgs run CAPTURE --output RUN")
+    sections = [
+        visibility_section(run.path),
+        blocks_section(run.path),
+        assignment_section(run.path),
+        training_section(run),
+        views_section(run.path),
+        by_visibility_section(run.path),
+        seams_section(run.path),
+        costs_section(run),
+        settings_section(run.path),
+    ]
+    source = Source(run.path)
+    header, title = _header(source)
+    path = run.path / "report.html"
+    write_text(path, document(title, [header, contents(CONTENTS), *sections]))
+    return path
+
+
+def _header(source: Source) -> tuple[Html, str]:
+    config = _config(source)
+    version = config.inner("vdgs")
+    made_of = source.record("capture.json")
+    name = _capture_name(config, made_of)
+    coarse, merged = metrics_of(source)
+    title = f"{name} – vdgs report"
+    facts = [
+        f"Report of {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+        f"run begun with vdgs {version.text('version') or 'of unknown version'}"
+        + (f", commit {commit[:12]}" if (commit := version.text("commit")) else ""),
+        _photographs(made_of),
+    ]
+    parts = [
+        Html(f"<h1>{escaped(name)}</h1>"),
+        paragraph(" · ".join(fact for fact in facts if fact), "facts"),
+        *(paragraph(note, "note") for note in source.notes),
+        paragraph(verdict(coarse, merged), "verdict"),
+        result_table(coarse, merged),
+        *(paragraph(warning, "note") for warning in made_of.texts("warnings")),
+    ]
+    return Html(f"<header>\n{joined(parts)}\n</header>"), title
+
+
+def _config(source: Source) -> Record:
+    text = source.text("config.yaml")
+    try:
+        config = yaml.safe_load(text or "")
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        first = str(error).splitlines()[0] if str(error) else "unknown"
+        source.notes.append(f"config.yaml is damaged, not valid YAML ({first}).")
+        return Record({})
+    return Record(config if isinstance(config, dict) else {})
+
+
+def _capture_name(config: Record, made_of: Record) -> str:
+    """The last folder of the capture's path, whatever system wrote it."""
+    path = config.inner("capture").text("path") or made_of.text("root") or ""
+    names = [part for part in re.split(r"[/\\]", path) if part not in ("", ".", "..")]
+    return names[-1] if names else "A run without a name"
+
+
+def _photographs(made_of: Record) -> str:
+    training, test = (made_of.values.get(key) for key in ("training_views", "test_views"))
+    if not isinstance(training, list) or not isinstance(test, list):
+        return ""
+    return f"{len(training)} training and {len(test)} test photographs"

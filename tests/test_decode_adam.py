@@ -1,0 +1,169 @@
+"""The fused way from splats to moved anchors: the bits of autograd and Adam one after the other."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from decode_scenes import Scene, looking_down, turned
+from native_choice import every_instruction_set, on_threads, using
+from vdgs.kernels import native, reference
+from vdgs.kernels.decode_types import AdamState, SplatGradients
+
+CAMERA = turned(96, 64)
+#: A few of the anchors, some of them neighbours.
+ROWS = torch.tensor([row for row in range(700) if row % 7 in (0, 3, 4)])
+RATES = (0.01, 0.02, 0.005)
+
+
+def states_of(scene: Scene) -> list[AdamState]:
+    """The scene's parameters after some steps of Adam; copies."""
+    g = torch.Generator().manual_seed(9)
+    return [
+        AdamState(t.clone(), 0.1 * torch.randn(t.shape, generator=g), torch.rand(t.shape, generator=g), rate)
+        for t, rate in zip((scene.features, scene.offsets, scene.log_scales), RATES, strict=True)
+    ]
+
+
+def gradients_of(scene: Scene, rows: torch.Tensor = ROWS) -> SplatGradients:
+    with torch.no_grad():
+        splats = native.decode(*scene.arguments, CAMERA, rows)
+    g = torch.Generator().manual_seed(8)
+    parts = {name: torch.randn(getattr(splats, name).shape, generator=g)
+             for name in ("means_px", "conics", "colours", "opacities")}  # fmt: skip
+    return SplatGradients(
+        **parts, volume=0.3, source=splats.source, colour_values=splats.colours, opacity_values=splats.opacities
+    )
+
+
+def fused(kernels, scene: Scene, gradients: SplatGradients, rows: torch.Tensor = ROWS):
+    states = states_of(scene)
+    weights = scene.weights.map(lambda t: t.clone().requires_grad_(True))
+    finite, found = kernels.decode_backward_adam(scene.positions, states, weights, CAMERA, rows, gradients, step=4)
+    assert found is not None
+    return finite, [*(t for state in states for t in state[:3]), *found]
+
+
+def apart(scene: Scene, gradients: SplatGradients) -> list[torch.Tensor]:
+    """The same with autograd through gathered anchors, then Adam parameter by parameter."""
+    states = states_of(scene)
+    leaves = [state.parameter[ROWS].requires_grad_(True) for state in states]
+    weights = scene.weights.map(lambda t: t.clone().requires_grad_(True))
+    splats = native.decode(scene.positions[ROWS], *leaves, weights, CAMERA)
+    outputs = [splats.means_px, splats.conics, splats.colours, splats.opacities, splats.volumes]
+    received = [gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
+                torch.full_like(splats.volumes, gradients.volume)]  # fmt: skip
+    found = torch.autograd.grad(outputs, [*leaves, *weights.tensors()], received)
+    for state, gradient in zip(states, found, strict=False):
+        assert native.adam_rows(
+            state.parameter, ROWS, gradient, state.first, state.second, learning_rate=state.learning_rate, step=4
+        )
+    return [*(t for state in states for t in state[:3]), *found[3:]]
+
+
+@every_instruction_set
+def test_the_bits_are_those_of_autograd_and_adam_for_any_number_of_threads(instructions):
+    scene = Scene.random(700, seed=2)
+    with using(instructions):
+        gradients = gradients_of(scene)
+        assert len(gradients.source) > 300
+        expected = apart(scene, gradients)
+        for count in (1, 3):
+            with on_threads(count):
+                finite, ours = fused(native, scene, gradients)
+            assert finite
+            assert all(torch.equal(a, b) for a, b in zip(ours, expected, strict=True))
+
+
+@pytest.mark.parametrize("with_distance", [False, True])
+def test_native_equals_the_twin(with_distance):
+    scene = Scene.random(700, k=3, with_distance=with_distance, seed=3)
+    gradients = gradients_of(scene)
+    for ours, twins in zip(fused(native, scene, gradients)[1], fused(reference, scene, gradients)[1], strict=True):
+        torch.testing.assert_close(ours, twins, rtol=2e-3, atol=2e-4 * float(twins.abs().max()))
+
+
+def test_rows_that_are_not_given_keep_their_bits():
+    scene = Scene.random(700, seed=2)
+    before = [t for state in states_of(scene) for t in state[:3]]
+    _, after = fused(native, scene, gradients_of(scene))
+    others = torch.ones(700, dtype=torch.bool)
+    others[ROWS] = False
+    for a, b in zip(before, after, strict=False):
+        assert torch.equal(a[others], b[others])
+        assert not torch.equal(a[ROWS], b[ROWS])
+
+
+def test_a_gradient_that_is_not_a_number_is_reported_and_stays_out_of_its_anchor():
+    scene = Scene.random(700, seed=2)
+    gradients = gradients_of(scene)
+    spoilt = gradients.colours.clone()
+    spoilt[100, 1] = float("nan")
+    finite, after = fused(native, scene, replace(gradients, colours=spoilt))
+    assert not finite
+    assert all(bool(torch.isfinite(t).all()) for t in after[:9])
+
+
+def test_a_frozen_decoder_gets_no_gradients():
+    scene = Scene.random(700, seed=2)
+    gradients, states = gradients_of(scene), states_of(scene)
+    answer = native.decode_backward_adam(scene.positions, states, scene.weights, CAMERA, ROWS, gradients, step=4)
+    assert answer == (True, None)
+    _, expected = fused(native, scene, gradients)
+    assert all(torch.equal(a, b) for a, b in zip([t for s in states for t in s[:3]], expected, strict=False))
+
+
+def test_nothing_visible_moves_nothing():
+    scene, none = Scene.random(5, seed=1), torch.empty(0, dtype=torch.int64)
+    finite, after = fused(native, scene, gradients_of(scene, none), none)
+    before = [t for state in states_of(scene) for t in state[:3]]
+    assert finite
+    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=False))
+    assert all(not t.any() for t in after[9:])
+
+
+def test_rows_are_read_where_they_stand():
+    scene = Scene.random(700, seed=4)
+    gathered = replace(scene, **{name: getattr(scene, name)[ROWS]
+                                 for name in ("positions", "features", "offsets", "log_scales")})  # fmt: skip
+    camera = looking_down()
+    ours, expected = native.decode(*scene.arguments, camera, ROWS), native.decode(*gathered.arguments, camera)
+    twin = reference.decode(*scene.arguments, camera, ROWS)
+    assert len(ours.source) > 100
+    assert torch.equal(ours.source, twin.source)
+    for name in vars(ours):
+        assert torch.equal(getattr(ours, name), getattr(expected, name))
+    features = scene.features.clone().requires_grad_(True)
+    native.decode(*replace(scene, features=features).arguments, camera, ROWS).opacities.sum().backward()
+    assert features.grad is not None
+    assert set(features.grad.abs().sum(1).nonzero()[:, 0].tolist()) <= set(ROWS.tolist())
+
+
+@pytest.mark.parametrize(
+    ("rows", "error"),
+    [([3, 2], ValueError), ([2, 2], ValueError), ([-1, 2], IndexError), ([2, 700], IndexError)],
+)
+def test_rows_that_are_not_there_are_refused(rows, error):
+    scene = Scene.random(700, seed=2)
+    with pytest.raises(error):
+        native.decode(*scene.arguments, CAMERA, torch.tensor(rows))
+    gradients, states = gradients_of(scene), states_of(scene)
+    with pytest.raises(error):
+        native.decode_backward_adam(
+            scene.positions, states, scene.weights, CAMERA, torch.tensor(rows), gradients, step=1
+        )
+    assert torch.equal(states[0].parameter, scene.features)
+
+
+def test_a_state_that_does_not_fit_is_refused():
+    scene = Scene.random(700, seed=2)
+    gradients = gradients_of(scene)
+    for damage in (
+        {"first": torch.zeros(699, 32)},
+        {"second": torch.zeros(32, 700).T},
+        {"first": torch.zeros(700, 32).double()},
+    ):
+        states = states_of(scene)
+        states[0] = states[0]._replace(**damage)
+        with pytest.raises(ValueError, match="moments"):
+            native.decode_backward_adam(scene.positions, states, scene.weights, CAMERA, ROWS, gradients, step=1)

@@ -1,0 +1,309 @@
+"""The partition: every place has one owner, and the cut moves with the scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vdgs.captures.capture import GroundFrame
+from vdgs.captures.geodesy import enu_from_geodetic
+from vdgs.config import PartitionConfig
+from vdgs.errors import RunError, VdgsError
+from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks, save_blocks_wgs84
+from vdgs.partition.boundary import alpha_shape, widen
+from vdgs.partition.cut import area_of_blocks, choose_block_count, cut_scene
+
+
+def town(n: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Anchors of an uneven oblong site, and V that falls off from its middle."""
+    generator = np.random.default_rng(seed)
+    flat = generator.uniform([0, 0], [100, 60], (n, 2))
+    flat[: n // 4] = generator.normal([25, 20], 8, (n // 4, 2))
+    views = 40 * np.exp(-(((flat - [50, 30]) / [40, 25]) ** 2).sum(axis=1)) + generator.uniform(0, 3, n)
+    return np.column_stack([flat, generator.uniform(0, 10, n)]), views.astype(np.int64)
+
+
+def cut(positions: np.ndarray, views: np.ndarray, count: int = 4, **settings: object) -> Blocks:
+    return cut_scene(positions, views, PartitionConfig(blocks=count, **settings), seed=0)[0]
+
+
+def owners(blocks: Blocks, positions: np.ndarray) -> np.ndarray:
+    return blocks.owner(positions[:, :2])
+
+
+def by_distance(blocks: Blocks, places: np.ndarray) -> np.ndarray:
+    points = shapely.points(places)
+    return np.stack([shapely.distance(block.core, points) for block in blocks.items], axis=1).argmin(axis=1)
+
+
+# ------------------------------------------------------------------------------------------- invariance
+
+
+@settings(max_examples=6, deadline=None)
+@given(
+    turn=st.floats(0, 2 * np.pi), factor=st.floats(0.01, 100), shift=st.tuples(*[st.floats(-1e3, 1e3)] * 2),
+    balanced=st.booleans(),
+)  # fmt: skip
+def test_the_cut_turns_moves_and_scales_with_the_scene(
+    turn: float, factor: float, shift: tuple[float, float], balanced: bool
+) -> None:
+    positions, views = town()
+    c, s = np.cos(turn), np.sin(turn)
+    moved = factor * positions @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [*shift, 7]
+    expected = owners(cut(positions, views, balanced=balanced), positions)
+    assert np.array_equal(owners(cut(moved, views, balanced=balanced), moved), expected)
+
+
+def test_the_order_of_the_anchors_does_not_matter() -> None:
+    positions, views = town()
+    order = np.random.default_rng(3).permutation(len(positions))
+    there, shuffled = cut(positions, views), cut(positions[order], views[order])
+    assert all(a.core.equals(b.core) for a, b in zip(there.items, shuffled.items, strict=True))
+    assert np.array_equal(owners(shuffled, positions), owners(there, positions))
+
+
+def test_coordinates_as_large_as_utm() -> None:
+    positions, views = town()
+    far = positions + np.array([4.5e5, 5.4e6, 300])
+    blocks = cut(far, views)
+    assert np.array_equal(owners(blocks, far), owners(cut(positions, views), positions))
+    assert overlap(blocks) < 1e-6 * area_of_blocks(blocks).sum()
+
+
+# --------------------------------------------------------------------------------------------- ownership
+
+
+def overlap(blocks: Blocks) -> float:
+    cores = [block.core for block in blocks.items]
+    return sum(a.intersection(b).area for i, a in enumerate(cores) for b in cores[:i])
+
+
+@pytest.mark.parametrize("lambda_vis", [0.0, 1.0])
+@pytest.mark.parametrize("count", [2, 7])
+def test_every_place_has_one_owner_and_cores_are_disjoint_within_their_boundaries(
+    lambda_vis: float, count: int
+) -> None:
+    positions, views = town()
+    blocks = cut(positions, views, count, lambda_vis=lambda_vis)
+    assert len(blocks) == count
+    assert overlap(blocks) < 1e-9 * area_of_blocks(blocks).sum()
+    for block in blocks.items:
+        assert block.core.is_valid
+        assert block.expanded.is_valid
+        assert block.core.difference(block.expanded).area == 0
+        assert block.expanded.area > 1.2 * block.core.area
+    generator = np.random.default_rng(4)
+    places = np.concatenate(
+        [positions[:, :2], generator.uniform(-200, 300, (9000, 2)), generator.normal(0, 1e6, (50, 2))]
+    )
+    owner = blocks.owner(places)
+    assert np.array_equal(owner, by_distance(blocks, places))
+    assert set(owner.tolist()) == set(range(count))
+    assert np.array_equal(owner[::97], blocks.owner(places[::97])), "an owner depends on its place alone"
+    for index, block in enumerate(blocks.items):
+        inside = shapely.contains_xy(block.core, places)
+        assert (owner[inside] == index).all()
+        reached = blocks.reaches(index, places)
+        assert reached[owner == index].all()
+        assert np.array_equal(reached, shapely.contains_xy(block.expanded, places) | (owner == index))
+
+
+def test_the_first_of_equally_near_cores_owns_a_place_and_no_place_is_no_trouble() -> None:
+    boxes = [shapely.box(2, 0, 3, 1), shapely.box(0, 0, 1, 1), shapely.box(3, 0, 4, 1)]
+    blocks = Blocks(tuple(Block(box, box) for box in boxes))
+    places = np.array([[1.5, 0.5], [3.0, 0.5], [0.5, 0.5], [1.0, 0.2], [9e9, 0.0]])
+    assert blocks.owner(places).tolist() == [0, 0, 1, 1, 2]
+    assert blocks.owner(np.repeat(places, 2000, axis=0)).tolist() == np.repeat([0, 0, 1, 1, 2], 2000).tolist()
+    assert blocks.owner(np.zeros((0, 2))).tolist() == []
+    with pytest.raises(ValueError, match="not finite"):
+        blocks.owner(np.array([[np.nan, 0.0]]))
+
+
+@pytest.mark.parametrize("config", [PartitionConfig(blocks=1), PartitionConfig(blocks=5, blocking=False)])
+def test_one_block_owns_everything(config: PartitionConfig) -> None:
+    positions, views = town(500)
+    blocks, warnings = cut_scene(positions, views, config, seed=0)
+    assert len(blocks) == 1
+    assert warnings == []
+    assert shapely.contains_xy(blocks.items[0].core, positions[:, :2]).all()
+    assert blocks.owner(np.random.default_rng(0).normal(0, 1e9, (99, 2))).tolist() == [0] * 99
+
+
+# ------------------------------------------------------------------------------------ what decides about it
+
+
+def test_without_weight_visibility_leaves_no_trace() -> None:
+    positions, views = town()
+    other = np.random.default_rng(5).permutation(views)
+    a, b = cut(positions, views, lambda_vis=0.0), cut(positions, other, lambda_vis=0.0)
+    assert [block.core.wkb for block in a.items] == [block.core.wkb for block in b.items]
+
+
+def test_with_weight_the_cut_follows_visibility_across_a_uniform_field() -> None:
+    generator = np.random.default_rng(6)
+    flat = generator.uniform(0, 100, (6000, 2))
+    # Place alone cuts a square along one of its sides; visibility falls off across a diagonal.
+    seen = flat.sum(axis=1) > 100
+    views = np.where(seen, 40, 5)
+    positions = np.column_stack([flat, np.zeros(6000)])
+    spread = {}
+    for lambda_vis in (0.0, 1.0):
+        owner = owners(cut(positions, views, 2, lambda_vis=lambda_vis), positions)
+        spread[lambda_vis] = np.array([views[owner == index].std() for index in range(2)])
+    assert (spread[1.0] < 0.4 * spread[0.0]).all()
+    assert np.mean((owner == owner[flat.sum(axis=1).argmax()]) == seen) > 0.97
+
+
+def test_an_enclosed_dense_centre_keeps_its_place() -> None:
+    generator = np.random.default_rng(7)
+    outskirts = generator.uniform(-50, 50, (6000, 2)) * [1.2, 1.0]
+    centre = generator.uniform(-12, 12, (3000, 2))
+    flat = np.concatenate([outskirts, centre])
+    within = (np.abs(flat) < 12).all(axis=1)
+    positions = np.column_stack([flat, np.zeros(len(flat))])
+    blocks = cut(positions, np.where(within, 60, 4), 2, lambda_vis=3.0)
+    owner = owners(blocks, positions)
+    inner = int(owner[np.linalg.norm(flat, axis=1).argmin()])
+    assert np.mean((owner == inner) == within) > 0.97
+    assert len(blocks.items[1 - inner].core.interiors) == 1
+
+
+def test_balanced_blocks_hold_about_equally_many_anchors() -> None:
+    positions, views = town(8000)
+    for count in (3, 6):
+        sizes = np.bincount(owners(cut(positions, views, count, balanced=True, lambda_vis=0.0), positions))
+        assert np.abs(sizes * count / len(positions) - 1).max() < 0.1
+        plain = np.bincount(owners(cut(positions, views, count, lambda_vis=0.0), positions))
+        assert np.ptp(sizes) < np.ptp(plain)
+
+
+def test_anchors_that_cannot_be_cut_are_refused() -> None:
+    three = np.repeat(np.array([[0.0, 0, 0], [5, 1, 0], [9, 0, 0]]), 4, axis=0)
+    views = np.full(12, 3)
+    with pytest.raises(VdgsError, match=r"--blocks 4: .* only 3 distinct"):
+        cut(three, views, 4)
+    stacked = np.column_stack([np.ones((12, 2)), np.arange(12.0)])
+    with pytest.raises(VdgsError, match=r"--blocks 2: .* only 1 distinct"):
+        cut(stacked, np.arange(12), 2)
+    with pytest.raises(VdgsError, match="no anchors"):
+        cut(np.zeros((0, 3)), np.zeros(0, int))
+    with pytest.raises(VdgsError, match="not finite"):
+        cut(np.full((5, 3), np.nan), np.zeros(5, int))
+    with pytest.raises(VdgsError, match="--blocks 0"):
+        cut(three, views, 0)
+    with pytest.raises(ValueError, match="choose_block_count"):
+        cut_scene(three, views, PartitionConfig(blocks="auto"), 0)
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_handful_of_anchors_or_a_line_of_them_is_cut(count: int) -> None:
+    line = np.column_stack([np.arange(30.0) ** 1.1, np.zeros(30), np.zeros(30)])
+    for positions in (line, line[:: 30 // count][:count]):
+        blocks = cut(positions, np.full(len(positions), 2), count)
+        assert len(blocks) == len(set(owners(blocks, positions).tolist())) == count
+
+
+def test_the_number_of_blocks() -> None:
+    auto = PartitionConfig(blocks="auto")
+    assert choose_block_count(10**6, 500, 10**6, PartitionConfig(blocks=3)) == 3
+    assert choose_block_count(10**6, 500, 10**6, PartitionConfig(blocks=3, blocking=False)) == 1
+    assert [choose_block_count(10**5, cameras, 10**6, auto) for cameras in (33, 145, 400, 5000)] == [1, 2, 8, 8]
+    by_memory = [
+        choose_block_count(2 * 10**6, 5000, 10**6, PartitionConfig(blocks="auto", block_memory_gb=gb))
+        for gb in (2.5, 3, 4, 8, 64)
+    ]
+    assert by_memory == sorted(by_memory, reverse=True)
+    assert by_memory[0] > by_memory[-1] == 8
+
+
+# ----------------------------------------------------------------------------------------------- shapes
+
+
+def test_an_alpha_shape_follows_a_bay_and_widening_follows_the_area() -> None:
+    generator = np.random.default_rng(8)
+    points = generator.uniform(0, 10, (4000, 2))
+    points = points[(points[:, 0] < 4) | (points[:, 1] < 3)]  # an L of area 58
+    shape = alpha_shape(points, 0.8)
+    assert shape is not None
+    assert shape.area == pytest.approx(58, rel=0.05)
+    assert shapely.covers(shape, shapely.points(points)).all()
+    disc = shapely.Point(3, 4).buffer(5, quad_segs=64)
+    assert widen(disc, 0.4).area == pytest.approx(1.96 * disc.area, rel=0.01)
+    assert widen(disc, 0.0) is disc
+    assert alpha_shape(np.array([[0.0, 0], [1, 1], [2, 2]]), 1.0) is None
+
+
+# ------------------------------------------------------------------------------------------------ files
+
+
+def test_what_is_read_owns_what_was_written(tmp_path: Path) -> None:
+    positions, views = town()
+    blocks = cut(positions, views)
+    save_blocks(tmp_path / "blocks.geojson", blocks, [{"anchors": index} for index in range(4)])
+    read = load_blocks(tmp_path / "blocks.geojson")
+    places = np.random.default_rng(9).uniform(-50, 150, (5000, 2))
+    assert np.array_equal(read.owner(places), blocks.owner(places))
+    assert all(np.array_equal(read.reaches(k, places), blocks.reaches(k, places)) for k in range(4))
+    features = json.loads((tmp_path / "blocks.geojson").read_text())["features"]
+    assert [f["properties"]["anchors"] for f in features] == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: text.replace('"core"', '"kernel"', 1),
+        lambda text: text.replace("Polygon", "Point"),
+        lambda text: text.replace("Polygon", "Blob"),
+        lambda text: '{"type": "FeatureCollection", "features": []}',
+        lambda text: "[1, 2]",
+        lambda text: "\udcff",
+        lambda text: text.replace("2.0", "NaN"),
+    ],
+)
+def test_a_damaged_file_is_named(tmp_path: Path, damage: object) -> None:
+    file = tmp_path / "blocks.geojson"
+    box = shapely.box(0, 0, 2, 1)
+    save_blocks(file, Blocks((Block(box, box.buffer(1)),)), [{}])
+    file.write_bytes(damage(file.read_text()).encode(errors="surrogateescape"))  # type: ignore[operator]
+    with pytest.raises(RunError, match=r"blocks\.geojson: is damaged .*vdgs partition RUN"):
+        load_blocks(file)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"blocks\.geojson: is not there.*vdgs partition RUN"):
+        load_blocks(tmp_path / "blocks.geojson")
+
+
+@pytest.mark.parametrize("origin", [(47.3, 8.5, 440.0), (-17.0, 179.9999, 20.0), (-33.9, -70.6, 900.0)])
+def test_blocks_on_the_map(tmp_path: Path, origin: tuple[float, float, float]) -> None:
+    ring = shapely.box(-400, -300, 500, 300).difference(shapely.box(-50, -50, 60, 50))
+    hole = shapely.box(-50, -50, 60, 50)
+    blocks = Blocks((Block(ring, ring.buffer(40)), Block(hole, hole.buffer(10))))
+    ground = GroundFrame(1.0, np.eye(3), np.zeros(3), True, "GPS", origin)
+    save_blocks_wgs84(tmp_path / "map.geojson", blocks, [{}, {}], ground)
+    features = json.loads((tmp_path / "map.geojson").read_text())["features"]
+    assert [(f["properties"]["block"], f["properties"]["boundary"]) for f in features][1:3] == [
+        (0, "expanded"),
+        (1, "core"),
+    ]
+    written = shapely.geometry.shape(features[0]["geometry"])
+    assert len(written.interiors) == 1
+    assert written.exterior.is_ccw
+    assert not written.interiors[0].is_ccw
+    corners = shapely.get_coordinates(written)
+    back = enu_from_geodetic(np.column_stack([corners[:, ::-1], np.full(len(corners), origin[2])]), origin)[:, :2]
+    # Height 0 of the frame is a plane, height `origin` of the map is not: they part by 1 cm half a kilometre away.
+    nearest = np.linalg.norm(back[:, None] - shapely.get_coordinates(ring)[None], axis=2).min(axis=1)
+    assert nearest.max() < 1e-3
+    assert np.ptp(corners[:, 0]) < 0.02
+    with pytest.raises(ValueError, match="not georeferenced"):
+        save_blocks_wgs84(
+            tmp_path / "map.geojson", blocks, [{}, {}], GroundFrame(1.0, np.eye(3), np.zeros(3), True, "-")
+        )

@@ -1,0 +1,358 @@
+"""The report: whole, of unfinished and of damaged runs, and safe and small whatever the files hold."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from vdgs.errors import RunError
+from vdgs.report import write_report
+from vdgs.report.charts import running_median
+from vdgs.report.page import escaped
+from vdgs.report.pictures import MOST_BYTES, reduced
+from vdgs.report.words import duration, gain, memory
+from vdgs.run import RunFolder
+
+VOID = {"meta", "img", "br", "link", "hr", "input"}
+FILES = ("coarse/log.jsonl", "coarse/evaluation/metrics.json", "visibility/visibility.json", "partition/partition.json",
+         "blocks/00/log.jsonl", "blocks/01/status.json", "merged/status.json", "evaluation/metrics.json",
+         "evaluation/per_view.json", "evaluation/by_block.json", "config.yaml", "capture.json")  # fmt: skip
+PICTURES = ("visibility/map.png", "partition/blocks.png", "partition/block_facts.png", "partition/scores.png",
+            "evaluation/contact_sheet.png")  # fmt: skip
+
+
+class Page(HTMLParser):
+    """Text and attributes of a page; elements that are not closed in order are an error."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str, str]] = []
+        self.texts: list[str] = []
+        self.source = path.read_text(encoding="utf-8")
+        self.feed(self.source)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] != "style":
+            self.texts.append(data)
+
+    def text(self) -> str:
+        return " ".join("\n".join(self.texts).split())
+
+    def row(self, first: str) -> list[str]:
+        """The cells of the first table row that begins with this cell."""
+        rows = [re.findall(r"<td>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", self.source)]
+        return next(row for row in rows if row and row[0] == first)
+
+
+def picture(path: Path, size: tuple[int, int] = (60, 40), noise: bool = False) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8) if noise else None
+    (Image.new("RGB", size, "teal") if pixels is None else Image.fromarray(pixels)).save(path, compress_level=1)
+
+
+def write(path: Path, content: object) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
+
+
+def metrics(psnr: float, model: str) -> dict[str, object]:
+    bins = [
+        {"lower": low, "upper": high, "pixels": 1234, "psnr": psnr + shift, "ssim": 0.8, "psnr_cc": psnr + 1}
+        for low, high, shift in ((None, None, -9.0), (0.5, 3.25, -2.0), (3.25, 9.0, 2.0))
+    ]
+    return {"model": model, "psnr": psnr, "ssim": 0.87654, "psnr_cc": psnr + 0.5, "ssim_cc": 0.88, "lpips_vgg": None,
+            "by_visibility": bins, "n_anchors": 5000, "model_bytes": 2_000_000, "fps": 30.0, "test_views": 3,
+            "notes": ["LPIPS is null: no weights."]}  # fmt: skip
+
+
+def log(iterations: int, cycles: bool = False) -> str:
+    lines = []
+    for at in range(50, iterations + 1, 50):
+        line = {"iteration": at, "loss": 1 / at, "psnr_smoothed": 20 + at / 100, "anchors": 1000 + at, "downscale": 1}
+        if cycles and at % 100 == 0:
+            line |= {"low_share": 0.4, "t_low": 0.2, "mean_cache": 1e-4, "grown_low": 30, "grown_other": 10}
+        lines.append(json.dumps(line))
+    return "\n".join(lines) + "\n"
+
+
+def coarse_run(root: Path, name: str = "meadow") -> RunFolder:
+    """A run whose coarse model is trained and evaluated."""
+    header = {"vdgs": {"version": "0.1.0", "commit": "0123456789abcdef"}, "capture": {"path": f"/some/where/{name}"}}
+    write(root / "config.yaml", json.dumps(header) + "\n")  # JSON is YAML
+    write(root / "capture.json", {"training_views": ["a"] * 7, "test_views": ["b"] * 3, "warnings": []})
+    status = {"state": "done", "iteration": 400, "iterations": 400, "anchors": 1400, "seconds": 83.0,
+              "peak_memory_bytes": 500_000_000, "psnr_training": 24.0}  # fmt: skip
+    write(root / "coarse/status.json", status)
+    write(root / "coarse/log.jsonl", log(400))
+    write(root / "coarse/evaluation/metrics.json", metrics(27.125, "coarse"))
+    write(root / "coarse/evaluation/per_view.json", views(27.0))
+    return RunFolder(root)
+
+
+def views(psnr: float, names: tuple[str, ...] = ("first.jpg", "second.jpg", "third.jpg")) -> list[dict[str, object]]:
+    return [
+        {"name": name, "render": f"renders/{name[:-4]}.png", "psnr": psnr + index, "ssim": 0.9, "psnr_cc": psnr + 1,
+         "mean_visibility": 4.0 + index}
+        for index, name in enumerate(names)
+    ]  # fmt: skip
+
+
+def whole_run(root: Path, name: str = "meadow", noise: bool = False) -> RunFolder:
+    """A run with all stages, by hand."""
+    run = coarse_run(root, name)
+    write(
+        root / "visibility/visibility.json",
+        {
+            "anchors": 1400,
+            "training_views": 7,
+            "mean": 4.5,
+            "gini": 0.25,
+            "quantiles": {"5": 1, "50": 4},
+            "share_below": {"3": 0.125},
+        },
+    )
+    rows = [
+        {
+            "block": b,
+            "cameras": 5 + b,
+            "above_threshold": 3,
+            "best_block": 1,
+            "topped_up": 1 + b,
+            "anchors_core": 700,
+            "anchors_expanded": 900,
+            "mean_v": 4.5,
+            "area": 321.0,
+        }
+        for b in (0, 1)
+    ]
+    spatial = [{"block": 0, "anchors_core": 650, "area": 300.0, "mean_v": 4.0, "std_v": 1.75}]
+    write(
+        root / "partition/partition.json",
+        {
+            "lambda_vis": 1.0,
+            "blocks": rows,
+            "spatial": spatial,
+            "seconds": 4.5,
+            "warnings": ["Block 1 is thin."],
+            "complaints": ["Block 0 is blind."],
+        },
+    )
+    for block in (0, 1):
+        write(root / f"blocks/{block:02d}/log.jsonl", log(300, cycles=True))
+        write(
+            root / f"blocks/{block:02d}/status.json",
+            {"state": "done", "iteration": 300, "iterations": 300, "seconds": 61.0, "peak_memory_bytes": 1_500_000_000},
+        )
+    write(root / "merged/status.json", {"state": "done", "merge_seconds": 0.5, "merge_peak_memory_bytes": 4e8})
+    write(root / "evaluation/metrics.json", metrics(28.375, "merged"))
+    write(root / "evaluation/per_view.json", views(28.0))
+    write(root / "evaluation/status.json", {"seconds": 3.5, "peak_memory_bytes": 6e8})
+    figures = {"pixels": 99, "psnr_coarse": 27.0, "psnr_alone": 27.5, "psnr_merged": 27.75}
+    write(root / "evaluation/by_block.json", {
+        "blocks": [{"block": 0, **figures}, {"block": 1, **figures}], "all": figures,
+        "seams": {"border_px": 10.0, "border_pixels": 77, "seam_mae": 1.0625, "seam_mse": 1.125},
+        "views": [{"name": "first.jpg", "border_pixels": 40}]})  # fmt: skip
+    size = (1000, 700) if noise else (60, 40)
+    names = [f"evaluation/comparisons/{name}.png" for name in ("first", "second", "third")]
+    for file in (*PICTURES, *names, "evaluation/seams/first.png"):
+        picture(root / file, size, noise)
+    return run
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Page:
+    """The report of a run with all stages."""
+    run = whole_run(tmp_path_factory.mktemp("whole") / "run")
+    path = write_report(run)
+    assert path == run.path / "report.html"
+    return Page(path)
+
+
+def test_the_report_of_a_whole_run_holds_its_figures(whole):
+    page = whole
+    assert page.row("PSNR (dB) ↑") == ["PSNR (dB) ↑", "27.12", "28.38", "+1.25"]
+    assert page.row("PSNR, colour-corrected (dB) ↑")[1:] == ["27.62", "28.88", "+1.25"]
+    assert page.row("SSIM ↑")[1:] == ["0.8765", "0.8765", "+0.0000"]
+    assert page.row("0.5 to 3.25")[1:5] == ["1,234", "25.12", "26.38", "+1.25"]
+    assert page.row("nothing drawn")[2:4] == ["18.12", "19.38"]
+    assert page.row("all") == ["all", "11", "6", "2", "3"]  # cameras: in all, and by reason
+    assert page.row("block 0")[1:4] == ["300 / 300", "–", "–"]
+    assert page.row("partition and assignment")[1] == "4.5 s"
+    assert page.row("sum, highest")[1:3] == ["3 min 34 s", "1.50 GB"]
+    text = page.text()
+    for words in ("meadow", "commit 0123456789ab", "7 training and 3 test photographs", "Block 1 is thin.",
+                  "Block 0 is blind.", "PSNR 27.12 → 28.38 dB (+1.25)", "12.5 % of the anchors by fewer than 3",
+                  "1.06 times", "Best: third.jpg, 30.00 dB", "Median: second.jpg", "Worst: first.jpg",
+                  "LPIPS is null: no weights."):  # fmt: skip
+        assert words in text, words
+    assert 'class="absent"' not in page.source
+    # Five figures, three comparisons, a seam, and charts: 3 + 3 of training, 3 of growth, 2 by visibility.
+    assert page.tags.count("img") == 5 + 3 + 1 + 11
+
+
+def test_growth_is_summed_for_each_block(whole):
+    table = whole.source[whole.source.index("Sums over all cycles") :]
+    assert re.findall(r"<td>(.*?)</td>", table)[:6] == ["block 0", "3", "90", "30", "75.0 %", "40.0 %"]
+
+
+def test_a_coarse_run_is_reported_with_what_it_has(tmp_path):
+    page = Page(write_report(coarse_run(tmp_path / "run")))
+    text = page.text()
+    assert "Coarse model: PSNR 27.12 dB (colour-corrected 27.62), SSIM 0.8765." in text
+    assert "The scene is not cut into blocks yet." in text
+    assert "No block has a log yet." in text
+    assert page.row("PSNR (dB) ↑") == ["PSNR (dB) ↑", "27.12", "–", "–"]
+    assert page.row("0.5 to 3.25")[2:5] == ["25.12", "–", "–"]
+    assert "Best: third.jpg, 29.00 dB" in text
+    assert 'class="note"' not in page.source
+
+
+def test_the_coarse_model_may_be_the_one_that_is_evaluated(tmp_path):
+    run = coarse_run(tmp_path / "run")
+    shutil.move(run.path / "coarse/evaluation", run.path / "evaluation")
+    page = Page(write_report(run))
+    assert page.row("PSNR (dB) ↑") == ["PSNR (dB) ↑", "27.12", "–", "–"]
+    assert "Coarse model: PSNR 27.12" in page.text()
+
+
+def test_an_empty_folder_gives_a_report_and_none_an_error(tmp_path):
+    text = Page(write_report(RunFolder(tmp_path))).text()
+    assert "Nothing is evaluated yet." in text
+    with pytest.raises(RunError, match="not a run folder"):
+        write_report(RunFolder(tmp_path / "nowhere"))
+
+
+@pytest.mark.parametrize("damage", ["[[1, {", '{"blocks": 3}', "\x00\xff" + "[" * 100_000])
+def test_damaged_files_are_named_and_the_rest_stands(tmp_path, damage):
+    run = whole_run(tmp_path / "run")
+    for file in FILES:
+        (run.path / file).write_text(damage, encoding="latin-1")
+    text = Page(write_report(run)).text()
+    assert "block 0" in text
+    if damage != '{"blocks": 3}':  # that is valid, and says nothing
+        for file in FILES:
+            if file != "config.yaml":
+                assert file in text, file
+
+
+def test_one_damaged_file_leaves_the_other_sections_alone(tmp_path):
+    run = whole_run(tmp_path / "run")
+    (run.path / "evaluation/per_view.json").write_text("[{")
+    (run.path / "visibility/map.png").write_bytes((run.path / "visibility/map.png").read_bytes()[:60])
+    with (run.path / "coarse/log.jsonl").open("a") as file:
+        file.write('{"iteration": 45')
+    page = Page(write_report(run))
+    notes = re.findall(r'<p class="note">(.*?)</p>', page.source)
+    assert any(note.startswith("evaluation/per_view.json is damaged") for note in notes)
+    assert any(note.startswith("visibility/map.png is damaged") for note in notes)
+    assert "coarse/log.jsonl: 1 line could not be read and is left out." in notes
+    assert page.row("PSNR (dB) ↑")[2] == "28.38"
+
+
+@pytest.mark.parametrize("value", ["x", -1, 10**400], ids=["text", "negative", "endless"])
+def test_values_of_any_kind_are_survived(tmp_path, value):
+    run = whole_run(tmp_path / "run")
+    for file in FILES:
+        path = run.path / file
+        if path.suffix == ".json":
+            write(path, _replaced(json.loads(path.read_text()), value))
+    Page(write_report(run))
+
+
+def _replaced(content, value):
+    """Every number and text of a JSON value replaced."""
+    if isinstance(content, dict):
+        return {key: _replaced(each, value) for key, each in content.items()}
+    if isinstance(content, list):
+        return [_replaced(each, value) for each in content]
+    return value
+
+
+def test_hostile_names_stay_text(tmp_path):
+    evil = "<script>alert('x')</script>\"&<img src=https://e.example/x.png>\x00\ud800"
+    run = whole_run(tmp_path / "run", name=evil.replace("/", "|"))
+    write(run.path / "evaluation/per_view.json", views(28.0, names=(evil + "1", "../../../x.jpg", "n" * 900)))
+    write(run.path / "evaluation/by_block.json", {"views": [{"name": evil, "border_pixels": 3}]})
+    write(run.path / "partition/partition.json", {"warnings": [evil], "blocks": [{"block": evil}]})
+    write(run.path / "blocks/00/status.json", {"state": "failed", "why": evil})
+    page = Page(write_report(run))
+    assert "script" not in page.tags
+    assert "alert('x')" in page.text()
+    assert page.row("block 0")[-1].startswith("failed: &lt;script&gt;")
+    assert not re.search("[\x00-\x08\x0b-\x1f]", page.source)
+
+
+def test_nothing_is_loaded_from_elsewhere(whole):
+    page = whole
+    assert {"script", "link", "iframe", "object", "base"}.isdisjoint(page.tags)
+    for tag, name, value in page.attributes:
+        assert not name.startswith("on")
+        if name in ("src", "href", "srcset", "action"):
+            assert value.startswith("data:image/" if tag == "img" else "#"), value
+    ids = {value for _, name, value in page.attributes if name == "id"}
+    assert {value[1:] for _, name, value in page.attributes if name == "href"} == ids
+    assert "url(" not in page.source
+    assert "@import" not in page.source
+
+
+def test_the_report_stays_small_with_many_views_and_large_pictures(tmp_path):
+    run = whole_run(tmp_path / "run", noise=True)
+    names = tuple(f"{index:03d}.jpg" for index in range(150))
+    write(run.path / "evaluation/per_view.json", views(20.0, names))
+    write(run.path / "evaluation/by_block.json", {"views": [{"name": n, "border_pixels": 9} for n in names]})
+    for name in ("000", "074", "149"):
+        shutil.copy(run.path / PICTURES[0], run.path / f"evaluation/comparisons/{name}.png")
+    for name in names[:6]:
+        shutil.copy(run.path / PICTURES[0], run.path / f"evaluation/seams/{name[:-4]}.png")
+    path = write_report(run)
+    page = Page(path)
+    assert path.stat().st_size < 8_000_000
+    assert page.row("149.jpg")[3] == "169.00"
+    assert sum(value.startswith("seams in") for _, name, value in page.attributes if name == "alt") == 3
+
+
+def test_a_picture_keeps_its_shape_and_stands_on_white():
+    wide = reduced(Image.new("RGBA", (4000, 1000), (0, 0, 0, 0)))
+    assert (wide.width, wide.height, wide.kind) == (1600, 400, "png")
+    noise = Image.fromarray(np.random.default_rng(1).integers(0, 256, (900, 900, 3), dtype=np.uint8))
+    small = reduced(noise)
+    assert small.kind == "jpeg"
+    assert len(small.content) <= MOST_BYTES
+
+
+def test_running_medians_pass_over_gaps():
+    values = np.array([1.0, 9.0, 2.0, np.nan, 4.0])
+    np.testing.assert_allclose(running_median(values, 3), [5.0, 2.0, 5.5, 3.0, 4.0])
+
+
+def test_words():
+    assert [duration(s) for s in (None, 2.34, 59.6, 146.4, 7260)] == [
+        "–",
+        "2.3 s",
+        "1 min 00 s",
+        "2 min 26 s",
+        "2 h 01 min",
+    ]
+    assert [memory(b) for b in (None, 638_279_680, 1.5e9)] == ["–", "638 MB", "1.50 GB"]
+    assert [gain(1.0, before) for before in (1.25, 1.001, None)] == ["−0.25", "+0.00", "–"]
+    assert escaped("<a>&\"'\x01") == "&lt;a&gt;&amp;&quot;&#x27;\N{REPLACEMENT CHARACTER}"

@@ -1,0 +1,97 @@
+"""Visibility: V against brute force, shares of a cycle, and the numbers that describe imbalance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from captures_support import look_down
+from vdgs.cameras import NEAR, Camera, CameraModel
+from vdgs.visibility import imbalance, normalised, share_in_cycle, views_of
+
+
+def flight(count: int, model: CameraModel = "pinhole", seed: int = 0) -> list[Camera]:
+    """Tilted views over a square of 20 units; an orthographic camera has 4 px a unit."""
+    generator = np.random.default_rng(seed)
+    focal = 60.0 if model == "pinhole" else 4.0
+    places = generator.uniform(0, 20, (count, 2))
+    poses = [look_down(np.array([*at, 8.0]), generator.uniform(0, 80), generator.uniform(0, 360)) for at in places]
+    return [Camera(pose, focal, focal, 31.5, 25.0, 64, 48, model) for pose in poses]
+
+
+def cloud(n: int, seed: int = 1) -> np.ndarray:
+    """Points on the ground and far above the cameras, float32 values in float64."""
+    return np.random.default_rng(seed).uniform([-5, -5, -2], [25, 25, 14], (n, 3)).astype(np.float32).astype(np.float64)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "orthographic"])
+def test_v_is_the_number_of_frusta_that_hold_an_anchor(model: CameraModel) -> None:
+    cameras, points = flight(30, model), cloud(3000)
+    # float32 rounding decides about places within 1e-3 px of a border: none of them here.
+    borderless = np.ones(len(points), bool)
+    for camera in cameras:
+        pixels, depth = camera.project(points)
+        for value, border in ((pixels[:, 0], 0), (pixels[:, 0], 64), (pixels[:, 1], 0), (pixels[:, 1], 48)):
+            borderless &= np.abs(value - border) > 1e-3
+        borderless &= np.abs(depth - NEAR) > 1e-4
+    points = points[borderless]
+    expected = sum(camera.sees(points).astype(int) for camera in cameras)
+    views = views_of(torch.from_numpy(points).float(), cameras)
+    assert views.dtype == torch.int32
+    assert views.tolist() == expected.tolist()
+    assert len(set(views.tolist())) > 3
+    behind = [torch.from_numpy(camera.position - camera.forward).float()[None] for camera in cameras[:5]]
+    alone = [int(views_of(place, [camera])) for place, camera in zip(behind, cameras[:5], strict=True)]
+    assert alone == [0] * 5
+
+
+def test_the_left_and_upper_border_belong_to_the_image_the_right_and_lower_do_not() -> None:
+    camera = Camera(np.eye(4), 32.0, 32.0, 32.0, 16.0, 64, 32)
+    places = [[-1, 0, 1], [1, 0, 1], [0, -0.5, 1], [0, 0.5, 1], [0, 0, 1], [0, 0, -1], [0, 0, NEAR / 2]]
+    points = np.array(places, np.float64)
+    assert views_of(torch.from_numpy(points).float(), [camera]).tolist() == [1, 0, 1, 0, 1, 0, 0]
+    assert camera.sees(points).tolist() == [True, False, True, False, True, False, False]
+
+
+def test_v_does_not_depend_on_the_order_of_cameras_and_no_camera_sees_nothing() -> None:
+    cameras, points = flight(12), torch.from_numpy(cloud(500)).float()
+    assert torch.equal(views_of(points, cameras), views_of(points, cameras[::-1]))
+    assert views_of(points, []).tolist() == [0] * 500
+
+
+def test_a_view_counts_once_in_a_cycle_at_whatever_resolution() -> None:
+    cameras, points = flight(7), torch.from_numpy(cloud(800)).float()
+    share = share_in_cycle(points, cameras)
+    again = share_in_cycle(points, [*cameras, cameras[0], cameras[3].resized(32, 24), cameras[3].resized(16, 12)])
+    assert torch.equal(share, again)
+    assert torch.equal(share, views_of(points, cameras).float() / 7)
+    moved = Camera(**{**cameras[0].__dict__, "cx": cameras[0].cx + 4})
+    assert not torch.equal(share, share_in_cycle(points, [*cameras, moved]))
+    with pytest.raises(ValueError, match="without cameras"):
+        share_in_cycle(points, [])
+
+
+def test_normalised_visibility_spans_zero_to_one_and_is_zero_where_all_are_alike() -> None:
+    assert normalised(np.array([3, 7, 5])) == pytest.approx([0, 1, 0.5])
+    assert normalised(np.array([4, 4])).tolist() == [0, 0]
+    assert len(normalised(np.array([], np.int64))) == 0
+
+
+@given(st.lists(st.integers(0, 50), min_size=1, max_size=30))
+def test_gini_is_the_mean_difference_of_two_anchors(views: list[int]) -> None:
+    values = np.array(views, np.float64)
+    mean = values.mean()
+    expected = np.abs(values[:, None] - values[None]).mean() / (2 * mean) if mean else 0.0
+    assert imbalance(np.array(views)).gini == pytest.approx(expected, abs=1e-12)
+
+
+def test_imbalance_in_numbers() -> None:
+    facts = imbalance(np.arange(101))
+    assert facts.mean == 50
+    assert facts.quantiles == {5: 5, 25: 25, 50: 50, 75: 75, 95: 95}
+    assert facts.share_below == {3: 3 / 101, 5: 5 / 101, 10: 10 / 101}
+    with pytest.raises(ValueError, match="no anchors"):
+        imbalance(np.array([], np.int64))
