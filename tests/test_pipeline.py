@@ -22,8 +22,9 @@ from vdgs.stages.opening import open_run
 from vdgs.visibility import views_of
 
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "400", "--save-every", "40", "--anchors.offsets", "3", "--up", "z",
+    "--preset", "laptop", "--iterations", "400", "--save-every", "40", "--anchors.offsets", "3",
     "--growth.start", "100", "--growth.statistics-from", "50", "--growth.gate", "0.05", "--blocks", "2",
+    "--block.compensation.t-low-quantile", "0",
     "--assignment.min-cameras", "4", "--block.iterations", "250", "--block.growth.gate", "0.05",
     "--block.growth.start", "50", "--block.growth.statistics-from", "0", "--block.growth.interval", "50",
 )  # fmt: skip
@@ -220,7 +221,7 @@ def test_one_block_is_the_whole_scene_and_merging_it_the_identity(capture, copie
 
 def test_stages_need_those_before_them(capture, tmp_path):
     run = tmp_path / "run"
-    done = vdgs("coarse", capture, "--output", run, *SETTINGS[:4], "--anchors.offsets", "3", "--up", "z")
+    done = vdgs("coarse", capture, "--output", run, *SETTINGS[:4], "--anchors.offsets", "3")
     assert done.returncode == 0, done.stderr
     for verb, needed in (("train", "vdgs partition"), ("merge", "vdgs partition")):
         refused = vdgs(verb, run)

@@ -18,6 +18,7 @@ from vdgs.anchors import TRAINED, Anchors
 from vdgs.cameras import Camera
 from vdgs.kernels import native as kernels
 from vdgs.kernels.decode_types import DecoderWeights, SplatGradients, Splats
+from vdgs.kernels.native.rasterise import Drawing, rasterise_by_hand
 from vdgs.optimiser import Optimiser
 
 
@@ -31,7 +32,7 @@ class TrainingView:
     opacities: Float[Tensor, " m"]
     #: Mean volume of the splats; NaN if there are none.
     volume: Float[Tensor, ""]
-    drawing: kernels.Drawing
+    drawing: Drawing
     #: What the gradients of means_px and conics, of these splats and then of those around them, may overwrite.
     room: tuple[Tensor, Tensor]
 
@@ -59,7 +60,7 @@ def draw_view(
         return own if around is None else torch.cat([own, getattr(around, name)])
 
     means_px, conics = both("means_px"), both("conics")
-    raster, drawing = kernels.rasterise_by_hand(
+    raster, drawing = rasterise_by_hand(
         means_px, conics, both("colours"), both("opacities"), both("depths"), background,
         width=camera.width, height=camera.height,
     )  # fmt: skip

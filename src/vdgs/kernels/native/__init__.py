@@ -7,12 +7,11 @@ from vdgs.kernels.native.decode import decode
 from vdgs.kernels.native.decode_adam import decode_backward_adam
 from vdgs.kernels.native.loss import photometric_loss
 from vdgs.kernels.native.project import project
-from vdgs.kernels.native.rasterise import Drawing, rasterise, rasterise_by_hand
+from vdgs.kernels.native.rasterise import rasterise
 from vdgs.kernels.native.statistics import add_view_statistics
 from vdgs.kernels.native.views import count_views, mark_views
 
 __all__ = [
-    "Drawing",
     "adam_rows",
     "add_view_statistics",
     "cell_centres",
@@ -29,5 +28,4 @@ __all__ = [
     "photometric_loss",
     "project",
     "rasterise",
-    "rasterise_by_hand",
 ]
