@@ -32,7 +32,7 @@ def draw_block_facts(
     """
     ours = block_facts(positions, views, blocks)._replace(cameras=assigned.sum(axis=0))
     groups = [ours] if compare is None else [ours, block_facts(positions, views, compare)]
-    rows: list[Float[np.ndarray, " b"]] = [np.arange(len(blocks), dtype=np.float64)]
+    rows: list[Float[np.ndarray, " _"]] = [np.arange(len(blocks), dtype=np.float64)]
     if compare is not None:
         rows.append(len(blocks) + 2.5 + np.arange(len(compare)))
     count = float(rows[-1][-1] + 2)  # one row above the blocks names the cut
@@ -112,7 +112,7 @@ def _panel(axes: Axes, index: int, facts: BlockFacts, rows: Float[np.ndarray, " 
             return 0.0
         right = np.nan_to_num(values.astype(np.float64))
         axes.barh(rows, right, height=0.72, color=colours)
-        text = [_number(value, index) for value in values]
+        text = [_number(float(value), index) for value in values]
     for row, end, label in zip(rows, right, text, strict=True):
         missing = label == "nan"
         axes.annotate(
@@ -122,7 +122,7 @@ def _panel(axes: Axes, index: int, facts: BlockFacts, rows: Float[np.ndarray, " 
     return float(np.nanmax(right, initial=0.0))
 
 
-def _rows(axes: Axes, rows: list[Float[np.ndarray, " b"]], named: bool, step: float) -> None:
+def _rows(axes: Axes, rows: list[Float[np.ndarray, " _"]], named: bool, step: float) -> None:
     """Block numbers at the left, and the ink of one panel."""
     plain(axes)
     axes.patch.set_visible(False)  # captions reach into the next panel
