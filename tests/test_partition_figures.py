@@ -1,56 +1,152 @@
-"""The figures of a partition are drawn for any number of blocks, cameras and anchors."""
+"""The figures of the partition: drawn for every kind of scene, of sane size, and true to what they are given."""
 
-import cv2
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
 import numpy as np
 import pytest
 import shapely
+from matplotlib.colors import to_rgb
+from matplotlib.image import imread
 
-from captures_support import look_down
 from vdgs.cameras import Camera
 from vdgs.partition import figures
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.figure_words import block_colour
+from vdgs.partition.fact_figures import block_facts
+from vdgs.partition.figure_words import PALETTE, block_colour
+from vdgs.partition.score_figures import order_of_cameras
 
 
-def columns(count: int, width: float = 10.0) -> Blocks:
-    """Strips beside each other."""
-    cores = [shapely.box(i * width, 0, (i + 1) * width, 30) for i in range(count)]
-    return Blocks(tuple(Block(core, core.buffer(3)) for core in cores))
+def grid(count: int, side: float = 100.0) -> Blocks:
+    """So many upright boxes side by side."""
+    cores = [shapely.box(i * side / count, 0, (i + 1) * side / count, side) for i in range(count)]
+    return Blocks(tuple(Block(core, core.buffer(3.0)) for core in cores))
 
 
-def scene(anchors: int, cameras: int, blocks: int):
-    generator = np.random.default_rng(0)
-    positions = generator.uniform([0, 0, 0], [10 * blocks, 30, 2], (anchors, 3)).astype(np.float32)
-    views = generator.poisson(6, anchors)
-    poses = [look_down(np.array([*place, 20.0])) for place in generator.uniform(0, [10 * blocks, 30], (cameras, 2))]
-    return positions, views, [Camera(pose, 50, 50, 32, 24, 64, 48) for pose in poses]
+def cameras_above(count: int, side: float = 100.0) -> list[Camera]:
+    places = np.random.default_rng(3).uniform(0, side, (count, 2))
+    poses = []
+    for x, y in places:
+        pose = np.diag([1.0, -1.0, -1.0, 1.0])
+        pose[:3, 3] = -pose[:3, :3] @ (x, y, 50.0)
+        poses.append(pose)
+    return [Camera(pose, 400, 400, 200, 150, 400, 300) for pose in poses]
 
 
-@pytest.mark.parametrize(("anchors", "cameras", "blocks"), [(500, 8, 1), (3000, 40, 16), (50, 0, 2), (1, 1, 1)])
-def test_all_figures_are_drawn(tmp_path, anchors, cameras, blocks):
-    positions, views, flown = scene(anchors, cameras, blocks)
-    cut = columns(blocks)
-    assigned = np.random.default_rng(1).random((cameras, blocks)) > 0.5
-    compare = columns(blocks) if blocks > 1 else None
-    figures.draw_visibility_map(tmp_path / "map.png", positions, views, flown, "m")
-    figures.draw_blocks(tmp_path / "blocks.png", positions, views, cut, flown, assigned, "m", compare, 1.0)
-    figures.draw_block_facts(tmp_path / "facts.png", positions, views, cut, assigned, "m", compare)
-    figures.draw_scores(tmp_path / "scores.png", assigned.astype(np.float32), assigned)
-    for path in tmp_path.glob("*.png"):
-        picture = cv2.imread(str(path))
-        assert min(picture.shape[:2]) > 200
-        assert max(picture.shape[:2]) < 6000, path.name
-        assert picture.std() > 5, path.name
-    assert len(list(tmp_path.glob("*.png"))) == 4
+def scene(anchors: int, cameras: int, blocks: int) -> tuple[np.ndarray, np.ndarray, list[Camera], np.ndarray]:
+    """Positions, V, cameras and scores."""
+    random = np.random.default_rng(5)
+    positions = random.uniform(0, 100, (anchors, 3)).astype(np.float32)
+    views = random.integers(0, cameras + 1, anchors).astype(np.int32)
+    return positions, views, cameras_above(cameras), random.random((cameras, blocks)).astype(np.float32)
 
 
-def test_the_score_matrix_of_thousands_of_cameras_stays_legible(tmp_path):
-    scores = np.random.default_rng(0).random((3000, 8)).astype(np.float32)
-    figures.draw_scores(tmp_path / "scores.png", scores, scores > 0.8)
-    picture = cv2.imread(str(tmp_path / "scores.png"))
-    assert 600 < picture.shape[0] < 3000
+def check(file: Path) -> np.ndarray:
+    """A picture of sane size with something drawn on white."""
+    picture = imread(file)[..., :3]
+    height, width = picture.shape[:2]
+    assert 250 <= height <= 6000
+    assert 600 <= width <= 3000
+    assert (picture < 0.9).any(axis=-1).mean() > 0.001
+    edge = np.concatenate([picture[:4].reshape(-1, 3), picture[:, -4:].reshape(-1, 3), picture[-4:].reshape(-1, 3)])
+    assert (edge == 1).all(), "something is cut off at the edge"
+    return picture
 
 
-def test_neighbouring_blocks_have_other_colours():
-    colours = [block_colour(index) for index in range(16)]
-    assert len({str(colour) for colour in colours}) == 16
+SCENES = {
+    "one block": (2000, 12, 1),
+    "16 blocks": (3000, 40, 16),
+    "no cameras": (500, 0, 2),
+    "one anchor": (1, 3, 2),
+    "3000 cameras": (500, 3000, 4),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_all_figures_of_all_scenes(tmp_path: Path, name: str) -> None:
+    anchors, count, blocks = SCENES[name]
+    positions, views, cameras, scores = scene(anchors, count, blocks)
+    cut, assigned = grid(blocks), scores > 0.7
+    compare = grid(blocks + 1) if blocks > 1 else None
+    file = tmp_path / "figure.png"
+    figures.draw_blocks(file, positions, views, cut, cameras, assigned, "m", compare, 1.0)
+    check(file)
+    figures.draw_block_facts(file, positions, views, cut, assigned, "m", compare)
+    check(file)
+    figures.draw_scores(file, scores, assigned)
+    check(file)
+    figures.draw_visibility_map(file, positions, views, cameras, "units")
+    check(file)
+
+
+def test_the_comparison_stands_beside_or_below(tmp_path: Path) -> None:
+    positions, views, cameras, scores = scene(300, 5, 2)
+    alone, both, wide = (tmp_path / f"{name}.png" for name in ("alone", "both", "wide"))
+    cut, assigned = grid(2), scores > 0.5
+    figures.draw_blocks(alone, positions, views, cut, cameras, assigned, "m", None, 0.0)
+    figures.draw_blocks(both, positions, views, cut, cameras, assigned, "m", grid(2), 1.0)
+    stretched = positions * np.float32([10, 1, 1])
+    figures.draw_blocks(wide, stretched, views, cut, cameras, assigned, "m", grid(2), 1.0)
+    one, two, three = (check(file).shape for file in (alone, both, wide))
+    assert two[1] > 1.5 * one[1]
+    assert two[0] == one[0]
+    assert three[1] < 1.2 * one[1]
+
+
+def test_blocks_have_colours_of_their_own_and_show_them(tmp_path: Path) -> None:
+    colours = np.array([to_rgb(colour) for colour in PALETTE])
+    assert len(colours) == 16
+    assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(colours, 2)) > 0.2
+    assert block_colour(16) == block_colour(0) != block_colour(1)
+    positions, views, _, scores = scene(50, 3, 16)
+    file = tmp_path / "facts.png"
+    figures.draw_block_facts(file, positions, views, grid(16), scores > 2, "m", None)
+    picture = check(file).reshape(-1, 3)
+    for colour in colours:  # the area of each block is a bar of its colour
+        assert (np.abs(picture - colour).max(axis=1) < 0.01).sum() > 100
+
+
+def test_facts_are_those_of_the_anchors_that_a_block_owns() -> None:
+    positions = np.array([[10, 5, 0], [20, 5, 0], [30, 5, 9], [90, 5, 0]], np.float32)
+    facts = block_facts(positions, np.array([2, 4, 6, 7], np.int32), grid(4))
+    assert facts.anchors.tolist() == [2, 1, 0, 1]
+    np.testing.assert_allclose(facts.area, 2500)
+    np.testing.assert_allclose(facts.mean, [3, 6, np.nan, 7])
+    np.testing.assert_allclose(facts.spread, [1, 0, np.nan, 0])
+    assert (facts.low[0], facts.high[0]) == pytest.approx((2.1, 3.9))
+
+
+def test_cameras_are_sorted_by_best_block_then_score() -> None:
+    scores = np.array([[0.1, 0.5], [0.9, 0.2], [0, 0], [0.0, 0.8], [0.3, 0.1]], np.float32)
+    order, best = order_of_cameras(scores)
+    assert order.tolist() == [1, 4, 3, 0, 2]
+    assert best.tolist() == [0, 0, 1, 1, 2], "the one without any score comes last"
+
+
+@pytest.mark.parametrize("cameras", [15, 3000])
+def test_assigned_cameras_are_marked(tmp_path: Path, cameras: int) -> None:
+    wanted = np.random.default_rng(0).random((cameras, 4)) > 0.6
+
+    def red(assigned: np.ndarray) -> float:
+        figures.draw_scores(tmp_path / "scores.png", np.full((cameras, 4), 0.9, np.float32), assigned)
+        picture = check(tmp_path / "scores.png")[150:-100, :-150]  # without words and the scale
+        return float(picture[..., 0].sum() - picture[..., 1].sum())
+
+    nothing, some, everything = red(wanted & False), red(wanted), red(wanted | True)
+    assert (some - nothing) / (everything - nothing) == pytest.approx(wanted.mean(), abs=0.04)
+
+
+def test_many_anchors_are_thinned_and_the_heading_counts_cameras_beyond_the_map(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    headings = []
+    monkeypatch.setattr(figures, "titles", lambda figure, *lines: headings.append(lines))
+    positions, views, cameras, _ = scene(figures.MOST_DRAWN + 1, 3, 1)
+    far = cameras[0].camera_from_world.copy()
+    far[0, 3] = -500.0
+    cameras.append(Camera(far, 400, 400, 200, 150, 400, 300))
+    assigned = np.ones((4, 1), bool)
+    figures.draw_blocks(tmp_path / "blocks.png", positions, views, grid(1), cameras, assigned, "m", None, 0.0)
+    assert headings[0][1] == "60,001 anchors (60,000 drawn)  ·  4 training cameras (1 beyond the map)"

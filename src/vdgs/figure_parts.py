@@ -130,7 +130,7 @@ def _cameras(axes: Axes, marks: Sequence[CameraMarks]) -> None:
             centres[:, 1],
             marker="^",
             s=mark.size,
-            linewidths=0.8,
+            linewidths=mark_edge(mark.size),
             label=mark.label,
             zorder=3,
             facecolors=mark.face,
@@ -148,6 +148,16 @@ def _cameras(axes: Axes, marks: Sequence[CameraMarks]) -> None:
     )
 
 
+def mark_edge(size: float) -> float:
+    """Width in points of the edge of a mark of `size` points²: the edge of a small mark must not cover it."""
+    return min(0.8, 0.15 * size**0.5)
+
+
+def _decimals(ticks: np.ndarray) -> int:
+    """How many decimals tell the ticks apart, at most 2."""
+    return next((digits for digits in (0, 1) if np.allclose(ticks, np.round(ticks, digits))), 2)
+
+
 def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: Normalize, noun: str) -> None:
     """The colour scale, and growing out of it the histogram of V; the last step holds all above it."""
     levels = np.arange(top + 1)
@@ -163,7 +173,7 @@ def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: No
     axes.plot([0, 1.12 * shares.max()], [median, median], color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
     axes.text(1.12 * shares.max(), median, " median", va="center", fontsize=9, color=INK)
     below = float((visibility < THIN[0]).mean())
-    axes.text(
+    note = axes.text(
         shares[: THIN[0]].max() + 0.03 * shares.max(),
         1,
         f" {below:.1%} below {THIN[0]}",
@@ -175,8 +185,10 @@ def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: No
     axes.set(
         ylim=(-0.5, top + 0.5), xlim=(0, 1.4 * shares.max()), yticks=[], xlabel=f"share of the {noun.split()[-1]}s"
     )
+    if note.get_window_extent().x1 > axes.figure.bbox.x1:  # too long beside the longest bar
+        note.set_text(f" {below:.1%}\n below {THIN[0]}")
     axes.xaxis.set_major_locator(MaxNLocator(4))
-    axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+    axes.xaxis.set_major_formatter(PercentFormatter(1, decimals=_decimals(100 * axes.get_xticks())))
     for part in (bar, axes):
         plain(part)
         part.spines[:].set_visible(False)

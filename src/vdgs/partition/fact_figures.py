@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from vdgs.figure_parts import DPI, FAINT, INK, placer, plain, titles
 from vdgs.partition.blocks import Blocks
@@ -31,14 +32,14 @@ def draw_block_facts(
     """
     ours = block_facts(positions, views, blocks)._replace(cameras=assigned.sum(axis=0))
     groups = [ours] if compare is None else [ours, block_facts(positions, views, compare)]
-    rows: list[np.ndarray] = [np.arange(len(blocks), dtype=np.float64)]
+    rows: list[Float[np.ndarray, " _"]] = [np.arange(len(blocks), dtype=np.float64)]
     if compare is not None:
-        rows.append(len(blocks) + 1.5 + np.arange(len(compare)))
-    count = float(rows[-1][-1] + 1)
+        rows.append(len(blocks) + 2.5 + np.arange(len(compare)))
+    count = float(rows[-1][-1] + 2)  # one row above the blocks names the cut
     step = float(np.clip(14 / count, 0.13, 0.3))  # inches
-    figure = Figure(figsize=(14.5, 2.15 + step * (count + 1)), dpi=DPI)
+    figure = Figure(figsize=(14.5, 2.15 + step * count), dpi=DPI)
     canvas, place = FigureCanvasAgg(figure), placer(figure)
-    panels = [place(1.15 + 2.65 * index, 0.65, 2.3, step * (count + 1)) for index in range(5)]
+    panels = [place(1.15 + 2.65 * index, 0.65, 2.3, step * count) for index in range(5)]
     names = (
         "anchors of the core", "cameras assigned", f"area of the core ({unit}²)",
         "V: mean, 5–95 % of the anchors", "standard deviation of V",
@@ -50,11 +51,15 @@ def draw_block_facts(
         ]
         # From 0, with room for the number right of the longest bar.
         axes.set_xlim(0, 1.38 * max(ends) or 1.0)
-        axes.set_ylim(count, -1.0)
+        axes.set_ylim(count - 1.3, -1.3)
         axes.set_title(name, loc="left", fontsize=10, color=INK)
         _rows(axes, rows, index == 0, step)
+        axes.xaxis.set_major_locator(MaxNLocator(3, integer=index < 2, min_n_ticks=1))
     note = "mean over the blocks of the standard deviation of V within each: " + _both(groups)
-    lower = "blocks are numbered from above" if compare is None else "paler: cut by place alone, numbers of its own"
+    captions = ("",) if compare is None else ("this cut", "cut by place alone, λ_vis = 0 (numbers of its own)")
+    for places, caption in zip(rows, captions, strict=True):
+        panels[0].text(0, places[0] - 0.95, caption, va="center", fontsize=_font(step), fontweight="bold", color=INK)
+    lower = "colours and numbers are those of the map of blocks"
     titles(figure, count_of(len(blocks), "block"), note, lower)
     canvas.print_png(file)  # type: ignore[arg-type]
 
@@ -72,6 +77,7 @@ class BlockFacts(NamedTuple):
 
 
 def block_facts(positions: Float[np.ndarray, "n 3"], views: Int[np.ndarray, " n"], blocks: Blocks) -> BlockFacts:
+    """What a cut gives each block, without cameras; `views` are the V of the anchors."""
     owner = blocks.owner(np.asarray(positions[:, :2], np.float64))
     seen = [views[owner == index] for index in range(len(blocks))]
     nothing = (np.nan,) * 4
@@ -110,23 +116,24 @@ def _panel(axes: Axes, index: int, facts: BlockFacts, rows: Float[np.ndarray, " 
     for row, end, label in zip(rows, right, text, strict=True):
         missing = label == "nan"
         axes.annotate(
-            "no anchors" if missing else label, (0 if missing else end, row), (4, 0), textcoords="offset points",
+            "no anchors" if missing else label, (0 if missing else end, row), (6, 0), textcoords="offset points",
             va="center", fontsize=_font(step), color=FAINT if missing else INK,
         )  # fmt: skip
     return float(np.nanmax(right, initial=0.0))
 
 
-def _rows(axes: Axes, rows: list[Float[np.ndarray, " b"]], named: bool, step: float) -> None:
+def _rows(axes: Axes, rows: list[Float[np.ndarray, " _"]], named: bool, step: float) -> None:
     """Block numbers at the left, and the ink of one panel."""
     plain(axes)
+    axes.patch.set_visible(False)  # captions reach into the next panel
     places = np.concatenate(rows)
     numbers = [f"block {index}" for group in rows for index in range(len(group))]
     axes.set_yticks(places, numbers if named else [])
     axes.tick_params(axis="y", length=0, labelsize=_font(step))
     axes.spines["left"].set_visible(False)
-    axes.locator_params(axis="x", nbins=3)
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
     if len(rows) > 1:
-        axes.axhline(rows[1][0] - 1.25, color=FAINT, linewidth=0.6)
+        axes.axhline(rows[1][0] - 1.7, color=FAINT, linewidth=0.6)
 
 
 def _font(step: float) -> float:
@@ -137,6 +144,8 @@ def _font(step: float) -> float:
 def _number(value: float, index: int) -> str:
     if np.isnan(value):
         return "nan"
+    if index == 4:
+        return f"{value:.2f}"
     return f"{value:,.0f}" if index < 2 or value >= 1000 else f"{value:.3g}"
 
 
@@ -147,8 +156,9 @@ def _both(groups: list[BlockFacts]) -> str:
 
 def _mean_spread(spread: Float[np.ndarray, " b"]) -> str:
     known = spread[np.isfinite(spread)]
-    return f"{known.mean():.3g}" if len(known) else "none"
+    return f"{known.mean():.2f}" if len(known) else "none"
 
 
 def spread_note(spread: Float[np.ndarray, " b"]) -> str:
+    """One line about the `spread` of all blocks, the standard deviation of V in each."""
     return f"standard deviation of V in a block: {_mean_spread(spread)} (mean over the blocks)"

@@ -17,7 +17,19 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
 from vdgs.cameras import Camera
-from vdgs.figure_parts import DPI, FAINT, INK, CameraMarks, SeenMap, draw_seen_map, map_size, placer, plain, titles
+from vdgs.figure_parts import (
+    DPI,
+    FAINT,
+    INK,
+    CameraMarks,
+    SeenMap,
+    draw_seen_map,
+    map_size,
+    mark_edge,
+    placer,
+    plain,
+    titles,
+)
 from vdgs.inspect import sample_points
 from vdgs.partition.blocks import Blocks
 from vdgs.partition.fact_figures import block_facts, draw_block_facts, spread_note
@@ -64,24 +76,26 @@ def draw_blocks(
     """
     low, high = _frame(_inner(positions[:, :2]))
     width, height = map_size(low, high)
-    beside = compare is not None and width < 1.7 * height
-    columns, rows = (1 + beside, 1 + (compare is not None and not beside))
-    figure = Figure(figsize=(max(0.85 + columns * (width + 0.75), 7.5), 1.7 + rows * (height + 1.1)), dpi=DPI)
+    count = 1 if compare is None else 2
+    columns, rows = (count, 1) if width < 1.7 * height else (1, count)
+    figure = Figure(figsize=(max(0.85 + columns * (width + 0.75), 7.5), 1.15 + rows * (height + 1.1)), dpi=DPI)
     canvas, place = FigureCanvasAgg(figure), placer(figure)
-    shown = sample_points(np.column_stack([positions[:, :2], views]).astype(np.float64), MOST_DRAWN)[:, :2]
+    shown = sample_points(positions[:, :2].astype(np.float64), MOST_DRAWN)
     cuts = [(blocks, f"λ_vis = {lambda_vis:g}")]
     if compare is not None:
         cuts.append((compare, "λ_vis = 0: cut by place alone (numbers of its own)"))
     for index, (cut, name) in enumerate(cuts):
-        bottom = 0.65 + (rows - 1 - index * (not beside)) * (height + 1.1)
-        axes = place(0.85 + index * beside * (width + 0.75), bottom, width, height)
+        row, column = index // columns, index % columns
+        left, bottom = 0.85 + column * (width + 0.75), 0.55 + (rows - 1 - row) * (height + 1.1)
+        axes = place(left, bottom, width, height)
         _cut(axes, cut, shown, low, high)
-        _cameras(axes, _places(cameras), np.asarray(assigned.any(axis=1)) if index == 0 else None)
+        used = np.asarray(assigned.any(axis=1)) if cut is blocks else np.ones(len(cameras), bool)
+        _cameras(axes, _places(cameras), used)
         spread = block_facts(positions, views, cut).spread
         axes.set_title(f"{name}\n{spread_note(spread)}", loc="left", fontsize=10, color=INK)
         axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
     _heading(figure, blocks, (len(positions), len(shown)), _places(cameras), (low, high))
-    _legend(figure)
+    _legend(figure, bool(assigned.any(axis=1).all()))
     canvas.print_png(file)  # type: ignore[arg-type]
 
 
@@ -91,7 +105,7 @@ def _places(cameras: Sequence[Camera]) -> Float[np.ndarray, "c 2"]:
 
 def _mark_size(cameras: int) -> float:
     """Size of a camera mark in points²: thousands must not hide the map."""
-    return float(np.clip(3000 / max(cameras, 1), 5, 30))
+    return float(np.clip(9000 / max(cameras, 1), 8, 30))
 
 
 def _inner(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 2"]:
@@ -103,7 +117,7 @@ def _frame(corners: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
     """Lower left and upper right corner of a map that holds `corners`, with a margin; neither a point nor a strip."""
     low, high = corners.min(axis=0), corners.max(axis=0)
     longest = float((high - low).max()) or 1.0
-    grow = np.maximum(0.05 * longest, (NARROWEST * longest - (high - low)) / 2)
+    grow = np.maximum(0.08 * longest, (NARROWEST * longest - (high - low)) / 2)
     return low - grow, high + grow
 
 
@@ -146,12 +160,12 @@ def _room(core: shapely.Polygon, window: shapely.Polygon) -> tuple[float, float]
     return x, y
 
 
-def _cameras(axes: Axes, places: Float[np.ndarray, "c 2"], used: Bool[np.ndarray, " c"] | None) -> None:
-    """Cameras as small triangles, white those that no block got (`used`; None: not known for this cut)."""
-    used = np.ones(len(places), bool) if used is None else used
+def _cameras(axes: Axes, places: Float[np.ndarray, "c 2"], used: Bool[np.ndarray, " c"]) -> None:
+    """Cameras as small triangles; white those that are not `used`."""
+    size = 0.7 * _mark_size(len(places))
     for chosen, face, edge in ((used, INK, "white"), (~used, "white", INK)):
         axes.scatter(
-            places[chosen, 0], places[chosen, 1], marker="^", s=0.7 * _mark_size(len(places)), linewidths=0.6,
+            places[chosen, 0], places[chosen, 1], marker="^", s=size, linewidths=mark_edge(size),
             facecolors=face, edgecolors=edge, zorder=4,
         )  # fmt: skip
 
@@ -165,10 +179,10 @@ def _heading(
     outside = int((~((cameras >= frame[0]) & (cameras <= frame[1])).all(axis=1)).sum())
     facts = count_of(total, "anchor") + (f" ({drawn:,} drawn)" if drawn < total else "")
     seen = count_of(len(cameras), "training camera") + (f" ({outside:,} beyond the map)" if outside else "")
-    titles(figure, count_of(len(blocks), "block"), f"{facts}  ·  {seen}", "anchors coloured by block")
+    titles(figure, count_of(len(blocks), "block"), f"{facts}  ·  {seen}", "")
 
 
-def _legend(figure: Figure) -> None:
+def _legend(figure: Figure, all_used: bool) -> None:
     triangle = {"marker": "^", "linestyle": "none", "markersize": 5.5, "markeredgewidth": 0.7}
     lines = [
         Line2D([], [], color=INK, linewidth=1.1, label="core"),
@@ -178,6 +192,6 @@ def _legend(figure: Figure) -> None:
     ]
     width, height = figure.get_size_inches()
     figure.legend(
-        handles=lines, loc="upper left", bbox_to_anchor=(2.6 / width, 1 - 0.84 / height), ncols=4, fontsize=8.5,
-        frameon=False, handletextpad=0.5, columnspacing=1.2, borderaxespad=0, borderpad=0,
+        handles=lines[:3] if all_used else lines, loc="upper left", bbox_to_anchor=(0.85 / width, 1 - 0.84 / height),
+        ncols=4, fontsize=8.5, frameon=False, handletextpad=0.5, columnspacing=1.2, borderaxespad=0, borderpad=0,
     )  # fmt: skip

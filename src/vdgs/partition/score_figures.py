@@ -17,8 +17,10 @@ from vdgs.partition.figure_words import count_of
 
 #: From no score to the highest; nothing in it resembles the mark of an assigned camera.
 SCORE = LinearSegmentedColormap.from_list("score", ["#f1f3f5", "#a9c7d6", "#1f6f8b", "#14395b"])
-#: A cell is so many pixels wide before it is drawn; the last ones are its mark, then a gap.
-CELL, MARK, GAP = 20, 4, 1
+#: A cell is so many pixels wide before it is drawn; the last ones are a gap.
+CELL, GAP = 60, 3
+#: Width of the mark of an assigned camera, in inches.
+MARK = 0.12
 
 
 def draw_scores(file: Path, scores: Float[np.ndarray, "c b"], assigned: Bool[np.ndarray, "c b"]) -> None:
@@ -36,7 +38,10 @@ def draw_scores(file: Path, scores: Float[np.ndarray, "c b"], assigned: Bool[np.
     norm = Normalize(min(0.0, float(scores.min(initial=0))), max(float(scores.max(initial=0)), 1e-6))
     if cameras:
         extent = (-0.5, blocks - 0.5, cameras - 0.5, -0.5)
-        axes.imshow(_cells(scores[order], assigned[order], norm), aspect="auto", extent=extent)
+        picture = _cells(scores[order], assigned[order], norm, width / blocks)
+        # Sharp where every camera has a row of pixels, else averaged so that none is dropped.
+        smooth = "nearest" if cameras <= height * DPI else "antialiased"
+        axes.imshow(picture, aspect="auto", extent=extent, interpolation=smooth)
         bar = figure.colorbar(ScalarMappable(norm, SCORE), cax=place(1.6 + width + 0.3, 0.65, 0.18, height))
         bar.set_label("score", color=INK, fontsize=9)
         bar.outline.set_visible(False)  # type: ignore[operator]
@@ -67,11 +72,14 @@ def order_of_cameras(scores: Float[np.ndarray, "c b"]) -> tuple[Int[np.ndarray, 
     return order, best[order]
 
 
-def _cells(scores: Float[np.ndarray, "c b"], assigned: Bool[np.ndarray, "c b"], norm: Normalize) -> np.ndarray:
-    """The picture [c, CELL * b, 3] of the matrix."""
+def _cells(
+    scores: Float[np.ndarray, "c b"], assigned: Bool[np.ndarray, "c b"], norm: Normalize, inches: float
+) -> np.ndarray:
+    """The picture [c, CELL * b, 3] of the matrix, whose cells are so many `inches` wide."""
+    mark = int(np.clip(CELL * MARK / inches, 2, CELL // 4))
     cells = np.repeat(SCORE(norm(scores))[:, :, None, :3], CELL, axis=2)
     cells[:, :, CELL - GAP :] = 1.0
-    cells[:, :, CELL - GAP - MARK : CELL - GAP][assigned] = to_rgb(ACCENT)
+    cells[:, :, CELL - GAP - mark : CELL - GAP][assigned] = to_rgb(ACCENT)
     return cells.reshape(len(scores), -1, 3)
 
 
@@ -90,8 +98,8 @@ def _groups(axes: Axes, best: Int[np.ndarray, " c"], height: float) -> None:
         if inches - last < 0.16:
             continue
         last = inches
-        name = f"best: {block}" if block < most else "no score"
+        name = f"best: block {block}" if block < most else "no score"
         axes.annotate(
-            f"{name} ({size:,})", (0, middle), (-6, 0), xycoords=axes.get_yaxis_transform(), textcoords="offset points",
+            f"{name} ({size:,})", (0, middle), (-8, 0), xycoords=axes.get_yaxis_transform(), textcoords="offset points",
             ha="right", va="center", fontsize=9, color=INK,
         )  # fmt: skip
