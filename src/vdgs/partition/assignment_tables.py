@@ -50,7 +50,8 @@ def explain(
 def assignment_rows(
     blocks: Blocks, positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray, " n"], assignment: Assignment
 ) -> list[Row]:
-    """A row for each block: cameras by reason, anchors in core and widened block, mean and standard deviation of V_i, area of the core.
+    """A row for each block: cameras by reason, anchors in core and widened block, mean and standard deviation
+    of V_i, area of the core.
 
     Areas are in square units of the ground frame; `mean_v` is None for a block without anchors. Ready for JSON.
     """
