@@ -61,7 +61,7 @@ def block_stage(config: BlockConfig, index: int = 0, training: TrainConfig = CON
     surroundings = anchors.select(around & drawn_by(anchors, photographs.cameras))
     stage = Stage(
         training, photographs, 8, 0.4, 5.0, frozen_decoder=True, surroundings=surroundings,
-        may_hold=holds(BLOCKS, index, config), mobility=ramp(BLOCKS.items[index], config),
+        may_hold=holds(BLOCKS, index, config), mobility=ramp(BLOCKS, index, config),
     )  # fmt: skip
     return stage, start_state(anchors.select(own), decoder, stage)
 
@@ -131,11 +131,19 @@ def test_a_free_ring_moves_and_a_ramp_moves_it_less():
 
 
 def test_the_ramp_falls_from_core_to_boundary():
-    mobility = ramp(BLOCKS.items[0], BlockConfig(ring="ramp"))
+    mobility = ramp(BLOCKS, 0, BlockConfig(ring="ramp"))
     assert mobility is not None
     at = torch.tensor([[-2.0, 0, 0], [0.25, 0, 0], [0.5, 0, 0], [0.75, 0, 0], [-50, 0, 0]])
     expected = torch.tensor([1.0, 0.75, 0.5, 0.25, 1.0])
     torch.testing.assert_close(mobility(at), expected, atol=0.02, rtol=0)
+
+
+def test_ground_that_the_block_owns_beyond_its_boundary_moves_in_full():
+    bent = shapely.union(shapely.box(-10, -10, 10, -6), shapely.box(-10, -10, -6, 10))
+    blocks = Blocks((Block(bent, bent.buffer(1)), Block(shapely.box(20, 20, 30, 30), shapely.box(19, 19, 31, 31))))
+    mobility = ramp(blocks, 0, BlockConfig(ring="ramp"))
+    assert mobility is not None
+    assert mobility(torch.tensor([[9.0, 9.0, 0.0], [0.0, 0.0, 0.0], [-8.0, 5.0, 0.0]])).tolist() == [1.0, 1.0, 1.0]
 
 
 def test_one_block_without_surroundings_is_plain_training():
@@ -179,6 +187,8 @@ def test_compensation_that_adds_nothing_is_plain_growth_bit_for_bit(change):
 def test_a_cycle_lasts_from_decision_to_decision():
     stage = Stage(replace(CONFIG, growth=GrowthConfig(interval=3, statistics_from=0, start=6)), Photographs(), 8, 1, 1)
     assert len(views_in_cycle(6, stage)) == 6  # the first cycle counts since the statistics began
+    late = replace(stage, config=replace(CONFIG, growth=GrowthConfig(interval=3, statistics_from=4, start=6)))
+    assert len(views_in_cycle(6, late)) == 2  # the statistics began after the cycle would have
     assert len(views_in_cycle(12, stage)) == 3  # steps 10 to 12, within one epoch, which has no view twice
     assert not {*views_in_cycle(12, stage)} & {*views_in_cycle(15, stage)}
 

@@ -261,7 +261,7 @@ def test_evaluation_and_renders_of_a_run(unbroken, tmp_path):
     measured = subprocess.run([*vdgs, "eval", str(run)], capture_output=True, text=True, timeout=120, cwd=tmp_path)
     assert measured.returncode == 0, measured.stderr
     assert "LPIPS is null" in measured.stdout
-    metrics = json.loads((run / "evaluation/metrics.json").read_text())
+    metrics = json.loads((run / "coarse/evaluation/metrics.json").read_text())
     assert 15 < metrics["psnr"] < 60
     assert metrics["lpips_vgg"] is None
     assert metrics["n_anchors"] > 100

@@ -227,7 +227,7 @@ def test_a_poorly_seen_place_grows_where_plain_growth_sees_nothing():
     decision, change = results["compensated"]
     assert len(decision.added) > 50
     assert float(decision.added.positions[:, 0].min()) > -5  # offsets reach some units beyond their anchor
-    facts = cycle_facts(change, 0.2, decision)
+    facts = cycle_facts(change, 0.2, decision, CompensationConfig())
     assert facts["grown_low"] == len(decision.added)
     assert facts["grown_other"] == 0
     assert facts["low_share"] == pytest.approx(float(east.float().mean()))
@@ -268,7 +268,12 @@ def test_what_grows_plainly_grows_compensated_too():
 def test_facts_without_low_visibility_are_null():
     anchors, statistics, memory = some_anchors(2), Statistics.zeros(2, K), Compensation.zeros(2, K)
     change = compensate(memory, torch.zeros(2, dtype=torch.bool), 0.2, GROWTH, PAPER)
-    facts = cycle_facts(change, 0.2, decide(anchors, statistics, 1.0, GROWTH, torch.Generator(), compensated=change))
+    facts = cycle_facts(
+        change,
+        0.2,
+        decide(anchors, statistics, 1.0, GROWTH, torch.Generator(), compensated=change),
+        CompensationConfig(),
+    )
     assert facts["mean_cache"] is None
     assert facts["low_share"] == 0
     assert not any(isinstance(value, float) and math.isnan(value) for value in facts.values())

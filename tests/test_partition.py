@@ -17,7 +17,7 @@ from vdgs.config import PartitionConfig
 from vdgs.errors import RunError, VdgsError
 from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks, save_blocks_wgs84
 from vdgs.partition.boundary import alpha_shape, widen
-from vdgs.partition.cut import area_of_blocks, choose_block_count, cut_scene
+from vdgs.partition.cut import choose_block_count, cut_scene
 
 
 def town(n: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -73,7 +73,7 @@ def test_coordinates_as_large_as_utm() -> None:
     far = positions + np.array([4.5e5, 5.4e6, 300])
     blocks = cut(far, views)
     assert np.array_equal(owners(blocks, far), owners(cut(positions, views), positions))
-    assert overlap(blocks) < 1e-6 * area_of_blocks(blocks).sum()
+    assert overlap(blocks) < 1e-6 * sum(block.core.area for block in blocks.items)
 
 
 # --------------------------------------------------------------------------------------------- ownership
@@ -92,7 +92,7 @@ def test_every_place_has_one_owner_and_cores_are_disjoint_within_their_boundarie
     positions, views = town()
     blocks = cut(positions, views, count, lambda_vis=lambda_vis)
     assert len(blocks) == count
-    assert overlap(blocks) < 1e-9 * area_of_blocks(blocks).sum()
+    assert overlap(blocks) < 1e-9 * sum(block.core.area for block in blocks.items)
     for block in blocks.items:
         assert block.core.is_valid
         assert block.expanded.is_valid

@@ -199,7 +199,7 @@ def test_a_missing_block_stops_the_merge_unless_the_coarse_model_may_stand_in(co
         shutil.rmtree(copied / name)
     refused = vdgs("merge", copied)
     assert refused.returncode == 1
-    assert "block 1 is new" in refused.stderr
+    assert "block 1: not trained yet" in refused.stderr
     assert "--incomplete" in refused.stderr
     assert not (copied / MERGED).exists()
     done = vdgs("merge", copied, "--incomplete")
@@ -243,6 +243,56 @@ def test_damaged_files_of_a_partition_are_named(copied, file):
     assert done.returncode == 1
     assert Path(file).name in done.stderr
     assert "Traceback" not in done.stderr
+    assert "vdgs partition" in done.stderr or "run:" in done.stderr
+    mended = vdgs("partition", copied)  # what the message advises helps
+    assert mended.returncode == 0, mended.stderr
+    assert vdgs("train", copied, "--block", "0").returncode == 0
+
+
+def test_nothing_is_built_on_a_model_of_other_settings(capture, copied):
+    """A change of the coarse stage's settings counts at once, even if training it again never began."""
+    settings = ["--seed", "7", *SETTINGS]
+    command = [sys.executable, "-m", "vdgs.cli", "run", str(capture), "--output", str(copied), *settings, "--redo"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while process.poll() is None and "seed: 7" not in (copied / "config.yaml").read_text():
+        time.sleep(0.001)
+    process.kill()
+    process.communicate()
+    if "seed: 7" in (copied / "config.yaml").read_text():
+        refused = vdgs("partition", copied)
+        if refused.returncode:  # unless the kill came before the claim: then the old model still has the old key
+            assert "no coarse model of its settings" in refused.stderr
+    done = vdgs("run", capture, "--output", copied, *settings, "--redo")
+    assert done.returncode == 0, done.stderr
+    assert "already trained; nothing to do" not in done.stdout
+
+
+def test_figures_of_another_model_are_not_taken_for_this_ones(capture, copied):
+    again = vdgs("eval", copied, "--bins", "2")
+    assert again.returncode == 0, again.stderr
+    done = vdgs("run", capture, "--output", copied, *SETTINGS)
+    assert done.returncode == 0, done.stderr
+    assert len(json.loads((copied / "evaluation/metrics.json").read_text())["views_by_visibility"]) > 0
+    assert done.stdout.count("already measured") == 1  # the coarse one
+
+
+def test_a_block_trained_again_is_merged_again(unbroken, copied):
+    shutil.rmtree(copied / "blocks/01")
+    assert vdgs("merge", copied, "--incomplete").returncode == 0
+    assert model(copied) != model(unbroken)
+    assert vdgs("train", copied).returncode == 0
+    assert vdgs("merge", copied).returncode == 0
+    assert model(copied) == model(unbroken)
+
+
+def test_why_a_view_was_assigned(copied):
+    told = vdgs("partition", copied, "--why", "frame_001.png")
+    assert told.returncode == 0, told.stderr
+    assert "frame_001.png" in told.stdout
+    assert "threshold" in told.stdout or "best block" in told.stdout or "topped up" in told.stdout
+    unknown = vdgs("partition", copied, "--why", "nobody.png")
+    assert unknown.returncode == 1
+    assert "no training view 'nobody.png'" in unknown.stderr
 
 
 def test_the_report_is_one_file_without_links_out(unbroken):

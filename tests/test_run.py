@@ -105,7 +105,28 @@ def test_a_stage_deletes_what_was_made_for_other_settings_and_nothing_else(tmp_p
     assert not folder.is_done("b")
     folder.claim("b")
     assert not folder.model.exists()
-    assert folder.status() == {"state": "new", "key": "b"}
+    assert folder.status() == {"state": "new"}
+    assert folder.key() == "b"
+
+
+def test_work_of_unknown_settings_is_not_taken_over(tmp_path):
+    folder = StageFolder(tmp_path / "stage")
+    folder.claim("a")
+    folder.model.write_bytes(b"model")
+    folder.set_status("done")
+    folder.status_file.unlink()  # as the message about a damaged one advises: the key stays known
+    folder.claim("a")
+    assert folder.model.exists()
+    folder.key_file.unlink()
+    folder.claim("a")
+    assert not folder.model.exists()
+
+
+def test_what_is_built_on_the_coarse_model_depends_on_the_very_model():
+    ours, theirs = stage_keys(settings(), "1-a"), stage_keys(settings(), "1-b")
+    assert ours.coarse == theirs.coarse
+    assert ours.partition != theirs.partition
+    assert ours.merge != theirs.merge
 
 
 def test_each_setting_invalidates_the_stages_that_depend_on_it_and_no_others():

@@ -124,12 +124,14 @@ def compensate(
     return Compensated(compensation.cache * low[:, None], low, gate)
 
 
-def cycle_facts(compensated: Compensated, threshold: float, decision: Decision) -> dict[str, Any]:
+def cycle_facts(
+    compensated: Compensated, threshold: float, decision: Decision, config: CompensationConfig
+) -> dict[str, Any]:
     """JSON-able facts of one cycle for the log.
 
     `low_share`: share of the anchors that are of low visibility; `t_low`: the threshold used; `mean_cache`,
-    `max_cache`: g over the offsets of L (null where L is empty); `grown_low`, `grown_other`: new anchors in cells with
-    a parent in L, and the others; `pruned`: anchors removed.
+    `max_cache`: g over the offsets of L (null where L is empty), `capped`: how many of them are at the cap;
+    `grown_low`, `grown_other`: new anchors in cells with a parent in L, and the others; `pruned`: anchors removed.
     """
     low, offsets = int(compensated.low.sum()), compensated.added.shape[1]
     added = compensated.added.numpy()  # numpy sums in one order for any number of threads
@@ -138,6 +140,7 @@ def cycle_facts(compensated: Compensated, threshold: float, decision: Decision) 
         "t_low": threshold,
         "mean_cache": float(added.sum(dtype=np.float64)) / (low * offsets) if low else None,
         "max_cache": float(added.max()) if low else None,
+        "capped": int((added >= config.cap).sum()) if config.cap > 0 else 0,
         "grown_low": decision.grown_low,
         "grown_other": decision.grown_other,
         "pruned": decision.pruned,

@@ -59,6 +59,15 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
 
 
+def read_record(path: Path) -> dict[str, Any]:
+    """What a stage noted of itself in a JSON file; nothing if it is missing or damaged: it is then done again."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
 def read_json(path: Path) -> Any:
     """Read JSON; VdgsError names the file if it is missing or damaged."""
     try:

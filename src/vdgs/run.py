@@ -56,24 +56,30 @@ class StageFolder:
         return status
 
     def set_status(self, state: str, **facts: Any) -> None:
-        """`state` is queued, running, stopped, done or failed. The stage's key stays as `claim` wrote it."""
-        key = {"key": self.status()["key"]} if self.status_file.exists() and "key" in self.status() else {}
-        write_json(self.status_file, {"state": state, **facts, **key})
+        """`state` is queued, running, stopped, done or failed."""
+        write_json(self.status_file, {"state": state, **facts})
+
+    @property
+    def key_file(self) -> Path:
+        return self.path / "key"
+
+    def key(self) -> str | None:
+        """For which settings (`stages/keys.py`) this folder works; None if it says nothing of it."""
+        try:
+            return self.key_file.read_text(encoding="ascii", errors="replace").strip()
+        except OSError:
+            return None
 
     def claim(self, key: str) -> None:
-        """Say for which settings (`stages.py`) this folder works from now on; what is there for others is deleted."""
-        if self.path.exists() and self.status().get("key", key) != key:
-            self.remove()
-        self.path.mkdir(parents=True, exist_ok=True)
-        write_json(self.status_file, {**self.status(), "key": key})
-
-    def remove(self) -> None:
-        """Delete what is here, but for the lock that a process may hold."""
-        for stale in self.path.iterdir():
-            if stale.is_dir():
-                shutil.rmtree(stale)
-            elif stale.name != ".lock":
-                stale.unlink()
+        """Let this folder work for these settings from now on; what is there for others, or for unknown ones, is
+        deleted first and the key is written last: a folder never holds what its key does not say."""
+        if self.path.exists() and self.key() != key:
+            for stale in self.path.iterdir():
+                if stale.is_dir():
+                    shutil.rmtree(stale)
+                elif stale not in (self.path / ".lock", self.key_file):
+                    stale.unlink()
+        write_text(self.key_file, key + "\n")
 
     def holds_work(self) -> bool:
         """Something was trained here."""
@@ -82,7 +88,7 @@ class StageFolder:
     def is_done(self, key: str | None = None) -> bool:
         """Trained to the end, for the settings of `key` where one is given."""
         status = self.status()
-        return status["state"] == "done" and self.model.exists() and key in (None, status.get("key"))
+        return status["state"] == "done" and self.model.exists() and key in (None, self.key())
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -126,7 +132,9 @@ class RunFolder:
         return StageFolder(self.path / "blocks" / f"{index:02d}")
 
     def block_folders(self) -> list[StageFolder]:
-        return [StageFolder(path) for path in sorted((self.path / "blocks").glob("[0-9]*"))]
+        """Those that are there, in order; a folder whose name is no number is not ours."""
+        paths = [path for path in (self.path / "blocks").glob("[0-9]*") if path.name.isdecimal()]
+        return [StageFolder(path) for path in sorted(paths, key=lambda path: int(path.name))]
 
     @property
     def visibility(self) -> Path:
@@ -192,12 +200,12 @@ class RunFolder:
         changed = differences(old, settings)
         if not changed:
             return []
-        before, after = stage_keys(old), stage_keys(settings)
+        after = stage_keys(settings, self.coarse_identity())
         lost = []
-        if before.coarse != after.coarse and self.coarse.holds_work():
+        if self.coarse.holds_work() and self.coarse.key() != after.coarse:
             lost.append("the coarse model")
-        blocks = [folder for folder in self.block_folders() if folder.holds_work()]
-        if before.blocks != after.blocks and blocks:
+        blocks = [folder for folder in self.block_folders() if folder.holds_work() and folder.key() != after.blocks]
+        if blocks:
             lost.append(f"{len(blocks)} blocks" if len(blocks) > 1 else "a block")
         if lost and not redo:
             raise RunError(
@@ -206,6 +214,8 @@ class RunFolder:
                 "continue, or take another --output."
             )  # fmt: skip
         self._write(settings)
+        if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
+            self.coarse.claim(after.coarse)
         return changed
 
     def _write(self, settings: dict[str, Any]) -> None:
@@ -238,8 +248,12 @@ class RunFolder:
         return from_dict(MethodConfig, settings)
 
     def keys(self) -> StageKeys:
-        """The key of every stage, for the settings that config.yaml holds."""
-        return stage_keys(self.settings())
+        """The key of every stage, for the settings that config.yaml holds and the coarse model that is there."""
+        return stage_keys(self.settings(), self.coarse_identity())
+
+    def coarse_identity(self) -> str | None:
+        """What tells the coarse model from any other; None while there is none."""
+        return self.coarse.status().get("model")
 
     @contextmanager
     def locked(self, shared: bool = False) -> Iterator[None]:

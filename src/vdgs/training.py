@@ -216,13 +216,15 @@ def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:
         surroundings=None if stage.surroundings is None else stage.surroundings.positions,
         may_hold=stage.may_hold,
     )  # fmt: skip
-    added = len(decision.added)
+    before, added = len(state.anchors), len(decision.added)
     kept = torch.cat([decision.kept, torch.ones(added, dtype=torch.bool)])
     _rebuild(state, decision.added, kept)
     if state.compensation is not None:
         state.compensation = state.compensation.extended(added).select(kept)
         begin_cycle(state.compensation, state.statistics)
-    cycle = {} if compensated is None else cycle_facts(compensated, threshold, decision)
+    cycle = {} if compensated is None else cycle_facts(compensated, threshold, decision, config.compensation)
+    if config.growth.max_anchors:
+        cycle["budget_reached"] = before + added >= config.growth.max_anchors
     return {"grown": added, "pruned": decision.pruned, "cycle": cycle}
 
 
@@ -245,9 +247,9 @@ def views_in_cycle(iteration: int, stage: Stage) -> list[int]:
     """
     growth = stage.config.growth
     begin = iteration - growth.interval
-    if begin < growth.start:
-        begin = min(growth.statistics_from, begin)
-    used = range(max(begin, 0), iteration)
+    if begin < growth.start:  # no decision was made before
+        begin = growth.statistics_from
+    used = range(max(min(begin, iteration - 1), 0), iteration)
     return sorted({view_at(each, stage.image_count, stage.config.seed) for each in used})
 
 

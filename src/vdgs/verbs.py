@@ -117,6 +117,8 @@ class PartitionArguments:
     """Run folder with a coarse model."""
     redo: bool = False
     """Allow another cut to discard blocks that are trained."""
+    why: str | None = None
+    """Name of a training photograph: also say how well it shows each block and why it was assigned or not."""
     threads: int = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
@@ -269,11 +271,13 @@ def partition(arguments: list[str]) -> None:
     run, method = _recorded(arguments, PartitionArguments, "vdgs partition")
     default = PartitionArguments(tyro.MISSING, partition=method.partition, assignment=method.assignment)
     asked = tyro.cli(PartitionArguments, args=arguments, prog="vdgs partition", default=default)
-    from vdgs.stages.partition import partition_run
+    from vdgs.stages.partition import explain_view, partition_run
 
     _use_threads(asked.threads)
     _change(run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.redo)
     partition_run(run, _console())
+    if asked.why is not None:
+        explain_view(run, asked.why, _console())
 
 
 def train(arguments: list[str]) -> None:
@@ -355,11 +359,13 @@ def doctor(arguments: list[str]) -> int:
 
 
 def _recorded(arguments: list[str], kind: type, prog: str) -> tuple[RunFolder, MethodConfig]:
-    """The run that the arguments name and its settings: they are the defaults of the options (and of their help)."""
+    """The run that the arguments name and its settings: they are the defaults of the options, and of their help where
+    the run is named."""
     from vdgs.run import RunFolder
 
     if "-h" in arguments or "--help" in arguments:
-        tyro.cli(kind, args=arguments, prog=prog)
+        named = next((RunFolder(Path(a)) for a in arguments if (Path(a) / "config.yaml").is_file()), None)
+        return (named, named.method()) if named else tyro.cli(kind, args=arguments, prog=prog)
     run = RunFolder(tyro.cli(kind, args=arguments, prog=prog).run)
     return run, run.method()
 

@@ -16,25 +16,22 @@ from vdgs.errors import RunError
 from vdgs.evaluation.evaluate import EvaluationSettings, ModelFacts, evaluate
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.render import render, render_values
-from vdgs.stages.opening import ModelName, TrainedRun, open_run
+from vdgs.run import RunFolder
+from vdgs.stages.opening import TrainedRun
 from vdgs.visibility import views_of
 
 #: Photographs kept decoded during an evaluation, which needs one at a time.
 EVALUATION_IMAGES_BYTES = 256_000_000
 
 
-def evaluate_run(
-    path: Path, lpips_weights: Path | None, bins: int, console: Console, which: ModelName = "best"
-) -> TrainedRun:
+def evaluate_run(run: TrainedRun, lpips_weights: Path | None, bins: int, console: Console) -> None:
     """Measure a model of a run on the test views and print a table.
 
-    Writes RUN/evaluation; RUN/coarse/evaluation for the coarse model of a run that has a merged one too, or if the
-    coarse model was asked for by name.
+    Writes RUN/evaluation for the merged model, RUN/coarse/evaluation for the coarse one.
     """
     if bins < 1:
         raise RunError(f"--bins is {bins}; it must be at least 1")
-    run = open_run(path, which)
-    output = run.folder.coarse.path / "evaluation" if which == "coarse" else run.folder.evaluation
+    output = evaluation_folder(run.folder, run.name)
     views = run.capture.test_views
     index = {view.name: i for i, view in enumerate(views)}
     lpips, note = load_lpips(lpips_weights)
@@ -65,7 +62,11 @@ def evaluate_run(
             console=console,
         )
     console.print(f"pictures and figures: {output}", highlight=False)
-    return run
+
+
+def evaluation_folder(run: RunFolder, name: str) -> Path:
+    """Where the figures of a model ("coarse" or "merged") are."""
+    return run.evaluation if name == "merged" else run.coarse.path / "evaluation"
 
 
 def visibility_map(run: TrainedRun) -> Callable[[Camera], np.ndarray]:

@@ -285,8 +285,8 @@ def _record(job: Job, state: str, why: str) -> None:
     # Not if another process has taken over, nor if the file is damaged.
     with suppress(VdgsError, OSError, ValueError), folder.locked():
         status = folder.status()
-        if status["state"] != state:
-            facts = {name: fact for name, fact in status.items() if name not in ("state", "why", "key")}
+        if status["state"] not in (state, "done"):
+            facts = {name: fact for name, fact in status.items() if name not in ("state", "why")}
             folder.set_status(state, **facts, why=why)
 
 

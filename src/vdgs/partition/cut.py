@@ -83,11 +83,6 @@ def choose_block_count(n_anchors: int, n_cameras: int, image_pixels: int, config
     return max(1, min(most, wanted, n_anchors))
 
 
-def area_of_blocks(blocks: Blocks) -> Float[np.ndarray, " k"]:
-    """The area of every core, in squared units of the ground frame."""
-    return np.array([block.core.area for block in blocks.items], np.float64)
-
-
 def _checked(positions: np.ndarray, views: np.ndarray) -> Float[np.ndarray, "n 2"]:
     """x, y of the anchors in float64."""
     ground = np.asarray(positions, np.float64)[:, :2]

@@ -27,13 +27,13 @@ from vdgs.captures.images import ImageCache
 from vdgs.config import BlockConfig, block_training
 from vdgs.errors import RunError
 from vdgs.kernels import native as kernels
-from vdgs.partition.blocks import Block, Blocks, load_blocks
+from vdgs.partition.blocks import Blocks, load_blocks
 from vdgs.partition.saving import load_scores
 from vdgs.run import RunFolder, StageFolder
 from vdgs.run_options import WatchOptions
 from vdgs.stages.coarse import camera_height, image_budget, note_without_growth
 from vdgs.stages.opening import open_run
-from vdgs.stages.watching import continue_or_start, finish, train_watched
+from vdgs.stages.watching import continue_or_start, finish, identity, train_watched
 from vdgs.training import Stage, start_state
 
 #: Cells on each side of the table of the ramp.
@@ -92,13 +92,13 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
         _keep_coarse(folder, replace(coarse, anchors=anchors, facts=facts), len(views), console)
         return
     config = block_training(method, len(views))
-    note_without_growth(config, console)
+    note_without_growth(config, console, "--block.")
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
     with ImageCache(views, image_budget(options), downscales=factors) as images:
         stage = Stage(
             config, images, len(views), coarse.voxel, camera_height(capture), coarse.background,
             frozen_decoder=True, surroundings=surroundings,
-            may_hold=holds(blocks, index, method.block), mobility=ramp(blocks.items[index], method.block),
+            may_hold=holds(blocks, index, method.block), mobility=ramp(blocks, index, method.block),
             appearance_of=chosen,
         )  # fmt: skip
         state = continue_or_start(folder, stage, lambda: start_state(anchors, coarse.decoder, stage), console)
@@ -118,7 +118,10 @@ def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: C
     """A block that cannot be trained keeps what the coarse model has there, and says why."""
     why = "no camera sees it" if not views else "it holds no anchor"
     model.save(folder.model)
-    folder.set_status("done", iteration=0, iterations=0, anchors=len(model.anchors), seconds=0.0, why=why)
+    folder.set_status(
+        "done", iteration=0, iterations=0, anchors=len(model.anchors), seconds=0.0, why=why,
+        model=identity(folder.model),
+    )  # fmt: skip
     console.print(f"[yellow]note[/] this block stays as the coarse model has it: {why}", highlight=False)
 
 
@@ -159,26 +162,29 @@ def holds(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor],
     return inside
 
 
-def ramp(block: Block, config: BlockConfig) -> Callable[[Tensor], Tensor] | None:
-    """How far anchors move in a ring that is a ramp: 1 in the core, falling linearly to 0 at the widened boundary.
+def ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor] | None:
+    """How far anchors move where the ring is a ramp: 1 wherever the block owns the place, and where another does,
+    falling linearly from the core to 0 at the widened boundary.
 
     Read from a table over the block, since it is asked in every step.
     """
     if config.ring != "ramp":
         return None
+    block = blocks.items[index]
     low, high = np.array(block.expanded.bounds[:2]), np.array(block.expanded.bounds[2:])
     centres = (np.indices((RAMP_CELLS, RAMP_CELLS)).reshape(2, -1).T + 0.5) / RAMP_CELLS * (high - low) + low
     points = shapely.points(centres)
     inwards, outwards = shapely.distance(block.core, points), shapely.distance(block.expanded.exterior, points)
     share = np.where(shapely.contains(block.expanded, points), outwards / np.maximum(inwards + outwards, 1e-12), 0.0)
-    table = torch.from_numpy(np.where(inwards > 0, share, 1.0).astype(np.float32).reshape(RAMP_CELLS, RAMP_CELLS))
+    share = np.where(blocks.owner(centres) == index, 1.0, share)
+    table = torch.from_numpy(share.astype(np.float32).reshape(RAMP_CELLS, RAMP_CELLS))
     origin, cell = torch.from_numpy(low), torch.from_numpy((high - low) / RAMP_CELLS)
 
     def mobility(positions: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
         cells: Int64[Tensor, "p 2"] = ((positions[:, :2].double() - origin) / cell).floor().long()
         inside = ((cells >= 0) & (cells < RAMP_CELLS)).all(1)
         cells = cells.clamp(0, RAMP_CELLS - 1)
-        # A place beyond the table that the block owns (the nearest core) moves as the core does.
+        # What the block moves beyond the table it owns.
         return torch.where(inside, table[cells[:, 0], cells[:, 1]], torch.ones(()))
 
     return mobility

@@ -91,11 +91,13 @@ def train_coarse(run: RunFolder, capture: Capture, options: WatchOptions, consol
         _train(run, capture, config, options, console)
 
 
-def note_without_growth(config: TrainConfig, console: Console) -> None:
+def note_without_growth(config: TrainConfig, console: Console, prefix: str = "--") -> None:
+    """Say so where growth would begin after it has ended; `prefix` is that of the stage's options."""
     if config.growth.levels and config.growth.until * config.iterations < config.growth.start:
         console.print(
             f"[yellow]note[/] no anchor will grow: growth starts at iteration {config.growth.start} and ends at "
-            f"{config.growth.until * config.iterations:.0f}. Give more --iterations or a smaller --growth.start.",
+            f"{config.growth.until * config.iterations:.0f}. Give more {prefix}iterations or a smaller "
+            f"{prefix}growth.start.",
             highlight=False,
         )
 

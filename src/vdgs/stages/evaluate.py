@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import time
+from collections import OrderedDict
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,20 +16,55 @@ from vdgs.anchors import AnchorModel
 from vdgs.cameras import Camera
 from vdgs.captures.capture import View
 from vdgs.captures.images import ImageCache
-from vdgs.evaluation.of_run import EVALUATION_IMAGES_BYTES, evaluate_run
+from vdgs.evaluation.of_run import EVALUATION_IMAGES_BYTES, evaluate_run, evaluation_folder
+from vdgs.evaluation.saving import write_json
 from vdgs.evaluation.seams import block_table, evaluate_blocks
+from vdgs.files import read_record
 from vdgs.kernels.types import Raster
+from vdgs.memory import forget_peak, peak_memory_bytes
 from vdgs.render import render
 from vdgs.run import RunFolder
 from vdgs.stages.block import blocks_of, split_anchors
-from vdgs.stages.opening import ModelName, TrainedRun
+from vdgs.stages.opening import ModelName, TrainedRun, open_run
+
+#: Blocks are held assembled among their surroundings up to so many bytes (at least one): views show them in turn.
+HELD_BYTES = 2_000_000_000
 
 
 def evaluate_stage(path: Path, which: ModelName, lpips_weights: Path | None, bins: int, console: Console) -> None:
     """Measure a model of a run; of the merged one also block by block and at the seams."""
-    opened = evaluate_run(path, lpips_weights, bins, console, which)
+    opened = open_run(path, which)
+    output = evaluation_folder(opened.folder, opened.name)
+    _forget(output)
+    forget_peak()
+    began = time.monotonic()
+    evaluate_run(opened, lpips_weights, bins, console)
     if opened.name == "merged" and len(blocks_of(opened.folder)) > 1:
         console.print(block_table(_evaluate_blocks(opened)))
+    record = _record_of(opened.folder, opened.name, lpips_weights, bins)
+    write_json(
+        output / "status.json",
+        record | {"seconds": time.monotonic() - began, "peak_memory_bytes": peak_memory_bytes()},
+    )  # fmt: skip
+
+
+def is_measured(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> bool:
+    """Whether the figures that are there are those of the model that is there, measured in this way."""
+    wanted = _record_of(run, name, lpips_weights, bins)
+    record = read_record(evaluation_folder(run, name) / "status.json")
+    return {key: record.get(key) for key in wanted} == wanted
+
+
+def _record_of(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> dict[str, Any]:
+    stage = run.merged if name == "merged" else run.coarse
+    return {"model": stage.status().get("model"), "lpips_weights": str(lpips_weights), "bins": bins}
+
+
+def _forget(output: Path) -> None:
+    """Delete what vouches for figures that are about to change, and what another cut may have left."""
+    for stale in ("status.json", "by_block.json"):
+        (output / stale).unlink(missing_ok=True)
+    shutil.rmtree(output / "seams", ignore_errors=True)
 
 
 def _evaluate_blocks(opened: TrainedRun) -> dict[str, Any]:
@@ -53,21 +91,30 @@ def _evaluate_blocks(opened: TrainedRun) -> dict[str, Any]:
 
 
 class _BlocksAlone:
-    """Blocks as they were trained, before the merge: their own anchors among frozen coarse ones. One in memory."""
+    """Blocks as they were trained, before the merge: their own anchors among frozen coarse ones."""
 
     def __init__(self, run: RunFolder, coarse: AnchorModel):
         self._run, self._coarse = run, coarse
-        self._blocks, self._config = blocks_of(run), run.method().block
-        self._held: tuple[int, AnchorModel] | None = None
+        blocks, config, key = blocks_of(run), run.method().block, run.keys().blocks
+        self._around = [split_anchors(coarse.anchors, blocks, index, config)[1] for index in range(len(blocks))]
+        self._done = [run.block(index).is_done(key) for index in range(len(blocks))]
+        self._held: OrderedDict[int, AnchorModel] = OrderedDict()
 
     def render(self, index: int, camera: Camera) -> Raster | None:
-        if not self._run.block(index).is_done(self._run.keys().blocks):  # merged with --incomplete
+        """The block's own picture; None if it was not trained (merged with --incomplete)."""
+        if not self._done[index]:
             return None
-        if self._held is None or self._held[0] != index:
-            self._held = (index, self._assemble(index))
-        return render(self._held[1], camera)
+        if index not in self._held:
+            self._held[index] = self._assemble(index)
+            while len(self._held) > 1 and sum(_bytes(model) for model in self._held.values()) > HELD_BYTES:
+                self._held.popitem(last=False)
+        self._held.move_to_end(index)
+        return render(self._held[index], camera)
 
     def _assemble(self, index: int) -> AnchorModel:
         own = AnchorModel.load(self._run.block(index).model)
-        _, around = split_anchors(self._coarse.anchors, self._blocks, index, self._config)
-        return replace(own, anchors=own.anchors.extended(self._coarse.anchors.select(around)))
+        return replace(own, anchors=own.anchors.extended(self._coarse.anchors.select(self._around[index])))
+
+
+def _bytes(model: AnchorModel) -> int:
+    return sum(tensor.numel() * tensor.element_size() for tensor in model.anchors.tensors().values())

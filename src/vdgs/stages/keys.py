@@ -14,6 +14,7 @@ from typing import Any
 #: Each stage with the sections of config.yaml that it depends on and the stages it builds on.
 DEPENDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "coarse": (("capture", "training"), ()),
+    "visibility": ((), ("coarse",)),
     "partition": (("partition",), ("coarse",)),
     "assignment": (("assignment",), ("partition",)),
     "blocks": (("block",), ("assignment",)),
@@ -26,18 +27,20 @@ class StageKeys:
     """The key of every stage of a run."""
 
     coarse: str
+    visibility: str
     partition: str
     assignment: str
     blocks: str
     merge: str
 
 
-def stage_keys(settings: dict[str, Any]) -> StageKeys:
-    """Keys from the sections of config.yaml."""
+def stage_keys(settings: dict[str, Any], coarse_model: str | None = None) -> StageKeys:
+    """Keys from the sections of config.yaml. What builds on the coarse stage also depends on the very model
+    (`coarse_model`): trained again on another machine it may differ in its last bits."""
     keys: dict[str, str] = {}
     for stage, (sections, before) in DEPENDS.items():
         # Where the capture lies is not what it is: a capture that moved keeps its results.
         own = {name: {k: v for k, v in settings[name].items() if (name, k) != ("capture", "path")} for name in sections}
-        content = [own, *(keys[name] for name in before)]
+        content = [own, *(keys[name] for name in before), *([coarse_model] if before == ("coarse",) else [])]
         keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
     return StageKeys(**keys)

@@ -14,6 +14,7 @@ from vdgs.merging import merge
 from vdgs.run import RunFolder
 from vdgs.stages.block import blocks_of, views_of_block
 from vdgs.stages.opening import open_run
+from vdgs.stages.watching import identity
 
 
 def merge_run(path: Path, incomplete: bool, console: Console) -> None:
@@ -26,8 +27,8 @@ def merge_run(path: Path, incomplete: bool, console: Console) -> None:
         key, keys = run.keys().merge, run.keys()
         blocks = blocks_of(run)
         done = [run.block(index).is_done(keys.blocks) for index in range(len(blocks))]
-        status = run.merged.status()
-        if run.merged.is_done(key) and status.get("blocks_trained") == sum(done):
+        models = [run.block(i).status().get("model") if whole else None for i, whole in enumerate(done)]
+        if run.merged.is_done(key) and run.merged.status().get("block_models") == models:
             console.print(f"{run.merged.model}: already merged; nothing to do", highlight=False)
             return
         if not all(done) and not incomplete:
@@ -46,6 +47,7 @@ def merge_run(path: Path, incomplete: bool, console: Console) -> None:
         trained_in = [run.block(i).status() for i, whole in enumerate(done) if whole]
         run.merged.set_status(
             "done", anchors=len(merged.anchors), blocks_trained=sum(done), blocks=facts,
+            block_models=models, model=identity(run.merged.model),
             seconds=opened.status.get("seconds", 0.0) + sum(each.get("seconds", 0.0) for each in trained_in),
             iterations=opened.status.get("iteration", 0) + sum(each.get("iteration", 0) for each in trained_in),
             peak_memory_bytes=max(each.get("peak_memory_bytes") or 0 for each in [opened.status, *trained_in]),
@@ -63,7 +65,8 @@ def _refuse(run: RunFolder, done: list[bool]) -> None:
     for index, whole in enumerate(done):
         if not whole:
             status = run.block(index).status()
-            lines.append(f"block {index} is {status['state']}" + (f": {status['why']}" if status.get("why") else ""))
+            state = "not trained yet" if status["state"] in ("new", "queued") else status["state"]
+            lines.append(f"block {index}: {state}" + (f" ({status['why']})" if status.get("why") else ""))
     raise RunError(
         f"{run.path}: not all blocks are trained:\n  " + "\n  ".join(lines)
         + f"\nTrain them with `vdgs train {run.path}`, or give --incomplete to let the coarse model stand in for them."

@@ -47,11 +47,12 @@ def open_run(path: Path, which: ModelName = "best") -> TrainedRun:
     if which == "best":
         name = "merged" if folder.merged.is_done(folder.keys().merge) else "coarse"
     stage = folder.merged if name == "merged" else folder.coarse
-    if not stage.model.exists():
+    key = folder.keys().merge if name == "merged" else folder.keys().coarse
+    if not stage.is_done(key):
         verb = "vdgs merge RUN" if name == "merged" else "the same `vdgs coarse` or `vdgs run` command"
         raise RunError(
-            f"{path}: has no {name} model yet (state: {stage.status()['state']}). Run {verb} (again): training "
-            "continues from the last saved state."
+            f"{path}: has no {name} model of its settings yet (state: {stage.status()['state']}). Run {verb} (again): "
+            "training continues from the last saved state."
         )
     model = AnchorModel.load(stage.model)
     refuse_another_capture(stage.model, model.facts.get("capture", {}), capture)

@@ -14,21 +14,24 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from rich import box
 from rich.console import Console
 from rich.progress import Progress
+from rich.table import Table
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
 from vdgs.config import AssignmentConfig, PartitionConfig
+from vdgs.errors import RunError
 from vdgs.evaluation.saving import write_json
-from vdgs.files import read_json
+from vdgs.files import read_record
 from vdgs.memory import forget_peak, peak_memory_bytes
 from vdgs.partition import figures
 from vdgs.partition.assignment import Assignment, assign
-from vdgs.partition.assignment_tables import assignment_rows, assignment_table
+from vdgs.partition.assignment_tables import assignment_rows, assignment_table, explain
 from vdgs.partition.blocks import Blocks, load_blocks, save_blocks, save_blocks_wgs84
 from vdgs.partition.cut import choose_block_count, cut_scene
-from vdgs.partition.saving import save_scores
+from vdgs.partition.saving import load_scores, save_scores
 from vdgs.partition.scores import Scores, score_matrix
 from vdgs.run import RunFolder
 from vdgs.stages.block import places
@@ -55,8 +58,8 @@ class _Scene:
 
 def measure_visibility(run: RunFolder, console: Console) -> None:
     """V_i of every anchor: its distribution and a map from above. Skipped where it is there for this coarse model."""
-    file, key = run.visibility / "visibility.json", run.keys().coarse
-    if file.exists() and read_json(file).get("key") == key:
+    file, key = run.visibility / "visibility.json", run.keys().visibility
+    if read_record(file).get("key") == key:
         console.print(f"{file}: already there; nothing to do", highlight=False)
         return
     with run.locked():
@@ -80,16 +83,16 @@ def partition_run(run: RunFolder, console: Console) -> None:
 
     Raises RunError without a coarse model.
     """
-    keys, before = run.keys(), run.partition_facts()
-    cut = before.get("key") == keys.partition
-    if cut and before.get("assignment_key") == keys.assignment:
+    keys, before = run.keys(), read_record(run.partition / "partition.json")
+    kept = _kept_blocks(run) if before.get("key") == keys.partition else None
+    if kept is not None and before.get("assignment_key") == keys.assignment and _scores_are_whole(run):
         console.print(f"{run.partition}: already cut; nothing to do", highlight=False)
         return
     with run.locked():
         forget_peak()
         began, method, scene = time.monotonic(), run.method(), _Scene.of(run)
-        if cut:
-            blocks, warnings = load_blocks(run.partition / "blocks.geojson"), list(before["warnings"])
+        if kept is not None:
+            blocks, warnings = kept, list(before.get("warnings", []))
         else:
             blocks, warnings = _cut(scene, method.partition, method.training.seed)
         scores = _score(scene, blocks, method.assignment, console)
@@ -98,7 +101,7 @@ def partition_run(run: RunFolder, console: Console) -> None:
             console.print(f"[yellow]note[/] {note}", highlight=False)
         rows = assignment_rows(blocks, scene.positions, scene.views, assignment)
         _save(run.partition, scene, blocks, scores, assignment, rows)
-        spatial = _spatial(scene, method.partition, method.training.seed, len(blocks))
+        spatial = _spatial(scene, method.partition, method.training.seed, blocks)
         _draw(run.partition, scene, blocks, scores, assignment, method.partition, spatial)
         facts = {
             "key": keys.partition, "assignment_key": keys.assignment, "lambda_vis": method.partition.lambda_vis,
@@ -109,6 +112,17 @@ def partition_run(run: RunFolder, console: Console) -> None:
         write_json(run.partition / "partition.json", facts)  # last: where it stands, the rest is complete
     console.print(assignment_table(rows))
     console.print(f"figures: {run.partition / 'blocks.png'} and beside it", highlight=False)
+
+
+def explain_view(run: RunFolder, view: str, console: Console) -> None:
+    """How well a training view shows each block, and why it was assigned to it or not. RunError for another name."""
+    names, scores, assignment = load_scores(run.partition / "scores.npz")
+    table = Table(box=box.SIMPLE_HEAD, title=view, title_justify="left")
+    for heading in ("block", "score", "anchors held", "why"):
+        table.add_column(heading, justify="left" if heading == "why" else "right")
+    for row in explain(names, scores, assignment, view=view):
+        table.add_row(str(row["block"]), f"{row['score']:.3f}", f"{row['held']:,}", row["why"])
+    console.print(table)
 
 
 def unit(capture: Capture) -> str:
@@ -122,9 +136,27 @@ def _cut(scene: _Scene, config: PartitionConfig, seed: int) -> tuple[Blocks, lis
     return cut_scene(scene.positions, scene.views, replace(config, blocks=count), seed)
 
 
-def _spatial(scene: _Scene, config: PartitionConfig, seed: int, count: int) -> Blocks:
+def _spatial(scene: _Scene, config: PartitionConfig, seed: int, cut: Blocks) -> Blocks:
     """The cut that place alone would give, to compare with."""
-    return cut_scene(scene.positions, scene.views, replace(config, blocks=count, lambda_vis=0.0), seed)[0]
+    if config.lambda_vis == 0 or len(cut) == 1:
+        return cut
+    return cut_scene(scene.positions, scene.views, replace(config, blocks=len(cut), lambda_vis=0.0), seed)[0]
+
+
+def _kept_blocks(run: RunFolder) -> Blocks | None:
+    """The blocks that were cut before; None if their file is missing or damaged: the scene is then cut again."""
+    try:
+        return load_blocks(run.partition / "blocks.geojson")
+    except RunError:
+        return None
+
+
+def _scores_are_whole(run: RunFolder) -> bool:
+    try:
+        load_scores(run.partition / "scores.npz")
+    except RunError:
+        return False
+    return True
 
 
 def _score(scene: _Scene, blocks: Blocks, config: AssignmentConfig, console: Console) -> Scores:
@@ -153,7 +185,8 @@ def _save(
     folder: Path, scene: _Scene, blocks: Blocks, scores: Scores, assignment: Assignment, rows: list[dict[str, Any]]
 ) -> None:  # fmt: skip
     """The files that later stages read, and the place of the blocks on Earth where it is known."""
-    (folder / "partition.json").unlink(missing_ok=True)
+    for stale in ("partition.json", "blocks_wgs84.geojson"):
+        (folder / stale).unlink(missing_ok=True)
     save_blocks(folder / "blocks.geojson", blocks, rows)
     ground = scene.opened.capture.ground
     if ground.origin_geo is not None:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import time
-from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 
 from vdgs.errors import RunError, VdgsError
-from vdgs.evaluation.of_run import evaluate_run
-from vdgs.evaluation.saving import write_json
+from vdgs.evaluation.of_run import evaluation_folder
 from vdgs.files import read_json
-from vdgs.memory import forget_peak, peak_memory_bytes
 from vdgs.report import write_report
 from vdgs.run import RunFolder
 from vdgs.stages.coarse import begin_run, train_coarse
-from vdgs.stages.evaluate import evaluate_stage
+from vdgs.stages.evaluate import evaluate_stage, is_measured
 from vdgs.stages.merge import merge_run
 from vdgs.stages.partition import measure_visibility, partition_run
 from vdgs.stages.train import train_blocks
@@ -30,11 +26,12 @@ def run_all(asked: RunArguments, console: Console) -> None:
     Raises what the stages raise; all that was finished before stays, and the same command continues.
     """
     asked.watching.check()
+    if asked.jobs < 0 or asked.bins < 1:
+        raise VdgsError("--jobs must not be negative and --bins must be at least 1")
     run, capture = begin_run(asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo)
     _title(console, "coarse model")
     train_coarse(run, capture, asked.watching, console)
-    measured = {"lpips_weights": str(asked.lpips_weights), "bins": asked.bins}
-    _measure(run, "coarse", run.keys().coarse, measured, asked, console)
+    _measure(run, "coarse", asked, console)
     _title(console, "visibility and blocks")
     measure_visibility(run, console)
     partition_run(run, console)
@@ -47,8 +44,7 @@ def run_all(asked: RunArguments, console: Console) -> None:
         console.print(f"[yellow]note[/] {error}", highlight=False)
     _title(console, "merge and evaluation")
     merge_run(run.path, asked.incomplete, console)
-    merged = run.merged.status()
-    _measure(run, "merged", f"{merged['key']} {merged['blocks_trained']}", measured, asked, console)
+    _measure(run, "merged", asked, console)
     _verdict(run, console)
     console.print(f"report: {write_report(run)}", highlight=False)
 
@@ -58,23 +54,12 @@ def _title(console: Console, name: str) -> None:
     console.rule(f"[bold]{name}", align="left", style="dim")
 
 
-def _measure(
-    run: RunFolder, which: Any, key: str, settings: dict[str, Any], asked: RunArguments, console: Console
-) -> None:  # fmt: skip
-    """Evaluate a model unless that was done already, for it and in the same way."""
-    output = run.evaluation if which == "merged" else run.coarse.path / "evaluation"
-    record, wanted = output / "status.json", {"key": key, **settings}
-    with suppress(VdgsError):
-        if {name: read_json(record).get(name) for name in wanted} == wanted:
-            console.print(f"{output}: already measured; nothing to do", highlight=False)
-            return
-    forget_peak()
-    began = time.monotonic()
-    if which == "merged":
-        evaluate_stage(run.path, which, asked.lpips_weights, asked.bins, console)
-    else:
-        evaluate_run(run.path, asked.lpips_weights, asked.bins, console, which)
-    write_json(record, wanted | {"seconds": time.monotonic() - began, "peak_memory_bytes": peak_memory_bytes()})
+def _measure(run: RunFolder, which: Literal["coarse", "merged"], asked: RunArguments, console: Console) -> None:
+    """Evaluate a model unless that was done already, for this very model and in the same way."""
+    if is_measured(run, which, asked.lpips_weights, asked.bins):
+        console.print(f"{evaluation_folder(run, which)}: already measured; nothing to do", highlight=False)
+        return
+    evaluate_stage(run.path, which, asked.lpips_weights, asked.bins, console)
 
 
 def _verdict(run: RunFolder, console: Console) -> None:

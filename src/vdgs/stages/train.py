@@ -6,21 +6,24 @@ import os
 import shutil
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
 from rich.console import Console
 
-from vdgs.errors import RunError
+from vdgs.errors import RunError, VdgsError
 from vdgs.executors.local import Job, default_jobs, run_jobs
 from vdgs.kernels.native.module import threads as threads_available
-from vdgs.run import RunFolder
+from vdgs.run import RunFolder, StageFolder
 from vdgs.run_options import WatchOptions
 from vdgs.stages.block import blocks_of
 from vdgs.stages.watching import Stopped
 
 #: Rough memory of a process that trains a block: what is imported, and each anchor that it may hold once it has grown.
 PROCESS_BYTES, ANCHOR_BYTES, GROWTH = 400_000_000, 2_500, 2.0
+#: A frozen anchor around the block: its parameters alone.
+FROZEN_BYTES = 300
 
 
 def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console) -> None:
@@ -30,10 +33,12 @@ def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console)
     are trained first), Stopped after Ctrl-C or SIGTERM (every block saved).
     """
     options.check()
+    if jobs < 0:
+        raise VdgsError(f"--jobs is {jobs}; it must be at least 1, or 0 for what cores and memory allow")
     run = RunFolder(path)
     with run.locked(shared=True):
         blocks, key = blocks_of(run), run.keys().blocks
-        _remove_beyond(run, len(blocks))
+        _remove_beyond(run, len(blocks), console)
         left = [index for index in range(len(blocks)) if not run.block(index).is_done(key)]
         if not left:
             console.print(f"{path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
@@ -41,7 +46,7 @@ def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console)
         free = psutil.virtual_memory().available
         at_once, threads = default_jobs(len(left), threads_available(), free, _block_bytes(run))
         if jobs:
-            at_once, threads = min(jobs, len(left)), max(1, (threads_available()) // min(jobs, len(left)))
+            at_once, threads = min(jobs, len(left)), max(1, threads_available() // min(jobs, len(left)))
         budget = options.image_memory_gb or free / 4e9
         console.print(
             f"{len(left)} of {len(blocks)} blocks to train, {at_once} at once with {threads} thread(s) each",
@@ -49,8 +54,7 @@ def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console)
         )
         began = time.monotonic()
         for index in left:
-            run.block(index).claim(key)
-            run.block(index).set_status("queued")
+            _queue(run.block(index), key)
         commands = [_job(run, index, threads, budget / at_once, options) for index in left]
         outcomes = run_jobs(commands, at_once=at_once, retries=2, console=console)
     if any(outcome.state == "stopped" for outcome in outcomes):
@@ -75,15 +79,23 @@ def _job(run: RunFolder, index: int, threads: int, image_gb: float, options: Wat
     return Job(index, run.block(index), command, dict(os.environ))
 
 
-def _remove_beyond(run: RunFolder, count: int) -> None:
+def _queue(folder: StageFolder, key: str) -> None:
+    """Let a block wait for its turn, unless another process trains it already (its status is then its own)."""
+    with suppress(RunError), folder.locked():
+        folder.claim(key)
+        if not folder.is_done(key):
+            folder.set_status("queued")
+
+
+def _remove_beyond(run: RunFolder, count: int, console: Console) -> None:
     """Delete blocks of an earlier cut into more of them."""
     for folder in run.block_folders():
         if int(folder.path.name) >= count:
+            console.print(f"[yellow]note[/] {folder.path} is of an earlier cut and is deleted", highlight=False)
             shutil.rmtree(folder.path)
 
 
 def _block_bytes(run: RunFolder) -> int:
-    """Memory that the largest block may need, from its anchors, those around it and its photographs."""
-    largest = max(each["anchors_core"] for each in run.partition_facts()["blocks"])
-    everything = sum(each["anchors_core"] for each in run.partition_facts()["blocks"])
-    return int(PROCESS_BYTES + ANCHOR_BYTES * GROWTH * largest + 300 * everything)
+    """Memory that the largest block may need for its own anchors, once they have grown, and for those around it."""
+    anchors = [each["anchors_core"] for each in run.partition_facts()["blocks"]]
+    return int(PROCESS_BYTES + ANCHOR_BYTES * GROWTH * max(anchors) + FROZEN_BYTES * sum(anchors))

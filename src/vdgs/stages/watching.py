@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -18,15 +19,22 @@ from vdgs.memory import peak_memory_bytes, return_unused
 from vdgs.run import StageFolder
 from vdgs.run_options import WatchOptions
 from vdgs.stages.progress import TrainingProgress
+from vdgs.tensor_files import size_and_checksum
 from vdgs.training import Stage, StepReport, TrainingState, from_saved, to_saved, train
 
-AFTER_DIVERGENCE = (
-    "Lower --rates.* or raise --growth.threshold in a new --output, and look at the photographs with `vdgs inspect`."
-)
-SAVE_MEMORY = (
-    "Three settings help, in a new --output: smaller photographs (--images images_4, or --downscale 2), fewer anchors "
-    "(--growth.max-anchors), less memory for photographs (--image-memory-gb, also when this run is continued)."
-)
+#: What to do about a diverging loss and about missing memory, in the coarse stage and in a block.
+AFTER_DIVERGENCE = {
+    "coarse": "Lower --rates.* or raise --growth.threshold in a new --output, and look at the photographs with "
+    "`vdgs inspect`.",
+    "block": "Lower --block.offset-rate and --block.feature-rate or raise --block.growth.threshold (with --redo).",
+}
+SAVE_MEMORY = {
+    "coarse": "Three settings help, in a new --output: smaller photographs (--images images_4, or --downscale 2), "
+    "fewer anchors (--growth.max-anchors), less memory for photographs (--image-memory-gb, also when this run is "
+    "continued).",
+    "block": "Three settings help: fewer blocks at once (--jobs 1), more and smaller blocks (vdgs partition --blocks), "
+    "fewer anchors (--block.growth.max-anchors).",
+}
 #: Seconds between two notes of the progress in status.json.
 STATUS_SECONDS = 2.0
 
@@ -77,19 +85,20 @@ def train_watched(
     Raises Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged and VdgsError (out of memory, a photograph
     that is gone, a full disk), each with what is kept.
     """
+    kind = "block" if stage.frozen_decoder else "coarse"
     try:
         with stop_requests() as stop:
             folder.set_status("running", iteration=state.iteration, iterations=stage.config.iterations)
             complete = _loop(folder, state, stage, options, console, stop)
     except TrainingDiverged as error:
         folder.set_status("failed", iteration=state.iteration, why=str(error))
-        raise TrainingDiverged(f"{error} {_kept(folder)} {AFTER_DIVERGENCE}") from error
+        raise TrainingDiverged(f"{error} {_kept(folder)} {AFTER_DIVERGENCE[kind]}") from error
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
         folder.set_status("failed", iteration=state.iteration, why="out of memory")
         raise VdgsError(
-            f"{folder.path}: out of memory with {len(state.anchors):,} anchors. {_kept(folder)} {SAVE_MEMORY}"
+            f"{folder.path}: out of memory with {len(state.anchors):,} anchors. {_kept(folder)} {SAVE_MEMORY[kind]}"
         ) from error
     except VdgsError as error:  # a photograph that is gone, a full disk: every step so far is whole
         folder.set_status("failed", iteration=state.iteration, why=str(error))
@@ -107,6 +116,7 @@ def finish(folder: StageFolder, state: TrainingState, model: AnchorModel, consol
     model.save(folder.model)
     folder.set_status(
         "done", iteration=state.iteration, iterations=state.iteration, anchors=len(state.anchors),
+        model=identity(folder.model),
         seconds=state.seconds, psnr_training=None if math.isnan(state.psnr) else state.psnr,
         peak_memory_bytes=state.peak_memory_bytes,
     )  # fmt: skip
@@ -117,6 +127,12 @@ def finish(folder: StageFolder, state: TrainingState, model: AnchorModel, consol
         f"model: {folder.model}",
         highlight=False,
     )
+
+
+def identity(model: Path) -> str:
+    """What tells this model file from any other."""
+    size, checksum = size_and_checksum(model)
+    return f"{size}-{checksum:08x}"
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -137,9 +153,9 @@ def _loop(
             clock.tick()
             progress.step(state, report)
             if state.iteration % options.save_every == 0:
+                progress.flush()  # before the state: a run that continues there must not miss lines of its log
                 return_unused()
                 save_state(folder.checkpoints, to_saved(state))
-                progress.flush()
             if time.monotonic() - noted > STATUS_SECONDS:
                 noted = time.monotonic()
                 folder.set_status("running", **progress.facts(state))
