@@ -73,7 +73,9 @@ class StageFolder:
     def claim(self, key: str) -> None:
         """Let this folder work for these settings from now on; what is there for others, or for unknown ones, is
         deleted first and the key is written last: a folder never holds what its key does not say."""
-        if self.path.exists() and self.key() != key:
+        if self.key() == key:
+            return
+        if self.path.exists():
             for stale in self.path.iterdir():
                 if stale.is_dir():
                     shutil.rmtree(stale)
