@@ -18,6 +18,7 @@ from vdgs.cameras import Camera
 from vdgs.captures.loading import load_capture
 from vdgs.captures.options import CaptureOptions
 from vdgs.checkpoints import load_newest, save_state
+from vdgs.comparators import gaussian_watching
 from vdgs.comparators import gaussians as comparator
 from vdgs.comparators.gaussian_density import DensityConfig, control_density, reset_logits, split
 from vdgs.comparators.gaussian_model import (
@@ -443,7 +444,7 @@ def test_a_stopped_run_continues_from_its_last_state(trained, capture, tmp_path,
     def stopped(state, stage_, *, stop, after_step):
         return train(state, stage_, stop=lambda: state.iteration >= 37, after_step=after_step)
 
-    monkeypatch.setattr(comparator, "train", stopped)
+    monkeypatch.setattr(gaussian_watching, "train", stopped)
     with pytest.raises(Stopped, match="37"):
         comparator.train_gaussians(capture, SHORT, tmp_path, QUIET, options=WatchOptions(save_every=10))
     assert StageFolder(tmp_path).status()["state"] == "stopped"
@@ -461,6 +462,17 @@ def test_other_settings_and_other_captures_are_refused(trained, capture, tmp_pat
         comparator.train_gaussians(other, SHORT, trained.folder.path, QUIET)
     with pytest.raises(RunError, match="is not the capture"):
         comparator.evaluate_gaussians(GaussiansModel.load(trained.folder.model), other, tmp_path / "evaluation")
+
+
+def test_the_background_is_black_or_that_of_the_photographs(trained, capture, tmp_path):
+    assert GaussiansModel.load(trained.folder.model).background == (0.0, 0.0, 0.0)
+    mean = replace(SHORT, iterations=1, background="mean")
+    model = comparator.train_gaussians(capture, mean, tmp_path, QUIET)
+    assert all(0.3 < value < 0.7 for value in model.background)
+    away = Camera(np.diag([1.0, 1, 1, 1]), 20.0, 20.0, 4.0, 4.0, 8, 8)  # looks up from the ground
+    moved = replace(model.gaussians, means=model.gaussians.means - torch.tensor([0.0, 0.0, 100.0]))
+    nothing = replace(model, gaussians=moved).render(away).image
+    torch.testing.assert_close(nothing, torch.tensor(model.background).expand(8, 8, 3))
 
 
 def test_settings_that_do_not_work_are_named(capture, tmp_path):

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -60,6 +60,9 @@ class GaussiansConfig:
     """Opacity of the Gaussians at the start (program)."""
     ssim_weight: float = 0.2
     """lambda: loss = (1 - lambda) L1 + lambda (1 - SSIM) (eq. 7)."""
+    background: Literal["black", "mean"] = "black"
+    """Colour behind the scene (program: black). `mean` is that of the training photographs, as this project's own
+    method has it: to tell what the method gains from what its background does (choice)."""
     rates: GaussianRates = field(default_factory=GaussianRates)
     """Learning rates."""
     density: DensityConfig = field(default_factory=DensityConfig)
@@ -93,6 +96,8 @@ class GaussiansState:
     psnr: float = math.nan
     seconds: float = 0.0
     peak_memory_bytes: int = 0
+    #: Zeros between steps, in the shape of each tensor of the Gaussians: where gradients are put. Not saved.
+    room: dict[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -175,11 +180,14 @@ def _move(
     for name, tensor in state.gaussians.tensors().items():
         if name == "rest" and not degree:
             continue  # gradients and moments are zero: nothing moves
-        everywhere = torch.zeros_like(tensor).index_copy_(0, rows, gradients[name])
+        if name not in state.room:
+            state.room[name] = torch.zeros_like(tensor)
+        everywhere = state.room[name].index_copy_(0, rows, gradients[name])
         finite &= kernels.adam_rows(
             tensor, None, everywhere, state.moments.first[name], state.moments.second[name],
             learning_rate=rates[name], step=state.iteration + 1,
         )  # fmt: skip
+        everywhere.index_fill_(0, rows, 0.0)
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {state.iteration + 1}.")
 
@@ -211,6 +219,7 @@ def _control(state: GaussiansState, stage: GaussiansStage) -> dict[str, Any]:
 
 def _apply(state: GaussiansState, added: Gaussians, kept: Tensor) -> None:
     """Append Gaussians without moments, then keep some of all; the statistics begin again."""
+    state.room = {}
     tensors, state.gaussians = state.gaussians.tensors(), added
     rebuild(tensors, added.tensors(), kept)
     state.gaussians = Gaussians(**tensors)

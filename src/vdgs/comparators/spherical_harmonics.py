@@ -59,7 +59,7 @@ def view_colours(
     colours = 0.5 + DC * dc
     if used:
         weights = basis(directions, degree)[:, 1:]
-        colours = colours + (weights[:, :, None] * rest[:, :used]).sum(1)
+        colours = colours + torch.bmm(weights[:, None], rest[:, :used])[:, 0]
     return colours.clamp_min(0.0)
 
 
