@@ -1,0 +1,1 @@
+"""Other methods, built on the same kernels, captures and evaluation, to be measured beside this one."""
