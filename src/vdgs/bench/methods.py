@@ -93,7 +93,10 @@ def _sweep(prefix: str, symbol: str, values: tuple[float, ...], change: Callable
     return [Method(f"{prefix}-{value:g}", f"{symbol} = {value:g}", change(value)) for value in values]
 
 
-_COMMON = ("its training schedule and losses: blocks are trained as ours, with a frozen decoder and plain growth",)
+#: What the partitions leave out beyond what `partition.strategies` says of each.
+_COMMON = (
+    "training schedule and losses of their own: blocks are trained as ours, with frozen decoder and plain growth",
+)
 _ABLATIONS = [
     Method("full", "VDGS (full)", full, cites="VDGS, sections III-B and III-C"),
     Method("baseline", "baseline: coarse alone", coarse_alone, COARSE_ONLY, cites="VDGS, Table II (a)"),
@@ -104,24 +107,22 @@ _OTHERS = [
     Method(
         "scaffold-gs", "Scaffold-GS", coarse_alone, COARSE_ONLY,
         cites="Lu et al., Scaffold-GS: Structured 3D Gaussians for View-Adaptive Rendering, CVPR 2024",
-        leaves_out=("nothing of the model; starts, background and volume weight are those of our coarse stage",),
+        leaves_out=("its starts, background and volume weight: they are those of our coarse stage",),
     ),
     Method(
         "vastgaussian", "VastGaussian partition", partitioned_by("vastgaussian"),
         cites="Lin et al., VastGaussian: Vast 3D Gaussians for Large Scene Reconstruction, CVPR 2024",
-        leaves_out=("decoupled appearance", "point selection by coverage: blocks start from the coarse anchors", *_COMMON),
+        leaves_out=_COMMON,
     ),
     Method(
         "citygaussian", "CityGaussian partition", partitioned_by("citygaussian"),
         cites="Liu et al., CityGaussian: Real-time High-quality Large-Scale Scene Rendering with Gaussians, ECCV 2024",
-        leaves_out=("levels of detail and compression", "every block moves its own cell only", *_COMMON),
+        leaves_out=_COMMON,
     ),
     Method(
         "dogs", "DOGS partition", partitioned_by("dogs"),
         cites="Chen and Lee, DOGS: Distributed-Oriented Gaussian Splatting via Gaussian Consensus, NeurIPS 2024",
-        leaves_out=(
-            "the consensus (ADMM) between blocks", "recursive splitting by content: cells are equal", *_COMMON,
-        ),
+        leaves_out=_COMMON,
     ),
 ]  # fmt: skip
 _BLOCKS = [Method(f"blocks-{count}", f"{count} block{'s' * (count > 1)}", in_blocks(count)) for count in BLOCKS]

@@ -5,6 +5,7 @@ Liu et al., CityGaussian: Real-time High-quality Large-Scale Scene Rendering wit
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -51,8 +52,8 @@ class CityGaussian:
         columns, rows = grid_shape(count, float(extent[0] / max(extent[1], 1e-9)))
         across, up = (np.linspace(-2, 2, n + 1).clip(-reach, reach) for n in (columns, rows))
         cells = []
-        for x0, x1 in zip(across, across[1:], strict=False):
-            for y0, y1 in zip(up, up[1:], strict=False):
+        for x0, x1 in itertools.pairwise(across):
+            for y0, y1 in itertools.pairwise(up):
                 core = shapely.Polygon(expand(_outline(x0, y0, x1, y1)) * half + middle).buffer(0)
                 if isinstance(core, shapely.Polygon) and not core.is_empty:
                     cells.append(Block(core, core))

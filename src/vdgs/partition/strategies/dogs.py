@@ -6,6 +6,7 @@ NeurIPS 2024.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -48,8 +49,8 @@ class Dogs:
         across, up = (low[i] + size[i] * np.linspace(0, 1, n + 1) for i, n in enumerate((columns, rows)))
         cores = [
             plane.to_ground(shapely.box(x0, y0, x1, y1))
-            for x0, x1 in zip(across, across[1:], strict=False)
-            for y0, y1 in zip(up, up[1:], strict=False)
+            for x0, x1 in itertools.pairwise(across)
+            for y0, y1 in itertools.pairwise(up)
         ]
         return inhabited([Block(core, stretched(core, WIDENED)) for core in cores], ground, count)
 

@@ -23,8 +23,11 @@ KEPT = (0.01, 0.99)
 class Strategy(Protocol):
     """A published partition. Blocks own every place, by core or nearest core, as ours do."""
 
-    cites: str
-    leaves_out: tuple[str, ...]
+    @property
+    def cites(self) -> str: ...
+
+    @property
+    def leaves_out(self) -> tuple[str, ...]: ...
 
     def cut(
         self, positions: Float[np.ndarray, "n 3"], cameras: Sequence[Camera], count: int
@@ -44,7 +47,7 @@ class Strategy(Protocol):
 
 
 def grid_shape(count: int, aspect: float) -> tuple[int, int]:
-    """Columns and rows with exactly `count` cells, the most nearly square for a place `aspect` times wider than high."""
+    """Columns and rows with exactly `count` cells, the most nearly square where x is `aspect` times as long as y."""
     shapes = [(columns, count // columns) for columns in range(1, count + 1) if count % columns == 0]
     return min(shapes, key=lambda shape: abs(np.log(shape[0] / shape[1]) - np.log(max(aspect, 1e-9))))
 

@@ -5,6 +5,7 @@ Lin et al., VastGaussian: Vast 3D Gaussians for Large Scene Reconstruction, CVPR
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -107,6 +108,6 @@ def _equal(
         return [(low, high, centres)]
     ordered = centres[np.argsort(centres[:, axis], kind="stable")]
     sections = np.array_split(ordered, min(parts, len(ordered)))
-    meets = [(a[-1, axis] + b[0, axis]) / 2 for a, b in zip(sections, sections[1:], strict=False)]
+    meets = [(a[-1, axis] + b[0, axis]) / 2 for a, b in itertools.pairwise(sections)]
     edges = [low, *meets, high]
     return [(edges[i], edges[i + 1], section) for i, section in enumerate(sections)]
