@@ -32,10 +32,11 @@ from vdgs.bench.verdict import verdict
 from vdgs.bench.worker import RECORD, Job
 from vdgs.bench.writing import latex, markdown, tidy_csv
 from vdgs.captures.options import CaptureOptions
-from vdgs.config import to_dict
+from vdgs.config import differences, to_dict
 from vdgs.errors import VdgsError
 from vdgs.evaluation.saving import write_json
 from vdgs.files import read_json, write_text
+from vdgs.run import RunFolder
 from vdgs.stages.watching import Stopped
 from vdgs.synth import SynthOptions, generate
 
@@ -123,6 +124,8 @@ def _train(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings, co
     cores = psutil.cpu_count() or 1
     threads = max(1, cores // settings.jobs)
     for run in wanted:
+        _refuse_other_settings(settings, run)
+    for run in wanted:
         job = _job(run, plan, captures[run.scene], settings, threads)
         if _is_done(settings.output, run, job.key):
             done[run.name] = Ended(run.name, "done")
@@ -147,8 +150,24 @@ def _train(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings, co
             f"{result.state:8} {name}  {result.seconds:.0f} s  ({total - left} of {total}) {result.why}",
             style=style, highlight=False, markup=False,
         )  # fmt: skip
+        console.file.flush()  # also into a file that someone follows
 
     return done | run_tasks(tasks, settings.jobs, tell)
+
+
+def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
+    """Raise VdgsError, before anything is trained, if the run's folder was filled with other settings."""
+    folder = RunFolder(settings.output / run.folder)
+    if settings.redo or not folder.config_file.exists():
+        return
+    wanted, held = to_dict(run.config), folder.settings()
+    changed = differences({name: held[name] for name in wanted}, wanted)
+    if changed:
+        raise VdgsError(
+            f"{folder.path}: was trained with other settings:\n  "
+            + "\n  ".join(changed)
+            + "\nGive the old options to continue, --redo to train again what depends on them, or another --output."
+        )
 
 
 def _job(run: PlannedRun, plan: Plan, capture: Path, settings: BenchSettings, threads: int) -> Job:

@@ -29,14 +29,14 @@ def draw_groups(file: Path, plan: Plan, results: Sequence[Result]) -> bool:
         return False
     rows = -(-len(plan.methods) // 3)
     legend = 0.3 * rows + 0.25
-    width, height = 0.4 + (PANEL_WIDTH + 0.75) * len(scenes), PANEL_HEIGHT + 2.35 + legend
+    width, height = 0.4 + (PANEL_WIDTH + 0.75) * len(scenes), PANEL_HEIGHT + 2.2 + legend
     width = max(width, 7.5)
     figure = Figure(figsize=(width, height), dpi=DPI)
     canvas = FigureCanvasAgg(figure)
     panel = (width - 0.4) / len(scenes) - 0.75
     for index, scene in enumerate(scenes):
         left = 0.85 + index * (panel + 0.75)
-        axes = figure.add_axes((left / width, (0.85 + legend) / height, panel / width, PANEL_HEIGHT / height))
+        axes = figure.add_axes((left / width, (0.7 + legend) / height, panel / width, PANEL_HEIGHT / height))
         _panel(axes, plan, [each for each in results if each.scene == scene.name], scene.title, index == 0)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower left", bbox_to_anchor=(0.75 / width, 0.1 / height), ncols=3,
@@ -61,7 +61,8 @@ def _panel(axes: Axes, plan: Plan, results: Sequence[Result], title: str, first:
         shift = 0.05 * (index - (len(plan.methods) - 1) / 2) if len(plan.seeds) > 1 else 0.0
         axes.errorbar(
             [place + shift for place, _ in known], [each.mean for _, each in known],
-            yerr=[each.spread or 0.0 for _, each in known], color=colour, marker=marker, markersize=5.5,
+            yerr=[each.spread or 0.0 for _, each in known] if len(plan.seeds) > 1 else None,
+            color=colour, marker=marker, markersize=5.5,
             linewidth=2.2 if ours else 1.3, elinewidth=1.0, capsize=2.5, label=method.title, zorder=3 if ours else 2,
         )  # fmt: skip
     names = [

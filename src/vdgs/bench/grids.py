@@ -61,11 +61,11 @@ COSTS = (
     Column("anchors", "anchors", 0, 0),
     Column("blocks", "blocks", 0, 0),
     Column("cameras a block", "cameras_per_block", 0, 0),
-    Column("training min", "seconds", 1, 0, 1 / 60),
-    Column("longest block min", "longest_block_seconds", 1, 0, 1 / 60),
+    Column("training s", "seconds", 0, 0),
+    Column("longest block s", "longest_block_seconds", 0, 0),
     Column("peak memory GB", "peak_memory_bytes", 2, 0, 1e-9),
     Column("model MB", "model_bytes", 1, 0, 1e-6),
-    Column("frames/s", "fps", 1, 0),
+    Column("frames/s", "fps", 0, 0),
 )
 
 

@@ -67,7 +67,8 @@ class VastGaussian:
         shares = np.array([[covered_share(box, camera) for box in boxes] for camera in cameras])
         centres = np.array([camera.position[:2] for camera in cameras], np.float64)
         inside = [shapely.contains_xy(block.expanded, centres[:, 0], centres[:, 1]) for block in blocks.items]
-        return replace(scores, scores=np.where(np.stack(inside, axis=1), 1.0, shares))
+        joined = np.where(np.stack(inside, axis=1), 1.0, shares)
+        return replace(scores, scores=joined.astype(scores.scores.dtype))
 
 
 def covered_share(corners: Float[np.ndarray, "8 3"], camera: Camera) -> float:
