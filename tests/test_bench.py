@@ -1,6 +1,7 @@
 """The evidence harness: definitions hold together, statistics and marks are right, a real bench runs and continues."""
 
 import csv
+import fcntl
 import io
 import json
 import math
@@ -16,7 +17,9 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
+from vdgs.bench.bench import BenchSettings, run_bench
 from vdgs.bench.definitions import Budget, Method, Scene
 from vdgs.bench.figure import draw_groups
 from vdgs.bench.grids import Cell, Grid, Row, grids_of
@@ -51,6 +54,9 @@ def test_every_method_works_on_every_scene_and_gets_the_same_iterations(scene):
         assert validate(config) == []
         assert config.training.seed == 7
         assert set(method.stages) <= set(STAGES)
+        if method.less:
+            assert total_iterations(method, scene) < scene.budget.total
+            continue
         assert total_iterations(method, scene) == pytest.approx(scene.budget.total, abs=16), method.name
 
 
@@ -104,6 +110,14 @@ def test_runs_with_the_same_settings_are_one_run():
     assert len({run.folder for run in defaults}) == 1
     assert len(plan.runs) == 15 - 3
     assert len(plan.coarse) == 1
+
+
+def test_the_coarse_row_trains_nothing_of_its_own():
+    plan = make_plan("table2", Choices(scenes=("tiny",), seeds=1))
+    (shared,) = plan.coarse
+    assert plan.answers["tiny", "coarse", 0].coarse_from == shared.folder
+    assert plan.answers["tiny", "coarse-as-long", 0].coarse_from is None
+    assert plan.answers["tiny", "baseline", 0].coarse_from is None
 
 
 def test_choices_change_the_budget_for_all_alike():
@@ -196,6 +210,14 @@ def test_the_verdict_asks_for_more_than_the_spread_and_allows_a_tenth():
     assert answers(made(nothing | {"full": (0.5, 0.0)}, method_failed="full")) == [None]
 
 
+def test_rows_that_are_the_same_run_are_not_compared():
+    plan = make_plan("table4", Choices(scenes=("residence",)))
+    assert [
+        line for line in verdict(plan, []) if "γ = 0.9" in line.question.split(", ")[0].split(" against ")[1:]
+    ] == []
+    assert len(verdict(plan, [])) == 15 - 4
+
+
 def test_an_even_scene_is_judged_against_the_best():
     plan = make_plan("table2", Choices(scenes=("toy-even",)))
     results = [
@@ -266,12 +288,12 @@ def test_a_failed_run_stops_only_those_that_build_on_it(tmp_path):
     assert ("c", None) in told
 
 
-def bench(output: Path, *arguments: object) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "vdgs.cli", "bench", "toy", "--output", str(output), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=200)
-
-
 SMALL = ("--methods", "baseline", "full", "--scale-iterations", "0.1", "--jobs", "2")
+
+
+def settings(output: Path, scale: float = 0.1) -> BenchSettings:
+    """The same in this process."""
+    return BenchSettings("toy", output, Choices(methods=("baseline", "full"), scale_iterations=scale), jobs=2)
 
 
 @pytest.fixture(scope="module")
@@ -288,9 +310,12 @@ def benched(tmp_path_factory) -> Path:
     os.kill(started.pid, signal.SIGKILL)
     started.communicate()
     time.sleep(1.5)  # its processes notice, save and end
-    done = bench(output, *SMALL)
-    assert done.returncode == 0, done.stdout + done.stderr
+    run_bench(settings(output), Console(file=io.StringIO()))
     return output
+
+
+def models(output: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in output.rglob("*.safetensors")}
 
 
 def test_a_bench_that_was_killed_continues_to_its_tables(benched):
@@ -309,17 +334,30 @@ def test_a_bench_that_was_killed_continues_to_its_tables(benched):
 
 
 def test_a_finished_bench_trains_nothing_again(benched):
-    before = {path: path.stat().st_mtime_ns for path in benched.rglob("*.safetensors")}
-    again = bench(benched, *SMALL)
-    assert again.returncode == 0, again.stderr
-    assert "started" not in again.stdout
-    assert {path: path.stat().st_mtime_ns for path in benched.rglob("*.safetensors")} == before
+    before, said = models(benched), io.StringIO()
+    run_bench(settings(benched), Console(file=said))
+    assert "started" not in said.getvalue()
+    assert models(benched) == before
     assert len(before) > 3
 
 
 def test_other_settings_do_not_discard_what_is_trained(benched):
-    before = {path: path.stat().st_mtime_ns for path in benched.rglob("*.safetensors")}
-    refused = bench(benched, "--methods", "baseline", "full", "--scale-iterations", "0.3")
-    assert refused.returncode == 1
-    assert "training.iterations: 30 -> 90" in refused.stderr
-    assert {path: path.stat().st_mtime_ns for path in benched.rglob("*.safetensors")} == before
+    before = models(benched)
+    with pytest.raises(VdgsError, match=r"training\.iterations: 60 -> 180"):
+        run_bench(settings(benched, scale=0.3), Console(file=io.StringIO()))
+    assert models(benched) == before
+
+
+def test_one_bench_at_a_time_in_a_folder(tmp_path):
+    with (tmp_path / ".lock").open("w") as handle:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        with pytest.raises(VdgsError, match="another `vdgs bench`"):
+            run_bench(settings(tmp_path), Console(file=io.StringIO()))
+
+
+def test_data_that_is_not_there_is_named(tmp_path):
+    asked = BenchSettings("table2", tmp_path, Choices(scenes=("residence",)))
+    with pytest.raises(VdgsError, match="--data"):
+        run_bench(asked, Console(file=io.StringIO()))
+    with pytest.raises(VdgsError, match="residence-pixsfm"):
+        run_bench(replace(asked, data=tmp_path), Console(file=io.StringIO()))

@@ -2,7 +2,7 @@
 
 OUTPUT/
   captures/SCENE/             what was generated
-  runs/SCENE/METHOD/SEED/     ordinary run folders; coarse-…: coarse stages that several runs share
+  runs/SCENE/METHOD/SEED/     ordinary run folders; shared-coarse-…: coarse stages of several runs
   jobs/                       what each process was told, and what it said
   results.json table.md table.tex table.csv verdict.txt groups.png
 """

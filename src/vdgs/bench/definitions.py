@@ -53,6 +53,8 @@ class Method:
     cites: str = ""
     #: What of the published method is not here.
     leaves_out: tuple[str, ...] = ()
+    #: What it gets less than the others, where it does not spend the whole budget.
+    less: str = ""
 
     def settings(self, base: MethodConfig, budget: Budget) -> MethodConfig:
         return self.change(base, budget)

@@ -27,6 +27,11 @@ def coarse_alone(config: MethodConfig, budget: Budget) -> MethodConfig:
     return replace(config, training=replace(config.training, iterations=budget.total))
 
 
+def coarse_as_long(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """The coarse stage as long as one process takes when every block has its own: coarse + one block's iterations."""
+    return replace(config, training=replace(config.training, iterations=budget.coarse + budget.per_block))
+
+
 def without_blocking(config: MethodConfig, budget: Budget) -> MethodConfig:
     """One block of the whole scene, trained as long as all blocks together, with compensated growth."""
     one = budget.shared_by(1)
@@ -100,6 +105,14 @@ _COMMON = (
 _ABLATIONS = [
     Method("full", "VDGS (full)", full, cites="VDGS, sections III-B and III-C"),
     Method("baseline", "baseline: coarse alone", coarse_alone, COARSE_ONLY, cites="VDGS, Table II (a)"),
+    Method("coarse", "coarse stage, as blocks begin", full, COARSE_ONLY, less="iterations of the coarse stage only"),
+    Method(
+        "coarse-as-long",
+        "coarse alone, as long as one block",
+        coarse_as_long,
+        COARSE_ONLY,
+        less="iterations of the coarse stage and one block: as much time, if all blocks are trained at once",
+    ),
     Method("no-blocking", "w/o blocking", without_blocking, cites="VDGS, Table II (b)"),
     Method("no-anchor-generation", "w/o anchor generation", without_anchor_generation, cites="VDGS, Table II (c)"),
 ]

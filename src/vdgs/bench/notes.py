@@ -36,8 +36,8 @@ def notes_of(plan: Plan, results: Sequence[Result], lines: Sequence[Line], figur
 
 def _fairness(plan: Plan) -> str:
     said = [
-        "Same photographs, sparse points, split and total of iterations for all methods of a scene; where a cut gives "
-        "fewer blocks than asked for, a method gets fewer iterations, as its row says.",
+        "Same photographs, sparse points, split and total of iterations for all methods of a scene but those of which "
+        "it is said below; where a cut gives fewer blocks than asked for, a method gets fewer iterations, as its row says.",
         "A coarse stage that several methods share is trained once; its time counts for each of them. Training time is "
         "the sum over all blocks, as if one after the other.",
         "Groups by visibility are the same pixels for all methods and seeds: V is drawn with one coarse model of the "
@@ -59,6 +59,8 @@ def _method(method: Method) -> str:
     if strategy is not None:
         left = [*strategy.leaves_out, *left]
     text = f"{method.title} (`{method.name}`)" if not method.cites else f"{method.title} ({method.cites})"
+    if method.less:
+        text += f". Gets less: {method.less}"
     return text + (f". Left out: {'; '.join(left)}" if left else "")
 
 

@@ -143,19 +143,19 @@ def _planned(scene: Scene, method: Method, budget: Budget, base: MethodConfig, s
 
 
 def _share_coarse(planned: Sequence[PlannedRun]) -> tuple[list[PlannedRun], list[PlannedRun]]:
-    """The coarse stages that more than one run with blocks needs, as runs of their own, and the runs that take them."""
+    """The coarse stages that blocks begin with, as runs of their own, and the runs that take them over."""
     shared: dict[str, PlannedRun] = {}
     for run in planned:
-        if "blocks" not in run.stages:
-            continue
-        digest = hashlib.sha256(json.dumps(to_dict(run.config.training), sort_keys=True).encode()).hexdigest()[:6]
-        folder = Path("runs", run.scene, f"coarse-{digest}", str(run.seed))
-        shared.setdefault(
-            json.dumps(to_dict(run.config.training)),
-            replace(run, method="coarse", folder=folder, stages=("coarse",)),
-        )
+        digest = _coarse_digest(run)
+        if "blocks" in run.stages and digest not in shared:
+            folder = Path("runs", run.scene, f"shared-coarse-{digest}", str(run.seed))
+            shared[digest] = replace(run, method="coarse", folder=folder, stages=("coarse",))
     taken = [
-        replace(run, coarse_from=shared[json.dumps(to_dict(run.config.training))].folder)
-        if "blocks" in run.stages else run for run in planned
-    ]  # fmt: skip
+        replace(run, coarse_from=shared[_coarse_digest(run)].folder) if _coarse_digest(run) in shared else run
+        for run in planned
+    ]
     return list(shared.values()), taken
+
+
+def _coarse_digest(run: PlannedRun) -> str:
+    return hashlib.sha256(json.dumps(to_dict(run.config.training), sort_keys=True).encode()).hexdigest()[:8]

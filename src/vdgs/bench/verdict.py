@@ -34,7 +34,7 @@ def verdict(plan: Plan, results: Sequence[Result]) -> list[Line]:
     titles = {method.name: method.title for method in plan.methods}
     for scene in plan.scenes:
         mine = [result for result in results if result.scene == scene.name]
-        others = [name for name in titles if name != ours]
+        others = [name for name in titles if name != ours and not _same_runs(plan, scene.name, ours, name)]
         if ours not in titles or not others:
             continue
         if scene.uneven:
@@ -42,6 +42,11 @@ def verdict(plan: Plan, results: Sequence[Result]) -> list[Line]:
         else:
             lines.append(_even(scene.title, mine, ours, titles))
     return lines
+
+
+def _same_runs(plan: Plan, scene: str, ours: str, other: str) -> bool:
+    """Two rows of a sweep may have the same settings: nothing is to be compared."""
+    return all(plan.answers.get((scene, ours, s)) == plan.answers.get((scene, other, s)) for s in plan.seeds)
 
 
 def _uneven(scene: str, results: Sequence[Result], ours: str, other: str, titles: dict[str, str]) -> list[Line]:
