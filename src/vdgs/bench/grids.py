@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from vdgs.bench.definitions import Group
 from vdgs.bench.measure import group_names
 from vdgs.bench.plan import Plan
 from vdgs.bench.quoted import COLUMNS, QUOTED
@@ -124,7 +125,9 @@ def _measured(
     titles = {method.name: method.title for method in plan.methods}
     rows: list[Row] = []
     shown = set()
-    for group in plan.table.headings():
+    # Methods that were asked for by name come in that order, unless the table has groups of its own.
+    headings = plan.table.groups or (Group("", tuple(titles)),)
+    for group in headings:
         members = [method for method in group.methods if method in titles]
         shown |= set(members)
         rows += _rows_of_group(group.title, members, titles, results, columns)

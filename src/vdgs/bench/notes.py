@@ -36,10 +36,11 @@ def notes_of(plan: Plan, results: Sequence[Result], lines: Sequence[Line], figur
 
 def _fairness(plan: Plan) -> str:
     said = [
-        "Same photographs, sparse points, split and total of iterations for all methods of a scene but those of which "
-        "it is said below; where a cut gives fewer blocks than asked for, a method gets fewer iterations, as its row says.",
+        "Same photographs, sparse points, split and total of iterations for all methods of a scene, but for rows of "
+        "which it is said below that they get less; where a cut gives fewer blocks than asked for, a method gets fewer "
+        "iterations, as its row says.",
         "A coarse stage that several methods share is trained once; its time counts for each of them. Training time is "
-        "the sum over all blocks, as if one after the other.",
+        "the sum over all blocks, as if one after the other; it depends on how many runs went at once (--jobs).",
         "Groups by visibility are the same pixels for all methods and seeds: V is drawn with one coarse model of the "
         "scene.",
         "LPIPS is VGG with input in [-1, 1]; a dash means that no weights were given (--lpips-weights).",
