@@ -67,7 +67,7 @@ def run_tasks(tasks: Sequence[Task], at_once: int, tell: Callable[[str, Ended | 
                 _start_ready(waiting, running, ended, at_once, tell)
                 for each in [each for each in running if each.process.poll() is not None]:
                     running.remove(each)
-                    ended[each.task.name] = result = _ended(each)
+                    ended[each.task.name] = result = _ended(each, bool(asked))
                     tell(each.task.name, result)
                 time.sleep(POLL_SECONDS)
         finally:
@@ -107,11 +107,11 @@ def _begin(task: Task) -> _Running:
     return _Running(task, process, time.monotonic(), start)
 
 
-def _ended(each: _Running) -> Ended:
+def _ended(each: _Running, asked: bool) -> Ended:
     code, seconds = each.process.returncode, time.monotonic() - each.began
     if code == 0:
         return Ended(each.task.name, "done", seconds)
-    if code == 130:
+    if code == 130 or (asked and code == -signal.SIGTERM):  # one that had not begun to train ends at once
         return Ended(each.task.name, "stopped", seconds)
     said = explanation(each.task.output, each.output_from)
     how = said or (f"ended by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}")
