@@ -114,7 +114,9 @@ def _ended(each: _Running, asked: bool) -> Ended:
     if code == 130 or (asked and code == -signal.SIGTERM):  # one that had not begun to train ends at once
         return Ended(each.task.name, "stopped", seconds)
     said = explanation(each.task.output, each.output_from)
-    how = said or (f"ended by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}")
+    how = said or f"exit code {code}"
+    if code < 0:  # what was said last is then no explanation
+        how = f"ended by {signal.Signals(-code).name}" + (" (out of memory?)" if code == -signal.SIGKILL else "")
     return Ended(each.task.name, "failed", seconds, how)
 
 
