@@ -26,6 +26,7 @@ its stages, one by one:
 more:
   render RUN                        views or a camera path, as PNG or video
   synth OUTPUT                      generate a small aerial town with known truth
+  bench TABLE --output FOLDER       methods x scenes x seeds: the paper's tables, a figure and a verdict
   doctor                            what this machine can use, and what to install for the rest
 
 vdgs VERB --help explains the options of a verb. A capture is a folder with images/ and sparse/0 (COLMAP),
@@ -34,7 +35,7 @@ transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of Matri
 
 VERBS = (
     "inspect", "run", "coarse", "visibility", "partition", "train", "merge", "eval", "report", "render", "synth",
-    "doctor",
+    "bench", "doctor",
 )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 PresetName = Literal["paper", "laptop"]
+PartitionStrategy = Literal["visibility", "vastgaussian", "citygaussian", "dogs"]
 
 
 @dataclass(frozen=True)
@@ -151,6 +152,9 @@ class TrainConfig:
 class PartitionConfig:
     """How the scene is cut into blocks (eq. 5 and what follows it)."""
 
+    strategy: PartitionStrategy = "visibility"
+    """`visibility`: by place and visibility (the paper). The others are the partitions of published methods, to compare
+    with; each cuts and chooses cameras in its own way, whatever the settings of the assignment say."""
     blocks: int | Literal["auto"] = 8
     """K, the number of blocks; `auto` follows from anchors, cameras and --block-memory-gb."""
     blocking: bool = True

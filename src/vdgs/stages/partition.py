@@ -33,6 +33,7 @@ from vdgs.partition.blocks import Blocks, load_blocks, save_blocks, save_blocks_
 from vdgs.partition.cut import choose_block_count, cut_scene
 from vdgs.partition.saving import load_scores, save_scores
 from vdgs.partition.scores import Scores, score_matrix
+from vdgs.partition.strategies import STRATEGIES
 from vdgs.run import RunFolder
 from vdgs.stages.block import places
 from vdgs.stages.opening import TrainedRun, open_run
@@ -95,8 +96,11 @@ def partition_run(run: RunFolder, console: Console) -> None:
             blocks, warnings = kept, list(before.get("warnings", []))
         else:
             blocks, warnings = _cut(scene, method.partition, method.training.seed)
-        scores = _score(scene, blocks, method.assignment, console)
-        assignment = assign(scores, method.assignment)
+        config = method.assignment
+        if method.partition.strategy != "visibility":
+            config = STRATEGIES[method.partition.strategy].assignment(config)
+        scores = _score(scene, blocks, config, method.partition, console)
+        assignment = assign(scores, config)
         for note in warnings + assignment.complaints:
             console.print(f"[yellow]note[/] {note}", highlight=False)
         rows = assignment_rows(blocks, scene.positions, scene.views, assignment)
@@ -133,6 +137,8 @@ def unit(capture: Capture) -> str:
 def _cut(scene: _Scene, config: PartitionConfig, seed: int) -> tuple[Blocks, list[str]]:
     camera = scene.cameras[0]
     count = choose_block_count(len(scene.views), len(scene.cameras), camera.width * camera.height, config)
+    if config.strategy != "visibility":
+        return STRATEGIES[config.strategy].cut(scene.positions, scene.cameras, count)
     return cut_scene(scene.positions, scene.views, replace(config, blocks=count), seed)
 
 
@@ -159,13 +165,18 @@ def _scores_are_whole(run: RunFolder) -> bool:
     return True
 
 
-def _score(scene: _Scene, blocks: Blocks, config: AssignmentConfig, console: Console) -> Scores:
+def _score(
+    scene: _Scene, blocks: Blocks, config: AssignmentConfig, partition: PartitionConfig, console: Console
+) -> Scores:
     with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
         task = bar.add_task("assigning cameras")
-        return score_matrix(
+        scores = score_matrix(
             scene.opened.model, blocks, scene.cameras, config,
             lambda done, total: bar.update(task, completed=done, total=total),
         )  # fmt: skip
+    if partition.strategy == "visibility":
+        return scores
+    return STRATEGIES[partition.strategy].rescored(scores, scene.positions, blocks, scene.cameras)
 
 
 def _facts_of_cut(scene: _Scene, blocks: Blocks) -> list[dict[str, Any]]:
@@ -200,7 +211,8 @@ def _draw(
     folder: Path, scene: _Scene, blocks: Blocks, scores: Scores, assignment: Assignment, config: PartitionConfig,
     spatial: Blocks,
 ) -> None:  # fmt: skip
-    compare = spatial if config.lambda_vis and len(blocks) > 1 else None
+    ours = config.strategy == "visibility" and config.lambda_vis > 0
+    compare = spatial if ours and len(blocks) > 1 else None
     figures.draw_blocks(
         folder / "blocks.png", scene.positions, scene.views, blocks, scene.cameras, assignment.cameras,
         unit(scene.opened.capture), compare, config.lambda_vis,

@@ -1,0 +1,251 @@
+"""`vdgs bench`: the runs of a table, several at once, then its tables, figure and verdict.
+
+OUTPUT/
+  captures/SCENE/             what was generated
+  runs/SCENE/METHOD/SEED/     ordinary run folders; shared-coarse-…: coarse stages of several runs
+  jobs/                       what each process was told, and what it said
+  results.json table.md table.tex table.csv verdict.txt groups.png
+"""
+
+from __future__ import annotations
+
+import fcntl
+import time
+import typing
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+from rich.console import Console
+
+from vdgs.bench.definitions import Scene
+from vdgs.bench.figure import draw_groups
+from vdgs.bench.grids import grids_of
+from vdgs.bench.measure import measure_groups
+from vdgs.bench.notes import notes_of
+from vdgs.bench.plan import Choices, Plan, PlannedRun, make_plan
+from vdgs.bench.processes import Ended, Task, run_tasks
+from vdgs.bench.results import Result, as_json, gather
+from vdgs.bench.verdict import verdict
+from vdgs.bench.worker import RECORD, Job
+from vdgs.bench.writing import latex, markdown, tidy_csv
+from vdgs.captures.options import CaptureOptions
+from vdgs.config import differences, to_dict
+from vdgs.errors import VdgsError
+from vdgs.evaluation.saving import write_json
+from vdgs.files import read_json, write_text
+from vdgs.run import RunFolder
+from vdgs.stages.watching import Stopped
+from vdgs.synth import SynthOptions, generate
+
+
+@dataclass(frozen=True)
+class BenchSettings:
+    """How a table is worked off."""
+
+    table: str
+    output: Path
+    choices: Choices
+    data: Path | None = None
+    jobs: int = 1
+    bins: int = 4
+    lpips_weights: Path | None = None
+    redo: bool = False
+
+
+def run_bench(settings: BenchSettings, console: Console) -> list[Result]:
+    """Everything; what is finished for the same settings is kept, and the same command continues.
+
+    Raises VdgsError for settings that do not work, Stopped after Ctrl-C or SIGTERM (what is measured so far is
+    written), and at the end if a run failed: the tables then say which and why.
+    """
+    if settings.jobs < 1 or settings.bins < 1:
+        raise VdgsError("--jobs and --bins must be at least 1")
+    plan = make_plan(settings.table, settings.choices)
+    began = time.monotonic()
+    with _locked(settings.output):
+        captures, lost = _captures(plan, settings, console)
+        ended = lost | _train(plan, captures, settings, console)
+        ended |= _measure(plan, captures, ended, settings, console)
+        results = gather(plan, settings.output, ended)
+        _write(plan, results, settings, console)
+    console.print(f"{(time.monotonic() - began) / 60:.1f} min", highlight=False)
+    if any(each.state == "stopped" for each in ended.values()):
+        raise Stopped("Stopped; every run is saved. The same command continues.")
+    failed = [each for each in ended.values() if each.state == "failed"]
+    if failed:
+        raise VdgsError(
+            f"{len(failed)} of {len(ended)} runs failed; the tables leave them out:\n  "
+            + "\n  ".join(f"{each.name}: {each.why}" for each in failed)
+        )
+    return results
+
+
+def _captures(plan: Plan, settings: BenchSettings, console: Console) -> tuple[dict[str, Path], dict[str, Ended]]:
+    """The folder of every scene, generated where there is none yet; the runs of those that cannot be had, failed."""
+    found, lost = {}, dict[str, Ended]()
+    for scene in plan.scenes:
+        try:
+            found[scene.name] = _capture(scene, settings, console)
+        except VdgsError as error:
+            names = [run.name for run in plan.coarse + plan.runs if run.scene == scene.name]
+            lost |= {name: Ended(name, "failed", why=str(error)) for name in names}
+    if not found:
+        raise VdgsError(next(iter(lost.values())).why)
+    return found, lost
+
+
+def _capture(scene: Scene, settings: BenchSettings, console: Console) -> Path:
+    if scene.capture is not None:
+        if settings.data is None:
+            raise VdgsError(f"{scene.name}: say where the data is: --data FOLDER. {scene.note}")
+        folder = settings.data / scene.capture
+        if not folder.is_dir():
+            raise VdgsError(f"{folder}: is not there. {scene.note}")
+        return folder
+    folder = settings.output / "captures" / scene.name
+    if not folder.exists():
+        for name in ("size", "flight"):
+            known = typing.get_args(typing.get_type_hints(SynthOptions)[name])
+            if name in scene.synth and scene.synth[name] not in known:
+                raise VdgsError(f"{scene.name}: this version generates no {name} {scene.synth[name]!r}")
+        console.print(f"generating {scene.name}", highlight=False)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        generate(folder, SynthOptions(**scene.synth))
+    return folder
+
+
+def _train(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings, console: Console) -> dict[str, Ended]:
+    """Every run whose scene is there, trained or found finished."""
+    done, tasks = dict[str, Ended](), list[Task]()
+    wanted = [run for run in plan.coarse + plan.runs if run.scene in captures]
+    cores = psutil.cpu_count() or 1
+    threads = max(1, cores // settings.jobs)
+    for run in wanted:
+        _refuse_other_settings(settings, run)
+    for run in wanted:
+        job = _job(run, plan, captures[run.scene], settings, threads)
+        if _is_done(settings.output, run, job.key):
+            done[run.name] = Ended(run.name, "done")
+            continue
+        stem = settings.output / "jobs" / run.name.replace("/", "__")
+        job.write(stem.with_name(stem.name + ".json"))
+        after = None if run.coarse_from is None else str(run.coarse_from.relative_to("runs"))
+        after = after if after not in done else None
+        tasks.append(Task(run.name, stem.with_name(stem.name + ".json"), stem.with_name(stem.name + ".log"), after))
+    if done:
+        console.print(f"{len(done)} of {len(wanted)} runs are finished already", highlight=False)
+    left, total = len(tasks), len(tasks)
+
+    def tell(name: str, result: Ended | None) -> None:
+        nonlocal left
+        if result is None:
+            console.print(f"started  {name}", highlight=False, style="dim")
+            return
+        left -= 1
+        style = {"done": "green", "failed": "red", "stopped": "yellow"}[result.state]
+        console.print(
+            f"{result.state:8} {name}  {result.seconds:.0f} s  ({total - left} of {total}) {result.why}",
+            style=style, highlight=False, markup=False,
+        )  # fmt: skip
+        console.file.flush()  # also into a file that someone follows
+
+    return done | run_tasks(tasks, settings.jobs, tell)
+
+
+def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
+    """Raise VdgsError, before anything is trained, if the run's folder was filled with other settings."""
+    folder = RunFolder(settings.output / run.folder)
+    if settings.redo or not folder.config_file.exists():
+        return
+    wanted, held = to_dict(run.config), folder.settings()
+    changed = differences({name: held[name] for name in wanted}, wanted)
+    if changed:
+        raise VdgsError(
+            f"{folder.path}: was trained with other settings:\n  "
+            + "\n  ".join(changed)
+            + "\nGive the old options to continue, --redo to train again what depends on them, or another --output."
+        )
+
+
+def _job(run: PlannedRun, plan: Plan, capture: Path, settings: BenchSettings, threads: int) -> Job:
+    scene = next(scene for scene in plan.scenes if scene.name == run.scene)
+    options = to_dict(CaptureOptions(**scene.options, validation=settings.choices.validation))
+    measured = {"bins": settings.bins, "lpips": str(settings.lpips_weights)}
+    return Job(
+        capture.resolve(), options, to_dict(run.config), run.stages, (settings.output / run.folder).resolve(),
+        None if run.coarse_from is None else (settings.output / run.coarse_from).resolve(),
+        run.key({"options": options, "scene": dict(scene.synth) or scene.capture}, measured),
+        settings.lpips_weights and settings.lpips_weights.resolve(), settings.bins, threads,
+        threads if settings.jobs == 1 else 1, settings.redo,
+    )  # fmt: skip
+
+
+def _is_done(output: Path, run: PlannedRun, key: str) -> bool:
+    """Finished for this key. Any doubt (a damaged record) means no."""
+    try:
+        record = read_json(output / run.folder / RECORD)
+    except (VdgsError, FileNotFoundError):
+        return False
+    return isinstance(record, dict) and record.get("state") == "done" and record.get("key") == key
+
+
+def _measure(
+    plan: Plan, captures: Mapping[str, Path], ended: Mapping[str, Ended], settings: BenchSettings, console: Console
+) -> dict[str, Ended]:
+    """Groups by visibility of every finished run, scene by scene; runs that cannot be measured, as failed."""
+    failed = dict[str, Ended]()
+    for scene in captures:
+        reference = plan.reference(scene)
+        runs = {
+            settings.output / run.folder: read_json(settings.output / run.folder / RECORD)["key"]
+            for run in plan.runs if run.scene == scene and ended[run.name].state == "done"
+        }  # fmt: skip
+        if not runs or ended[reference.name].state != "done":
+            continue
+        try:
+            with console.status(f"{scene}: measuring by visibility") as status:
+                measure_groups(
+                    settings.output / reference.folder, runs, settings.bins,
+                    lambda text, scene=scene, status=status: status.update(f"{scene}: {text}"),  # type: ignore[misc]
+                )  # fmt: skip
+        except VdgsError as error:
+            names = [run.name for run in plan.runs if run.scene == scene and ended[run.name].state == "done"]
+            failed |= {name: Ended(name, "failed", why=str(error)) for name in names}
+    return failed
+
+
+def _write(plan: Plan, results: list[Result], settings: BenchSettings, console: Console) -> None:
+    output, grids, lines = settings.output, grids_of(plan, results), verdict(plan, results)
+    write_json(
+        output / "results.json",
+        {
+            "table": plan.table.name, "title": plan.table.title, "seeds": plan.seeds,
+            "budgets": {name: vars(budget) | {"total": budget.total} for name, budget in plan.budgets.items()},
+            "choices": vars(settings.choices), "results": as_json(results),
+            "verdict": [vars(line) for line in lines],
+        },
+    )  # fmt: skip
+    text = "\n".join(map(str, lines)) or "This table asks no question."
+    drawn = draw_groups(output / "groups.png", plan, results)
+    paragraphs = notes_of(plan, results, lines, drawn)
+    write_text(output / "table.md", markdown(grids, plan.table.title, paragraphs))
+    write_text(output / "table.tex", latex(grids))
+    write_text(output / "table.csv", tidy_csv(grids))
+    write_text(output / "verdict.txt", text + "\n")
+    console.print(text, highlight=False, markup=False)
+    console.print(f"tables: {output / 'table.md'} and beside it", highlight=False)
+
+
+@contextmanager
+def _locked(output: Path) -> Iterator[None]:
+    """Hold the folder: two benches in one would train the same runs."""
+    output.mkdir(parents=True, exist_ok=True)
+    with (output / ".lock").open("w") as handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise VdgsError(f"{output}: another `vdgs bench` works here. Wait for it or stop it.") from error
+        yield

@@ -1,0 +1,124 @@
+"""What a table is made of, as plain objects. Only the standard library and the settings are imported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from vdgs.config import PRESETS, MethodConfig, PresetName
+
+#: Stages of the run of a method, by the names that `worker.STAGES` knows.
+COARSE_ONLY = ("coarse", "evaluate")
+WITH_BLOCKS = ("coarse", "partition", "blocks", "merge", "evaluate")
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Training iterations that every method of a table may spend on a scene, one photograph each."""
+
+    coarse: int
+    blocks: int
+    per_block: int
+
+    @property
+    def total(self) -> int:
+        return self.coarse + self.blocks * self.per_block
+
+    def scaled(self, factor: float) -> Budget:
+        """As many blocks, every count times `factor`, at least one."""
+        return Budget(max(1, round(factor * self.coarse)), self.blocks, max(1, round(factor * self.per_block)))
+
+    def shared_by(self, blocks: int) -> Budget:
+        """The same total for another number of blocks."""
+        return Budget(self.coarse, blocks, max(1, round(self.blocks * self.per_block / blocks)))
+
+
+Change = Callable[[MethodConfig, Budget], MethodConfig]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to turn a capture into a model."""
+
+    #: Unique; the name of its folder.
+    name: str
+    #: What people read.
+    title: str
+    #: The method's settings from those of the full method with the scene's preset and the budget.
+    change: Change
+    #: Its stages in order (`worker.STAGES`).
+    stages: tuple[str, ...] = WITH_BLOCKS
+    #: Where it was published.
+    cites: str = ""
+    #: What of the published method is not here.
+    leaves_out: tuple[str, ...] = ()
+    #: What it gets less than the others, where it does not spend the whole budget.
+    less: str = ""
+
+    def settings(self, base: MethodConfig, budget: Budget) -> MethodConfig:
+        return self.change(base, budget)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A place to reconstruct: generated (`synth`) or a folder under --data (`capture`)."""
+
+    name: str
+    title: str
+    budget: Budget
+    preset: PresetName = "laptop"
+    #: Path below --data; None for a generated scene.
+    capture: str | None = None
+    #: SynthOptions by name.
+    synth: Mapping[str, Any] = field(default_factory=dict)
+    #: CaptureOptions by name.
+    options: Mapping[str, Any] = field(default_factory=dict)
+    #: How the settings of the preset are adapted to the scene.
+    adapt: Callable[[MethodConfig], MethodConfig] = lambda config: config
+    #: Whether some parts are seen far less than others; the verdict asks other questions of even scenes.
+    uneven: bool = True
+    #: What people should know: where the data comes from, how its folder is laid out.
+    note: str = ""
+
+    def base(self, budget: Budget, seed: int, scale: float = 1.0) -> MethodConfig:
+        """The full method on this scene with so many iterations. `scale` is that of the budget to the scene's own:
+        growth begins that much earlier or later, as in `block.scale_iterations`."""
+        config = self.adapt(PRESETS[self.preset])
+        growth = config.training.growth
+        early = replace(
+            growth, statistics_from=round(scale * growth.statistics_from), start=round(scale * growth.start)
+        )
+        inner = config.block.growth
+        earlier = replace(inner, statistics_from=round(scale * inner.statistics_from), start=round(scale * inner.start))
+        return replace(
+            config,
+            training=replace(config.training, iterations=budget.coarse, seed=seed, growth=early),
+            partition=replace(config.partition, blocks=budget.blocks),
+            block=replace(config.block, iterations=budget.per_block, growth=earlier),
+        )
+
+
+@dataclass(frozen=True)
+class Group:
+    """Methods that stand together in a table under a heading."""
+
+    title: str
+    methods: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Methods × scenes × seeds, by name."""
+
+    name: str
+    title: str
+    methods: tuple[str, ...]
+    scenes: tuple[str, ...]
+    seeds: tuple[int, ...] = (0, 1, 2)
+    groups: tuple[Group, ...] = ()
+    #: The method that the verdict is about.
+    ours: str = "full"
+
+    def headings(self) -> tuple[Group, ...]:
+        return self.groups or (Group("", self.methods),)

@@ -1,0 +1,83 @@
+"""PSNR by visibility group, a line for each method, a panel for each scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from vdgs.bench.measure import group_names
+from vdgs.bench.plan import Plan
+from vdgs.bench.results import Result
+from vdgs.bench.statistics import Summary, summarise
+from vdgs.figure_parts import ACCENT, DPI, FAINT, INK, plain, titles
+
+#: Colours and markers of the other methods, told apart without colour too.
+COLOURS = ("#1f6f8b", "#8ab17d", "#e0a030", "#7b5ea7", "#22262b", "#2a9d8f", "#b5838d", "#6c757d")
+MARKERS = ("s", "^", "v", "D", "P", "X", "<", ">")
+PANEL_WIDTH, PANEL_HEIGHT = 4.4, 3.6
+
+
+def draw_groups(file: Path, plan: Plan, results: Sequence[Result]) -> bool:
+    """Write a PNG; False, and no file, where no group was measured."""
+    scenes = [scene for scene in plan.scenes if any(r.groups for r in results if r.scene == scene.name)]
+    if not scenes:
+        return False
+    rows = -(-len(plan.methods) // 3)
+    legend = 0.3 * rows + 0.25
+    width, height = 0.4 + (PANEL_WIDTH + 0.75) * len(scenes), PANEL_HEIGHT + 2.2 + legend
+    width = max(width, 7.5)
+    figure = Figure(figsize=(width, height), dpi=DPI)
+    canvas = FigureCanvasAgg(figure)
+    panel = (width - 0.4) / len(scenes) - 0.75
+    for index, scene in enumerate(scenes):
+        left = 0.85 + index * (panel + 0.75)
+        axes = figure.add_axes((left / width, (0.7 + legend) / height, panel / width, PANEL_HEIGHT / height))
+        _panel(axes, plan, [each for each in results if each.scene == scene.name], scene.title, index == 0)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower left", bbox_to_anchor=(0.75 / width, 0.1 / height), ncols=3,
+                  frameon=False, fontsize=9)  # fmt: skip
+    bars = "bars: standard deviation over seeds" if len(plan.seeds) > 1 else "one seed"
+    titles(figure, plan.table.title, "PSNR by how many training cameras see the place (raw, dB)",
+           f"the same pixels of all test views for every method; {bars}")  # fmt: skip
+    canvas.print_png(file)  # type: ignore[arg-type]
+    return True
+
+
+def _panel(axes: Axes, plan: Plan, results: Sequence[Result], title: str, first: bool) -> None:
+    groups = max((result.groups for result in results), key=len)
+    places = np.arange(len(groups), dtype=float)
+    others = 0
+    for index, method in enumerate(plan.methods):
+        ours = method.name == plan.table.ours
+        colour, marker = (ACCENT, "o") if ours else (COLOURS[others % 8], MARKERS[others % 8])
+        others += not ours
+        summaries = [_of(results, method.name, group) for group in range(len(groups))]
+        known = [(place, each) for place, each in zip(places, summaries, strict=True) if each is not None]
+        shift = 0.05 * (index - (len(plan.methods) - 1) / 2) if len(plan.seeds) > 1 else 0.0
+        axes.errorbar(
+            [place + shift for place, _ in known], [each.mean for _, each in known],
+            yerr=[each.spread or 0.0 for _, each in known] if len(plan.seeds) > 1 else None,
+            color=colour, marker=marker, markersize=5.5,
+            linewidth=2.2 if ours else 1.3, elinewidth=1.0, capsize=2.5, label=method.title, zorder=3 if ours else 2,
+        )  # fmt: skip
+    names = [
+        f"{name}\nV {group['lower']:.3g} to {group['upper']:.3g}"
+        for name, group in zip(group_names(len(groups)), groups, strict=True)
+    ]  # fmt: skip
+    axes.set_xticks(places, [name.replace(" seen ", "\nseen ") for name in names])
+    axes.set_title(title, fontsize=10.5, color=INK, loc="left")
+    axes.grid(axis="y", color=FAINT, alpha=0.18, linewidth=0.7)
+    if first:
+        axes.set_ylabel("PSNR, dB")
+    axes.margins(x=0.08, y=0.12)
+    plain(axes)
+    axes.tick_params(axis="x", labelsize=8)
+
+
+def _of(results: Sequence[Result], method: str, group: int) -> Summary | None:
+    return summarise(each.figures.get(f"psnr@{group}") for each in results if each.method == method)

@@ -1,0 +1,180 @@
+"""Results as grids of numbers: rows are methods, columns figures. How they are written is `writing.py`'s business."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from vdgs.bench.definitions import Group
+from vdgs.bench.measure import group_names
+from vdgs.bench.plan import Plan
+from vdgs.bench.quoted import COLUMNS, QUOTED
+from vdgs.bench.results import Result
+from vdgs.bench.statistics import Mark, Summary, marks, summarise
+
+
+@dataclass(frozen=True)
+class Column:
+    """A figure: `key` of `Result.figures`, shown times `factor`; `better`: +1 higher, -1 lower, 0 neither."""
+
+    title: str
+    key: str
+    digits: int = 2
+    better: int = 1
+    factor: float = 1.0
+    scene: str | None = None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A number, or none."""
+
+    summary: Summary | None
+    digits: int
+    mark: Mark = ""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method's numbers; a row without cells is a heading."""
+
+    label: str
+    cells: tuple[Cell, ...] = ()
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table with a name for files and machines and a title for people."""
+
+    name: str
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[Row, ...]
+    notes: tuple[str, ...] = ()
+
+
+QUALITY = (Column("PSNR ↑", "psnr"), Column("SSIM ↑", "ssim", 3), Column("LPIPS ↓", "lpips_vgg", 3, -1))
+CORRECTED = (
+    Column("PSNR ↑", "psnr_cc"), Column("SSIM ↑", "ssim_cc", 3), Column("LPIPS ↓", "lpips_vgg_cc", 3, -1),
+)  # fmt: skip
+COSTS = (
+    Column("iterations", "iterations", 0, 0),
+    Column("anchors", "anchors", 0, 0),
+    Column("blocks", "blocks", 0, 0),
+    Column("cameras a block", "cameras_per_block", 0, 0),
+    Column("training s", "seconds", 0, 0),
+    Column("longest block s", "longest_block_seconds", 0, 0),
+    Column("peak memory GB", "peak_memory_bytes", 2, 0, 1e-9),
+    Column("model MB", "model_bytes", 1, 0, 1e-6),
+    Column("frames/s", "fps", 0, 0),
+)
+
+
+def grids_of(plan: Plan, results: Sequence[Result]) -> list[Grid]:
+    """Quality raw and corrected over all scenes; by visibility and cost for each scene; the paper's own numbers."""
+    across = "mean ± standard deviation over seeds" if len(plan.seeds) > 1 else "one seed"
+    grids = [
+        _measured(plan, results, "raw", f"Test views, raw ({across})", _for_scenes(plan, QUALITY)),
+        _measured(plan, results, "corrected", f"Test views, colour-corrected ({across})", _for_scenes(plan, CORRECTED)),
+    ]
+    for scene in plan.scenes:
+        mine = [result for result in results if result.scene == scene.name]
+        columns, notes = _group_columns(mine, scene.name)
+        if columns:
+            title = f"{scene.title}: PSNR by visibility"
+            grids.append(_measured(plan, mine, f"visibility-{scene.name}", title, columns, notes))
+        columns = [Column(c.title, c.key, c.digits, c.better, c.factor, scene.name) for c in COSTS]
+        grids.append(_measured(plan, mine, f"costs-{scene.name}", f"{scene.title}: what each method got", columns))
+    quoted = _quoted(plan)
+    return grids + ([quoted] if quoted else [])
+
+
+def _for_scenes(plan: Plan, columns: Sequence[Column]) -> list[Column]:
+    several = len(plan.scenes) > 1
+    return [
+        Column(
+            f"{scene.title}: {c.title}" if several else c.title, c.key, c.digits, c.better, c.factor, scene.name
+        )
+        for scene in plan.scenes
+        for c in columns
+    ]  # fmt: skip
+
+
+def _group_columns(results: Sequence[Result], scene: str) -> tuple[list[Column], tuple[str, ...]]:
+    """PSNR of each group, least seen first, raw and corrected for the ends; how the groups are bounded."""
+    groups = next((result.groups for result in results if result.groups), ())
+    names = group_names(len(groups)) if groups else []
+    columns = [Column(f"{name} ↑", f"psnr@{index}", scene=scene) for index, name in enumerate(names)]
+    columns += [
+        Column(f"{names[index]}, corrected ↑", f"psnr_cc@{index}", scene=scene)
+        for index in sorted({0, len(names) - 1})
+        if names
+    ]
+    bounds = "; ".join(
+        f"{name}: {group['lower']:.3g} to {group['upper']:.3g}" for name, group in zip(names, groups, strict=True)
+    )
+    note = f"Training cameras that see the place drawn at a pixel, pooled over all test views: {bounds}."
+    return columns, (note,) if groups else ()
+
+
+def _measured(
+    plan: Plan, results: Sequence[Result], name: str, title: str, columns: Sequence[Column],
+    notes: tuple[str, ...] = (),
+) -> Grid:  # fmt: skip
+    """Rows in the order of the table's groups, marks within a group."""
+    titles = {method.name: method.title for method in plan.methods}
+    rows: list[Row] = []
+    shown = set()
+    # Methods that were asked for by name come in that order, unless the table has groups of its own.
+    headings = plan.table.groups or (Group("", tuple(titles)),)
+    for group in headings:
+        members = [method for method in group.methods if method in titles]
+        shown |= set(members)
+        rows += _rows_of_group(group.title, members, titles, results, columns)
+    extra = [method for method in titles if method not in shown]
+    rows += _rows_of_group("" if not rows else "others", extra, titles, results, columns) if extra else []
+    return Grid(name, title, tuple(column.title for column in columns), tuple(rows), notes)
+
+
+def _rows_of_group(
+    title: str, methods: Sequence[str], titles: dict[str, str], results: Sequence[Result], columns: Sequence[Column]
+) -> list[Row]:
+    table = [[_summary(results, method, column) for column in columns] for method in methods]
+    marked = [
+        marks([None if row[i] is None else row[i].mean for row in table], column.digits, column.better > 0)  # type: ignore[union-attr]
+        if column.better
+        else [""] * len(methods)
+        for i, column in enumerate(columns)
+    ]
+    rows = [Row(title)] if title and methods else []
+    for place, method in enumerate(methods):
+        cells = tuple(
+            Cell(table[place][i], column.digits, marked[i][place])  # type: ignore[arg-type]
+            for i, column in enumerate(columns)
+        )  # fmt: skip
+        rows.append(Row(titles[method], cells))
+    return rows
+
+
+def _summary(results: Sequence[Result], method: str, column: Column) -> Summary | None:
+    chosen: Callable[[Result], bool] = lambda each: each.method == method and each.scene == column.scene  # noqa: E731
+    values = [each.figures.get(column.key) for each in results if chosen(each)]
+    return summarise(None if value is None else column.factor * value for value in values)
+
+
+def _quoted(plan: Plan) -> Grid | None:
+    """The paper's numbers for its scenes; all of them, whichever scenes were run, so that they are never mixed up."""
+    rows = QUOTED.get(plan.table.name)
+    if not rows:
+        return None
+    scenes = list(dict.fromkeys(scene for row in rows.values() for scene in row))
+    columns = tuple(f"{scene}: {name}" for scene in scenes for name in COLUMNS)
+    made = []
+    for label, row in rows.items():
+        cells = [
+            Cell(Summary(row[scene][i], None, 1), 4 if digits == 4 and i else (2 if i == 0 else 3))
+            if scene in row else Cell(None, 2)
+            for scene in scenes for i, digits in enumerate([2, 4, 4] if plan.table.name == "table4" else [2, 3, 3])
+        ]  # fmt: skip
+        made.append(Row(label, tuple(cells)))
+    return Grid("quoted", "Quoted from the paper (its data, its hardware; not measured here)", columns, tuple(made))

@@ -1,0 +1,94 @@
+"""Every method measured on the same pixels by visibility.
+
+A run's own evaluation groups pixels by V as its own coarse model draws it; methods with other coarse models would then
+be compared on other pixels. Here one reference model of the scene says for every pixel of the test views how many
+training cameras see the place, and the pictures that each run left are measured against that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from vdgs.captures.images import ImageCache
+from vdgs.errors import VdgsError
+from vdgs.evaluation import metrics
+from vdgs.evaluation.by_visibility import VisibilityHistogram
+from vdgs.evaluation.colour import correct_colours
+from vdgs.evaluation.of_run import EVALUATION_IMAGES_BYTES, visibility_map
+from vdgs.evaluation.saving import file_stems, jsonable
+from vdgs.files import read_json, write_json
+from vdgs.stages.opening import open_run
+
+#: In a run folder: its figures by visibility, and the key of the reference and of the run that they hold for.
+GROUPS_FILE = "by_visibility.json"
+NAMES = ("squared_error", "ssim", "squared_error_cc", "ssim_cc")
+
+
+def measure_groups(reference: Path, runs: Mapping[Path, str], bins: int, tell: Callable[[str], None]) -> None:
+    """Write GROUPS_FILE into every run of a scene that has none for this reference and its key.
+
+    `runs`: folder -> key. The test views are read once for all. Raises VdgsError where a picture is missing.
+    """
+    opened = open_run(reference, "coarse")
+    wanted = {folder: {"reference": opened.status.get("key"), "run": key, "bins": bins} for folder, key in runs.items()}
+    left = [folder for folder, record in wanted.items() if not _is_measured(folder, record)]
+    if not left:
+        return
+    views, v_at = opened.capture.test_views, visibility_map(opened)
+    stems = file_stems([view.name for view in views])
+    histograms = {folder: VisibilityHistogram(NAMES) for folder in left}
+    with ImageCache(views, EVALUATION_IMAGES_BYTES) as images:
+        for index, view in enumerate(views):
+            tell(f"test view {index + 1} of {len(views)}")
+            photograph, seen = images.get(index), v_at(view.camera)
+            mask = None if photograph.mask is None else photograph.mask.numpy() > 0
+            for folder in left:
+                picture = _read_picture(folder / "evaluation" / "renders" / f"{stems[index]}.png")
+                histograms[folder].add(seen, pixel_values(picture, photograph.image.numpy(), mask), mask)
+    for folder in left:
+        write_json(folder / GROUPS_FILE, jsonable(wanted[folder] | {"groups": histograms[folder].bins(bins)}))
+
+
+def pixel_values(
+    picture: UInt8[np.ndarray, "h w 3"], photograph: UInt8[np.ndarray, "h w 3"], mask: np.ndarray | None
+) -> dict[str, np.ndarray]:
+    """Squared error and SSIM at every pixel [h, w], raw and after the colour correction."""
+    corrected = metrics.to_8bit(correct_colours(picture, photograph, mask).image)
+    return {
+        "squared_error": metrics.squared_error(picture, photograph),
+        "ssim": metrics.ssim_map(picture, photograph, mask),
+        "squared_error_cc": metrics.squared_error(corrected, photograph),
+        "ssim_cc": metrics.ssim_map(corrected, photograph, mask),
+    }
+
+
+def group_names(count: int) -> list[str]:
+    """What the groups are called, least seen first."""
+    part = {2: "half", 3: "third", 4: "quarter", 5: "fifth"}.get(count, f"1/{count}")
+    if count == 1:
+        return ["all pixels"]
+    between = [f"{part} {index + 1}" for index in range(1, count - 1)]
+    return [f"least seen {part}", *between, f"best seen {part}"]
+
+
+def _is_measured(folder: Path, record: Mapping[str, Any]) -> bool:
+    file = folder / GROUPS_FILE
+    if not file.exists():
+        return False
+    held = read_json(file)
+    return isinstance(held, dict) and all(held.get(name) == value for name, value in record.items())
+
+
+def _read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise VdgsError(
+            f"{path}: the rendered test view is missing or damaged. Measure again: vdgs eval {path.parents[2]}"
+        )
+    return np.ascontiguousarray(picture[..., ::-1])

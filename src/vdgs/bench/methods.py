@@ -1,0 +1,150 @@
+"""The methods: VDGS, its ablations, its parameter sweeps and the partitions of others.
+
+All share the anchor model, the loss and the block training of this package, and spend the same total of iterations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from vdgs.bench.definitions import COARSE_ONLY, Budget, Change, Method
+from vdgs.config import CompensationConfig, MethodConfig, PartitionStrategy
+
+LAMBDA_VIS = (0.0, 0.5, 1.0, 1.3)
+T_LOW = (0.05, 0.15, 0.20, 0.30)
+BETA_G = (0.5, 1.5, 2.0, 3.0)
+GAMMA = (0.80, 0.90, 0.95)
+BLOCKS = (1, 2, 4, 8, 16)
+
+
+def full(config: MethodConfig, _budget: Budget) -> MethodConfig:
+    return config
+
+
+def coarse_alone(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """All iterations in the coarse stage."""
+    return replace(config, training=replace(config.training, iterations=budget.total))
+
+
+def coarse_as_long(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """The coarse stage as long as one process takes when every block has its own: coarse + one block's iterations."""
+    return replace(config, training=replace(config.training, iterations=budget.coarse + budget.per_block))
+
+
+def without_blocking(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """One block of the whole scene, trained as long as all blocks together, with compensated growth."""
+    one = budget.shared_by(1)
+    return replace(
+        config,
+        partition=replace(config.partition, blocking=False, blocks=1),
+        block=replace(config.block, iterations=one.per_block),
+    )
+
+
+def without_anchor_generation(config: MethodConfig, _budget: Budget) -> MethodConfig:
+    """Blocks grow anchors as the coarse stage does."""
+    return _compensated(config, enabled=False)
+
+
+def in_blocks(count: int) -> Change:
+    """The same total of block iterations shared by `count` blocks."""
+
+    def change(config: MethodConfig, budget: Budget) -> MethodConfig:
+        if count == 1:
+            return without_blocking(config, budget)
+        return replace(
+            config,
+            partition=replace(config.partition, blocks=count),
+            block=replace(config.block, iterations=budget.shared_by(count).per_block),
+        )
+
+    return change
+
+
+def with_lambda_vis(value: float) -> Change:
+    return lambda config, _: replace(config, partition=replace(config.partition, lambda_vis=value))
+
+
+def with_t_low(value: float) -> Change:
+    """A fixed T_low, as in the paper: never the quantile that the preset `laptop` takes instead."""
+    return lambda config, _: _compensated(config, t_low=value, t_low_quantile=0.0)
+
+
+def with_beta_g(value: float) -> Change:
+    return lambda config, _: _compensated(config, beta_g=value)
+
+
+def with_gamma(value: float) -> Change:
+    return lambda config, _: _compensated(config, gamma=value)
+
+
+def partitioned_by(strategy: PartitionStrategy) -> Change:
+    """Another partition; growth is plain, since compensation is what VDGS adds."""
+
+    def change(config: MethodConfig, budget: Budget) -> MethodConfig:
+        plain = without_anchor_generation(config, budget)
+        return replace(plain, partition=replace(plain.partition, strategy=strategy))
+
+    return change
+
+
+def _compensated(config: MethodConfig, **values: float | bool) -> MethodConfig:
+    changed: CompensationConfig = replace(config.block.compensation, **values)  # type: ignore[arg-type]
+    return replace(config, block=replace(config.block, compensation=changed))
+
+
+def _sweep(prefix: str, symbol: str, values: tuple[float, ...], change: Callable[[float], Change]) -> list[Method]:
+    return [Method(f"{prefix}-{value:g}", f"{symbol} = {value:g}", change(value)) for value in values]
+
+
+#: What the partitions leave out beyond what `partition.strategies` says of each.
+_COMMON = (
+    "training schedule and losses of their own: blocks are trained as ours, with frozen decoder and plain growth",
+)
+_ABLATIONS = [
+    Method("full", "VDGS (full)", full, cites="VDGS, sections III-B and III-C"),
+    Method("baseline", "baseline: coarse alone", coarse_alone, COARSE_ONLY, cites="VDGS, Table II (a)"),
+    Method("coarse", "coarse stage, as blocks begin", full, COARSE_ONLY, less="iterations of the coarse stage only"),
+    Method(
+        "coarse-as-long",
+        "coarse alone, as long as one block",
+        coarse_as_long,
+        COARSE_ONLY,
+        less="iterations of the coarse stage and one block: as much time, if all blocks are trained at once",
+    ),
+    Method("no-blocking", "w/o blocking", without_blocking, cites="VDGS, Table II (b)"),
+    Method("no-anchor-generation", "w/o anchor generation", without_anchor_generation, cites="VDGS, Table II (c)"),
+]
+_OTHERS = [
+    Method(
+        "scaffold-gs", "Scaffold-GS", coarse_alone, COARSE_ONLY,
+        cites="Lu et al., Scaffold-GS: Structured 3D Gaussians for View-Adaptive Rendering, CVPR 2024",
+        leaves_out=("its starts, background and volume weight: they are those of our coarse stage",),
+    ),
+    Method(
+        "vastgaussian", "VastGaussian partition", partitioned_by("vastgaussian"),
+        cites="Lin et al., VastGaussian: Vast 3D Gaussians for Large Scene Reconstruction, CVPR 2024",
+        leaves_out=_COMMON,
+    ),
+    Method(
+        "citygaussian", "CityGaussian partition", partitioned_by("citygaussian"),
+        cites="Liu et al., CityGaussian: Real-time High-quality Large-Scale Scene Rendering with Gaussians, ECCV 2024",
+        leaves_out=_COMMON,
+    ),
+    Method(
+        "dogs", "DOGS partition", partitioned_by("dogs"),
+        cites="Chen and Lee, DOGS: Distributed-Oriented Gaussian Splatting via Gaussian Consensus, NeurIPS 2024",
+        leaves_out=_COMMON,
+    ),
+]  # fmt: skip
+_BLOCKS = [Method(f"blocks-{count}", f"{count} block{'s' * (count > 1)}", in_blocks(count)) for count in BLOCKS]
+_SWEEPS = [
+    *_sweep("lambda-vis", "λ_vis", LAMBDA_VIS, with_lambda_vis),
+    *_sweep("t-low", "T_low", T_LOW, with_t_low),
+    *_sweep("beta-g", "β_g", BETA_G, with_beta_g),
+    *_sweep("gamma", "γ", GAMMA, with_gamma),
+]
+
+#: Every method by name.
+METHODS: dict[str, Method] = {method.name: method for method in _ABLATIONS + _OTHERS + _BLOCKS + _SWEEPS}

@@ -1,0 +1,70 @@
+"""What a table's readers must know beside its numbers, as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from vdgs.bench.definitions import Method
+from vdgs.bench.plan import Plan
+from vdgs.bench.quoted import CONTRADICTIONS, EFFICIENCY, QUOTED
+from vdgs.bench.results import Result
+from vdgs.bench.verdict import Line
+from vdgs.bench.writing import escape_markdown as plain
+from vdgs.partition.strategies import STRATEGIES
+
+
+def notes_of(plan: Plan, results: Sequence[Result], lines: Sequence[Line], figure: bool) -> list[str]:
+    """Verdict, figure, fairness, failures, sources, scenes, and the paper's contradictions."""
+    parts = []
+    if lines:
+        parts.append(_list("Verdict", map(str, lines)))
+    if figure:
+        parts.append("![PSNR by visibility](groups.png)")
+    parts.append(_fairness(plan))
+    lost = [each for each in results if each.state != "done"]
+    if lost:
+        said = [f"{each.method} on {each.scene}, seed {each.seed}: {each.state}. {each.why}" for each in lost]
+        parts.append(_list("Missing", said))
+    parts.append(_list("Methods", map(_method, plan.methods)))
+    parts.append(_list("Scenes", [f"{scene.title}: {scene.note}" for scene in plan.scenes if scene.note]))
+    if plan.table.name in QUOTED:
+        parts.append(_list("The paper's own numbers", CONTRADICTIONS))
+    if plan.table.name == "efficiency":
+        parts.append(_list("Quoted from the paper", EFFICIENCY))
+    return [part for part in parts if part]
+
+
+def _fairness(plan: Plan) -> str:
+    said = [
+        "Same photographs, sparse points, split and total of iterations for all methods of a scene, but for rows of "
+        "which it is said below that they get less; where a cut gives fewer blocks than asked for, a method gets fewer "
+        "iterations, as its row says.",
+        "A coarse stage that several methods share is trained once; its time counts for each of them. Training time is "
+        "the sum over all blocks, as if one after the other; it depends on how many runs went at once (--jobs).",
+        "Groups by visibility are the same pixels for all methods and seeds: V is drawn with one coarse model of the "
+        "scene.",
+        "LPIPS is VGG with input in [-1, 1]; a dash means that no weights were given (--lpips-weights).",
+    ]
+    said += [
+        f"{scene.title}: {budget.coarse:,} coarse iterations and {budget.blocks} × {budget.per_block:,} for blocks, "
+        f"{budget.total:,} in all."
+        for scene in plan.scenes
+        for budget in [plan.budgets[scene.name]]
+    ]
+    return _list("What each method got", said)
+
+
+def _method(method: Method) -> str:
+    left = list(method.leaves_out)
+    strategy = STRATEGIES.get(method.name)
+    if strategy is not None:
+        left = [*strategy.leaves_out, *left]
+    text = f"{method.title} (`{method.name}`)" if not method.cites else f"{method.title} ({method.cites})"
+    if method.less:
+        text += f". Gets less: {method.less}"
+    return text + (f". Left out: {'; '.join(left)}" if left else "")
+
+
+def _list(title: str, lines: object) -> str:
+    items = [f"- {plain(str(line))}" for line in lines]  # type: ignore[attr-defined]
+    return "\n".join([f"## {title}", "", *items]) if items else ""

@@ -1,0 +1,161 @@
+"""From a table to the runs that it needs: one folder each, coarse stages shared where their settings are the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from vdgs.bench.definitions import Budget, Method, Scene, Table
+from vdgs.bench.methods import METHODS
+from vdgs.bench.scenes import SCENES
+from vdgs.bench.tables import TABLES
+from vdgs.config import MethodConfig, to_dict
+from vdgs.config_checks import validate
+from vdgs.errors import VdgsError
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What a person may change about a table without changing what is compared."""
+
+    seeds: int | None = None
+    scenes: tuple[str, ...] = ()
+    methods: tuple[str, ...] = ()
+    scale_iterations: float = 1.0
+    iterations_total: int | None = None
+    max_anchors: int = 0
+    validation: bool = False
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """A run folder to be filled."""
+
+    scene: str
+    method: str
+    seed: int
+    #: Relative to the output folder.
+    folder: Path
+    stages: tuple[str, ...]
+    config: MethodConfig
+    #: The run whose coarse stage this one takes over; None trains its own.
+    coarse_from: Path | None = None
+
+    @property
+    def name(self) -> str:
+        return str(self.folder.relative_to("runs"))
+
+    def key(self, capture: Mapping[str, Any], measured: Mapping[str, Any]) -> str:
+        """Changes with everything that the run's result depends on."""
+        content = [self.stages, to_dict(self.config), dict(capture), dict(measured)]
+        return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All runs of a table."""
+
+    table: Table
+    scenes: tuple[Scene, ...]
+    methods: tuple[Method, ...]
+    seeds: tuple[int, ...]
+    budgets: Mapping[str, Budget]
+    #: Coarse stages that several runs share, to be trained first.
+    coarse: tuple[PlannedRun, ...]
+    runs: tuple[PlannedRun, ...]
+    #: (scene, method, seed) -> the run that answers for it: methods with the same settings share one.
+    answers: Mapping[tuple[str, str, int], PlannedRun]
+
+    def reference(self, scene: str) -> PlannedRun:
+        """The run whose coarse model says how often each pixel of the scene is seen, for all methods and seeds."""
+        return next(run for run in self.coarse + self.runs if run.scene == scene)
+
+
+def make_plan(name: str, choices: Choices) -> Plan:
+    """Raises VdgsError for a scene or method that does not exist and for settings that do not work."""
+    table = TABLES[name]
+    scenes = tuple(_named(SCENES, each, "scene") for each in choices.scenes or table.scenes)
+    methods = tuple(_named(METHODS, each, "method") for each in choices.methods or table.methods)
+    seeds = table.seeds if choices.seeds is None else tuple(range(choices.seeds))
+    if not seeds:
+        raise VdgsError("--seeds must be at least 1")
+    budgets: dict[str, Budget] = {}
+    answers: dict[tuple[str, str, int], PlannedRun] = {}
+    coarse, runs = list[PlannedRun](), list[PlannedRun]()
+    for scene in scenes:
+        budgets[scene.name] = budget = _budget(scene, choices)
+        for seed in seeds:
+            base = _limited(scene.base(budget, seed, budget.total / scene.budget.total), choices)
+            planned = [_planned(scene, method, budget, base, seed) for method in methods]
+            shared, planned = _share_coarse(planned)
+            coarse += shared
+            taken: dict[str, PlannedRun] = {}
+            for run in planned:
+                same = taken.setdefault(run.key({}, {}), run)
+                answers[scene.name, run.method, seed] = same
+            runs += taken.values()
+    return Plan(table, scenes, methods, seeds, budgets, tuple(coarse), tuple(runs), answers)
+
+
+def _named(known: Mapping[str, Any], name: str, kind: str) -> Any:
+    if name not in known:
+        raise VdgsError(f"there is no {kind} {name!r}. There are: {', '.join(known)}")
+    return known[name]
+
+
+def _budget(scene: Scene, choices: Choices) -> Budget:
+    factor = choices.scale_iterations
+    if choices.iterations_total is not None:
+        factor = choices.iterations_total / scene.budget.total
+    if factor <= 0:
+        raise VdgsError("--scale-iterations and --iterations-total must be positive")
+    return scene.budget.scaled(factor)
+
+
+def _limited(config: MethodConfig, choices: Choices) -> MethodConfig:
+    """With --max-anchors: a scene may hold so many, a block its share of them."""
+    if not choices.max_anchors:
+        return config
+    training, block = config.training, config.block
+    return replace(
+        config,
+        training=replace(training, growth=replace(training.growth, max_anchors=choices.max_anchors)),
+        block=replace(block, growth=replace(block.growth, max_anchors=choices.max_anchors)),
+    )
+
+
+def _planned(scene: Scene, method: Method, budget: Budget, base: MethodConfig, seed: int) -> PlannedRun:
+    config = method.settings(base, budget)
+    if config.block.growth.max_anchors and config.partition.blocks != "auto":
+        share = -(-config.block.growth.max_anchors // config.partition.blocks)
+        config = replace(
+            config, block=replace(config.block, growth=replace(config.block.growth, max_anchors=share))
+        )  # fmt: skip
+    problems = validate(config)
+    if problems:
+        raise VdgsError(f"{method.name} on {scene.name}: these settings do not work:\n  " + "\n  ".join(problems))
+    return PlannedRun(scene.name, method.name, seed, Path("runs", scene.name, method.name, str(seed)), method.stages,
+                      config)  # fmt: skip
+
+
+def _share_coarse(planned: Sequence[PlannedRun]) -> tuple[list[PlannedRun], list[PlannedRun]]:
+    """The coarse stages that blocks begin with, as runs of their own, and the runs that take them over."""
+    shared: dict[str, PlannedRun] = {}
+    for run in planned:
+        digest = _coarse_digest(run)
+        if "blocks" in run.stages and digest not in shared:
+            folder = Path("runs", run.scene, f"shared-coarse-{digest}", str(run.seed))
+            shared[digest] = replace(run, method="coarse", folder=folder, stages=("coarse",))
+    taken = [
+        replace(run, coarse_from=shared[_coarse_digest(run)].folder) if _coarse_digest(run) in shared else run
+        for run in planned
+    ]
+    return list(shared.values()), taken
+
+
+def _coarse_digest(run: PlannedRun) -> str:
+    return hashlib.sha256(json.dumps(to_dict(run.config.training), sort_keys=True).encode()).hexdigest()[:8]

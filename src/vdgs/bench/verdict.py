@@ -1,0 +1,89 @@
+"""What the numbers say about the claim: better where few cameras look, not worse elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from vdgs.bench.plan import Plan
+from vdgs.bench.results import Result
+from vdgs.bench.statistics import Difference, difference, summarise
+
+#: dB by which the full method may fall behind where many cameras look, and on even flights.
+ALLOWED_DB = 0.1
+
+
+@dataclass(frozen=True)
+class Line:
+    """A question about a scene, its answer (None: cannot be said), and the numbers."""
+
+    scene: str
+    question: str
+    answer: bool | None
+    numbers: str
+
+    def __str__(self) -> str:
+        word = {True: "yes", False: "NO", None: "not known"}[self.answer]
+        return f"{self.scene}: {self.question}: {word} ({self.numbers})"
+
+
+def verdict(plan: Plan, results: Sequence[Result]) -> list[Line]:
+    """For each scene with the full method: uneven ones by group, even ones against the best."""
+    lines = []
+    ours = plan.table.ours
+    titles = {method.name: method.title for method in plan.methods}
+    for scene in plan.scenes:
+        mine = [result for result in results if result.scene == scene.name]
+        others = [name for name in titles if name != ours and not _same_runs(plan, scene.name, ours, name)]
+        if ours not in titles or not others:
+            continue
+        if scene.uneven:
+            lines += [line for other in others for line in _uneven(scene.title, mine, ours, other, titles)]
+        else:
+            lines.append(_even(scene.title, mine, ours, titles))
+    return lines
+
+
+def _same_runs(plan: Plan, scene: str, ours: str, other: str) -> bool:
+    """Two rows of a sweep may have the same settings: nothing is to be compared."""
+    return all(plan.answers.get((scene, ours, s)) == plan.answers.get((scene, other, s)) for s in plan.seeds)
+
+
+def _uneven(scene: str, results: Sequence[Result], ours: str, other: str, titles: dict[str, str]) -> list[Line]:
+    groups = next((len(result.groups) for result in results if result.groups), 0)
+    least = _difference(results, ours, other, "psnr@0")
+    best = _difference(results, ours, other, f"psnr@{groups - 1}")
+    name = f"{titles[ours]} against {titles[other]}"
+    if groups == 0 or least is None or best is None:
+        return [Line(scene, name, None, "no common results")]
+    fine = best.mean >= -ALLOWED_DB
+    return [
+        Line(scene, f"{name}, better where least seen by more than the spread", least.beyond_spread, _numbers(least)),
+        Line(scene, f"{name}, at most {ALLOWED_DB} dB below where best seen", fine, _numbers(best)),
+    ]
+
+
+def _even(scene: str, results: Sequence[Result], ours: str, titles: dict[str, str]) -> Line:
+    means = {name: summarise(_by_seed(results, name, "psnr").values()) for name in titles}
+    known = {name: each.mean for name, each in means.items() if each is not None}
+    question = f"{titles[ours]} within {ALLOWED_DB} dB of the best (even coverage)"
+    if ours not in known or len(known) < 2:
+        return Line(scene, question, None, "no results to compare")
+    best = max(known, key=lambda name: known[name])
+    behind = known[best] - known[ours]
+    return Line(
+        scene, question, behind <= ALLOWED_DB, f"{known[ours]:.2f} dB, best {titles[best]} {known[best]:.2f} dB"
+    )
+
+
+def _difference(results: Sequence[Result], ours: str, other: str, key: str) -> Difference | None:
+    return difference(_by_seed(results, ours, key), _by_seed(results, other, key))
+
+
+def _by_seed(results: Sequence[Result], method: str, key: str) -> dict[int, float | None]:
+    return {result.seed: result.figures.get(key) for result in results if result.method == method}
+
+
+def _numbers(each: Difference) -> str:
+    spread = "one seed, spread unknown" if each.spread is None else f"spread {each.spread:.2f}, {each.seeds} seeds"
+    return f"{each.mean:+.2f} dB, {spread}"

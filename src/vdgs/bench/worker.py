@@ -1,0 +1,184 @@
+"""One run of a table, in a process of its own: `python -m vdgs.bench.worker JOB.json`.
+
+Its folder is an ordinary run: the verbs `partition`, `train`, `merge`, `eval`, `render` and `report` work on it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vdgs.config import MethodConfig, from_dict
+from vdgs.errors import VdgsError
+from vdgs.files import read_json, write_json
+
+#: In the run folder: state, key, why, seconds of each stage.
+RECORD = "bench.json"
+
+
+@dataclass(frozen=True)
+class Job:
+    """What the file says."""
+
+    capture: Path
+    options: dict[str, Any]
+    method: dict[str, Any]
+    stages: tuple[str, ...]
+    output: Path
+    coarse_from: Path | None
+    key: str
+    lpips_weights: Path | None
+    bins: int
+    threads: int
+    block_jobs: int
+    redo: bool = False
+
+    def write(self, path: Path) -> None:
+        write_json(path, {name: _plain(value) for name, value in vars(self).items()})
+
+    @staticmethod
+    def read(path: Path) -> Job:
+        values = read_json(path)
+        for name in ("capture", "output", "coarse_from", "lpips_weights"):
+            values[name] = None if values[name] is None else Path(values[name])
+        return Job(**values | {"stages": tuple(values["stages"])})
+
+
+@dataclass(frozen=True)
+class _Working:
+    """What the stages work with."""
+
+    job: Job
+    run: Any
+    capture: Any
+    console: Any
+
+
+def _coarse(at: _Working) -> None:
+    from vdgs.run_options import WatchOptions
+    from vdgs.stages.coarse import train_coarse
+
+    if at.job.coarse_from is not None:
+        take_coarse(at.job.coarse_from, at.job.output)
+    train_coarse(at.run, at.capture, WatchOptions(), at.console)
+
+
+def _partition(at: _Working) -> None:
+    from vdgs.stages.partition import measure_visibility, partition_run
+
+    measure_visibility(at.run, at.console)
+    partition_run(at.run, at.console)
+
+
+def _blocks(at: _Working) -> None:
+    from vdgs.run_options import WatchOptions
+    from vdgs.stages.train import train_blocks
+
+    train_blocks(at.run.path, WatchOptions(), at.job.block_jobs, at.console)
+
+
+def _merge(at: _Working) -> None:
+    from vdgs.stages.merge import merge_run
+
+    merge_run(at.run.path, False, at.console)
+
+
+def _evaluate(at: _Working) -> None:
+    from vdgs.stages.evaluate import evaluate_stage
+
+    evaluate_stage(at.run.path, "best", at.job.lpips_weights, at.job.bins, at.console)
+
+
+#: What a method may name as its stages. Each does nothing, or the same again, where it is done.
+STAGES: dict[str, Callable[[_Working], None]] = {
+    "coarse": _coarse, "partition": _partition, "blocks": _blocks, "merge": _merge, "evaluate": _evaluate,
+}  # fmt: skip
+
+
+def take_coarse(source: Path, target: Path) -> None:
+    """Give a run the finished coarse stage of another with the same settings; the model is linked, not copied.
+
+    Raises VdgsError if the other run has none. The keys of both are the same because the settings are; were they not,
+    the coarse stage would be trained again.
+    """
+    if (target / "coarse" / "model.safetensors").exists():
+        return
+    if not (source / "coarse" / "model.safetensors").exists():
+        raise VdgsError(f"{source}: the coarse stage that this run shares is not there")
+    partial = target / f".coarse.{os.getpid()}"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    for name in ("status.json", "log.jsonl"):
+        if (source / "coarse" / name).exists():
+            shutil.copy2(source / "coarse" / name, partial / name)
+    model = source / "coarse" / "model.safetensors"
+    try:
+        os.link(model, partial / model.name)
+    except OSError:  # another disk, or one without links
+        shutil.copy2(model, partial / model.name)
+    shutil.rmtree(target / "coarse", ignore_errors=True)
+    partial.rename(target / "coarse")
+    shutil.copy2(source / "capture.json", target / "capture.json")
+
+
+def work(job: Job) -> None:
+    """All stages of a job, noting how long each took; the record says done only at the end."""
+    import torch
+    from rich.console import Console
+
+    from vdgs.kernels.native.module import set_threads
+    from vdgs.stages.coarse import begin_run
+    from vdgs.stages.opening import options_from
+
+    set_threads(job.threads)
+    torch.set_num_threads(job.threads)
+    console = Console(soft_wrap=True)
+    options = options_from(job.options, job.output)
+    method = from_dict(MethodConfig, job.method)
+    run, capture = begin_run(job.capture, job.output, options, method, redo=job.redo)
+    working = _Working(job, run, capture, console)
+    record = _record(job)
+    for name in job.stages:
+        began = time.monotonic()
+        STAGES[name](working)
+        record["seconds"][name] = record["seconds"].get(name, 0.0) + time.monotonic() - began
+        write_json(job.output / RECORD, record)
+    write_json(job.output / RECORD, record | {"state": "done"})
+
+
+def _record(job: Job) -> dict[str, Any]:
+    """What is noted so far for the same key, so that the time of an interrupted run adds up."""
+    file = job.output / RECORD
+    before = read_json(file) if file.exists() else {}
+    seconds = before.get("seconds", {}) if before.get("key") == job.key else {}
+    return {"state": "running", "key": job.key, "seconds": seconds}
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, Path) else value
+
+
+def main(arguments: list[str]) -> int:
+    """Exit codes as those of the command line: 0 done, 1 explained, 130 stopped."""
+    from vdgs.executors.parent import stop_when_parent_dies
+
+    stop_when_parent_dies()
+    try:
+        work(Job.read(Path(arguments[0])))
+    except VdgsError as error:
+        print(f"vdgs bench: {error}", file=sys.stderr)
+        return 130 if getattr(error, "stopped", False) else 1
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    sys.exit(main(sys.argv[1:]))

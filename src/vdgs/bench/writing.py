@@ -1,0 +1,109 @@
+"""Grids as Markdown, LaTeX and CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Sequence
+
+from vdgs.bench.grids import Cell, Grid
+
+_LATEX = {
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
+    "±": r"$\pm$", "×": r"$\times$", "≥": r"$\geq$", "≤": r"$\leq$", "−": r"$-$", "–": "--", "↑": r"$\uparrow$",
+    "↓": r"$\downarrow$", "λ": r"$\lambda$", "β": r"$\beta$", "γ": r"$\gamma$",
+}  # fmt: skip
+#: Symbols of the paper with a subscript.
+_SYMBOLS = {
+    "λ_vis": r"$\lambda_{\mathrm{vis}}$", "T_low": r"$T_{\mathrm{low}}$", "β_g": r"$\beta_g$",
+}  # fmt: skip
+
+
+def escape_markdown(text: str) -> str:
+    """Plain text for a cell or a paragraph: nothing in it is markup, and a bar does not end the cell."""
+    return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", text.replace("\n", " "))
+
+
+def escape_latex(text: str) -> str:
+    """Plain text for LaTeX; the paper's symbols become mathematics."""
+    parts = re.split("(" + "|".join(_SYMBOLS) + ")", text.replace("\n", " "))
+    return "".join(_SYMBOLS.get(part) or "".join(_LATEX.get(letter, letter) for letter in part) for part in parts)
+
+
+def number(cell: Cell) -> str:
+    """`24.03 ± 0.05`; the dash stands for unknown."""
+    if cell.summary is None:
+        return "–"
+    text = f"{cell.summary.mean:,.{cell.digits}f}".replace(",", "\u202f")
+    spread = cell.summary.spread
+    return text if spread is None else f"{text} ± {spread:.{cell.digits}f}"
+
+
+def markdown(grids: Sequence[Grid], heading: str, paragraphs: Sequence[str]) -> str:
+    """A document: heading, the grids, and paragraphs (already Markdown)."""
+    parts = [f"# {escape_markdown(heading)}", *(_markdown_grid(grid) for grid in grids), *paragraphs]
+    return "\n\n".join(parts) + "\n"
+
+
+def latex(grids: Sequence[Grid]) -> str:
+    """One `table` for each grid; they need the package booktabs."""
+    return "% Made by `vdgs bench`. Needs \\usepackage{booktabs}.\n\n" + "\n\n".join(map(_latex_grid, grids)) + "\n"
+
+
+def tidy_csv(grids: Sequence[Grid]) -> str:
+    """One line for each number: grid, group, row, column, mean, spread, seeds, mark."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(["grid", "group", "row", "column", "mean", "spread", "seeds", "mark"])
+    for grid in grids:
+        group = ""
+        for row in grid.rows:
+            if not row.cells:
+                group = row.label
+            for column, cell in zip(grid.columns, row.cells, strict=bool(row.cells)):
+                if cell.summary is not None:
+                    spread = "" if cell.summary.spread is None else repr(cell.summary.spread)
+                    writer.writerow([grid.name, group, row.label, column, repr(cell.summary.mean), spread,
+                                     cell.summary.count, cell.mark])  # fmt: skip
+    return file.getvalue()
+
+
+def _markdown_grid(grid: Grid) -> str:
+    lines = [f"## {escape_markdown(grid.title)}", ""]
+    lines.append("| method | " + " | ".join(map(escape_markdown, grid.columns)) + " |")
+    lines.append("|---|" + "---:|" * len(grid.columns))
+    for row in grid.rows:
+        if row.cells:
+            lines.append(f"| {escape_markdown(row.label)} | " + " | ".join(map(_markdown_cell, row.cells)) + " |")
+        else:
+            lines.append(f"| *{escape_markdown(row.label)}* |" + " |" * len(grid.columns))
+    for note in grid.notes:
+        lines += ["", escape_markdown(note)]
+    return "\n".join(lines)
+
+
+def _markdown_cell(cell: Cell) -> str:
+    text = number(cell)
+    return {"best": f"**{text}**", "second": f"<u>{text}</u>", "": text}[cell.mark]
+
+
+def _latex_grid(grid: Grid) -> str:
+    lines = [r"\begin{table}[htbp]", r"\centering", rf"\caption{{{escape_latex(grid.title)}}}"]
+    lines.append(rf"\label{{tab:{re.sub('[^a-z0-9-]', '-', grid.name.lower())}}}")
+    lines += [r"\begin{tabular}{l" + "r" * len(grid.columns) + "}", r"\toprule"]
+    lines += [" & ".join(["method", *map(escape_latex, grid.columns)]) + r" \\", r"\midrule"]
+    for row in grid.rows:
+        if row.cells:
+            lines.append(" & ".join([escape_latex(row.label), *map(_latex_cell, row.cells)]) + r" \\")
+        else:
+            lines.append(rf"\multicolumn{{{len(grid.columns) + 1}}}{{l}}{{\textit{{{escape_latex(row.label)}}}}} \\")
+    lines += [r"\bottomrule", r"\end{tabular}"]
+    lines += [rf"\par\smallskip {escape_latex(note)}" for note in grid.notes]
+    return "\n".join([*lines, r"\end{table}"])
+
+
+def _latex_cell(cell: Cell) -> str:
+    text = escape_latex(number(cell)).replace("\u202f", r"\,")
+    return {"best": rf"\textbf{{{text}}}", "second": rf"\underline{{{text}}}", "": text}[cell.mark]
