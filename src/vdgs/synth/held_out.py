@@ -1,7 +1,8 @@
 """Test and validation photographs: all over the place that the flight saw, its poorly seen parts included.
 
 Every n-th photograph of a flight lies where the flight is dense. These are taken besides the flight instead: the
-surface that it truly sees is cut into as many parts of like area as views are wanted, and one photograph is aimed at each.
+surface that it truly sees is cut into as many parts of like area as views are wanted, and one photograph is aimed at
+each.
 """
 
 from __future__ import annotations

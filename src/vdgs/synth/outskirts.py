@@ -98,7 +98,7 @@ def _orchard(site: Site, plot: Plot) -> None:
         for b in np.arange(-plot.depth / 2 + 3, plot.depth / 2 - 2, 5.2):
             if site.rng.random() < 0.92:
                 frame = site.frame(plot, a + site.rng.normal(0, 0.2), b + site.rng.normal(0, 0.2))
-                tree(site.builder, frame, site.rng, kind, site.rng.uniform(3.0, 3.9), fine=False)
+                tree(site.builder, frame, site.rng, kind, site.rng.uniform(3.0, 3.9), detail=2)
 
 
 def _woods(site: Site, plot: Plot) -> None:
@@ -109,7 +109,7 @@ def _woods(site: Site, plot: Plot) -> None:
             if site.rng.random() < 0.85:
                 da, db = site.rng.normal(0, 1.0, 2)
                 kind = str(site.rng.choice(["round", "round", "conifer", "bush"]))
-                tree(site.builder, site.frame(plot, a + da, b + db), site.rng, kind, fine=False)
+                tree(site.builder, site.frame(plot, a + da, b + db), site.rng, kind, detail=2)
 
 
 def _lavender(site: Site, plot: Plot) -> None:
@@ -153,7 +153,7 @@ def _shore(site: Site, plot: Plot) -> None:
 
 def _line_of_trees(site: Site, plot: Plot, a: float, kind: str) -> None:
     for b in np.arange(-plot.depth / 2 + 3, plot.depth / 2 - 2, 6.0):
-        tree(site.builder, site.frame(plot, a, b), site.rng, kind, fine=False)
+        tree(site.builder, site.frame(plot, a, b), site.rng, kind, detail=2)
 
 
 def on_street(site: Site, x: float, y: float) -> bool:
@@ -176,4 +176,4 @@ def scatter_trees(site: Site, half_extent: float, count: int) -> None:
             if wet or site.zones.at(*here)[0] != Zone.OPEN or on_street(site, a, b):
                 continue
             p, q = site.plan.to_plan(*here)
-            tree(site.builder, site.frame(Plot(float(p[0]), float(q[0]), 1, 1)), rng, kind, fine=False)
+            tree(site.builder, site.frame(Plot(float(p[0]), float(q[0]), 1, 1)), rng, kind, detail=2)

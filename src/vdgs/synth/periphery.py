@@ -14,7 +14,7 @@ from vdgs.synth.terrain import Pond
 from vdgs.synth.trees import tree
 from vdgs.synth.zones import Zone
 
-_HAMLETS, _WOODS = 14, 26
+_HAMLETS, _WOODS = 12, 18
 #: From here (m beyond the half extent) to so many half extents, at most so many metres.
 _MARGIN, _REACH, _FARTHEST = 130.0, 5.0, 1300.0
 
@@ -61,7 +61,7 @@ def _hamlet(site: Site, x: float, y: float) -> None:
         for _ in range(2):
             c, e = a + rng.normal(0, 9), b + rng.normal(0, 9)
             if np.hypot(c - a, e - b) > 7 and _free(site, c, e):
-                tree(site.builder, _stand(site, c, e), rng, str(rng.choice(["round", "bush"])), fine=False)
+                tree(site.builder, _stand(site, c, e), rng, str(rng.choice(["round", "bush"])), detail=1)
 
 
 def _plain_house(site: Site, frame: Frame) -> None:
@@ -80,11 +80,11 @@ def _wood(site: Site, x: float, y: float) -> None:
     """A stand of trees, dense in the middle."""
     rng = site.rng
     kind = str(rng.choice(["round", "conifer"]))
-    size = rng.uniform(9, 20)
-    for _ in range(int(rng.integers(25, 55))):
+    size = rng.uniform(8, 17)
+    for _ in range(int(rng.integers(18, 40))):
         a, b = x + rng.normal(0, size), y + rng.normal(0, size)
         if _free(site, a, b):
-            tree(site.builder, _stand(site, a, b), rng, kind, fine=False)
+            tree(site.builder, _stand(site, a, b), rng, kind, detail=1)
 
 
 def _shore(site: Site, lake: Pond) -> None:
@@ -96,4 +96,4 @@ def _shore(site: Site, lake: Pond) -> None:
         away = rng.uniform(3.0, 12.0)
         x, y = lake.x + (lake.rx + away) * np.cos(angle), lake.y + (lake.ry + away) * np.sin(angle)
         if _free(site, x, y):
-            tree(site.builder, _stand(site, x, y), rng, str(rng.choice(["round", "bush", "poplar"])), fine=False)
+            tree(site.builder, _stand(site, x, y), rng, str(rng.choice(["round", "bush", "poplar"])), detail=1)
