@@ -222,6 +222,32 @@ def test_test_lists_and_every_nth(folder, scene, tmp_path):
         load_capture(folder, up(test_list=listed))
 
 
+def test_a_capture_may_bring_its_own_lists(folder, scene):
+    names = sorted(scene.cameras)
+    (folder / "test.txt").write_text(f"{names[2]}\n{names[9]}\n")
+    (folder / "validation.txt").write_text(f"{names[4]}\n{names[5]}\n")
+    tested, validated = load_capture(folder, UP), load_capture(folder, up(validation=True))
+    assert [view.name for view in tested.test_views] == [names[2], names[9]]
+    assert [view.name for view in validated.test_views] == names[4:6]
+    training = [view.name for view in tested.train_views]
+    assert training == [view.name for view in validated.train_views]
+    assert training == [name for name in names if name not in {names[k] for k in (2, 4, 5, 9)}]
+    # a list of one's own replaces the capture's; every n-th ignores both lists
+    (folder / "mine.txt").write_text(names[4])
+    mine = load_capture(folder, up(test_list=folder / "mine.txt"))
+    assert [view.name for view in mine.test_views] == [names[4]]
+    assert names[5] not in {view.name for view in mine.views}
+    every = load_capture(folder, up(split="every", test_every=4))
+    assert [view.name for view in every.test_views] == names[::4]
+    assert len(every.views) == len(names)
+
+
+def test_lists_may_name_photographs_that_max_images_leaves_out(folder, scene):
+    (folder / "test.txt").write_text("\n".join(sorted(scene.cameras)[::2]))
+    whole, part = load_capture(folder, UP), load_capture(folder, up(max_images=8))
+    assert {view.name for view in part.test_views} < {view.name for view in whole.test_views}
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -21,13 +21,14 @@ class CaptureOptions:
     test_every: int = 8
     """Every n-th photograph in name order is kept for testing (0, n, 2n, ...), as in 3DGS (llffhold)."""
     test_list: Path | None = None
-    """Text file with the names of the test photographs, one a line."""
+    """Text file with the names of the test photographs, one a line. Default: test.txt in the capture folder, if any."""
     split: SplitMode = "auto"
     """auto: the capture's own split or test list where there is one, else every n-th;
     explicit: insist on it; every: always every n-th."""
     validation: bool = False
-    """Leave the test photographs out altogether and test on every n-th training photograph instead: for choosing
-    settings without looking at the test set."""
+    """Leave the test photographs out altogether and test on those named in validation.txt of the capture folder
+    instead, or where there is none on every n-th training photograph: for choosing settings without looking at the
+    test set. Photographs named in validation.txt never train."""
     up: UpAxis = "auto"
     """Which axis of the capture's own world points up. auto: georeference, GPS, or estimated."""
     gps: Path | None = None

@@ -1,4 +1,8 @@
-"""Which photographs train and which test."""
+"""Which photographs train and which test.
+
+A capture may bring its own lists, `test.txt` and `validation.txt` beside its photographs' folder, one name a line.
+Photographs of either list never train; those of `validation.txt` are used with `--validation` only.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,9 @@ from vdgs.captures.photographs import Names
 from vdgs.captures.source import listing
 from vdgs.errors import CaptureError
 
+#: Lists that a capture may bring, in its root folder.
+TEST_LIST, VALIDATION_LIST = "test.txt", "validation.txt"
+
 
 def nearest_to_middle(views: list[View], count: int) -> list[View]:
     """The `count` views nearest to the median camera centre: a compact patch keeps its overlap."""
@@ -26,23 +33,19 @@ def nearest_to_middle(views: list[View], count: int) -> list[View]:
 def choose_splits(
     root: Path, views: list[View], explicit: Mapping[str, Split | None], options: CaptureOptions
 ) -> list[View]:
-    """The views in name order, each with its split. Raises `CaptureError` if a side stays empty."""
+    """The views in name order, each with its split, without those that are kept for the other purpose.
+
+    `explicit` names every photograph of the capture (`views` may be some of them) with the split that its format
+    gives it. Raises `CaptureError` if a side stays empty or a list names what is no photograph.
+    """
     views = sorted(views, key=lambda view: view.name)
-    own = all(explicit.get(view.name) is not None for view in views)
-    if options.test_list is not None and options.split != "every":
-        tests = _listed(options.test_list, views)
-        splits: list[Split] = ["test" if view.name in tests else "train" for view in views]
-    elif own and options.split != "every":
-        splits = ["test" if explicit[view.name] == "test" else "train" for view in views]
-    elif options.split == "explicit":
-        raise CaptureError(
-            f"{root}: --split explicit, but the capture brings no split of its own (train/ and val/ "
-            "folders). Name the test photographs with --test-list, or use --split every."
-        )
-    else:
-        splits = ["test" if index % options.test_every == 0 else "train" for index in range(len(views))]
+    names = Names({name: root / name for name in explicit})
+    splits = _splits(root, views, explicit, options, names)
     chosen = [replace(view, split=split) for view, split in zip(views, splits, strict=True)]
-    if options.validation:
+    own = root / VALIDATION_LIST
+    if own.is_file() and options.split != "every":
+        chosen = _with_validation_list(chosen, _listed(own, names), options.validation)
+    elif options.validation:
         kept = [view for view in chosen if view.split == "train"]
         chosen = [replace(v, split="train" if i % options.test_every else "test") for i, v in enumerate(kept)]
     for side in ("train", "test"):
@@ -54,19 +57,48 @@ def choose_splits(
     return chosen
 
 
-def _listed(file: Path, views: list[View]) -> set[str]:
-    """The names of views in a text file, one a line; extensions and case may differ."""
+def _splits(
+    root: Path, views: list[View], explicit: Mapping[str, Split | None], options: CaptureOptions, names: Names
+) -> list[Split]:
+    """The split of each view: by the list asked for, the capture's list, its format, or every n-th."""
+    listed = options.test_list
+    if listed is None and (root / TEST_LIST).is_file():
+        listed = root / TEST_LIST
+    if options.split != "every":
+        if listed is not None:
+            tests = _listed(listed, names)
+            return ["test" if view.name in tests else "train" for view in views]
+        if all(explicit.get(view.name) is not None for view in views):
+            return ["test" if explicit[view.name] == "test" else "train" for view in views]
+    if options.split == "explicit":
+        raise CaptureError(
+            f"{root}: --split explicit, but the capture brings no split of its own (train/ and val/ "
+            f"folders, or {TEST_LIST}). Name the test photographs with --test-list, or use --split every."
+        )
+    return ["test" if index % options.test_every == 0 else "train" for index in range(len(views))]
+
+
+def _with_validation_list(views: list[View], listed: set[str], validation: bool) -> list[View]:
+    """Leave the listed photographs out; or, for validation, test on them and leave the test photographs out."""
+    held_out = {view.name for view in views if view.split == "test"}
+    if not validation:
+        return [view for view in views if view.name in held_out or view.name not in listed]
+    kept = [view for view in views if view.name not in held_out]
+    return [replace(view, split="test" if view.name in listed else "train") for view in kept]
+
+
+def _listed(file: Path, names: Names) -> set[str]:
+    """The photographs named in a text file, one a line; extensions and case may differ."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise CaptureError(f"{file}: cannot be read ({error}).") from None
     wanted = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
-    names = Names({view.name: view.image_path for view in views})
     found = {name: names.find(name) for name in wanted}
     unknown = [name for name, match in found.items() if match is None]
     if unknown:
         raise CaptureError(
             f"{file}: {len(unknown)} of its names are not photographs of this capture. "
-            f"Write one image name a line.{listing(unknown)}"
+            f"Write one image name a line, or ignore lists with --split every.{listing(unknown)}"
         )
     return {match for match in found.values() if match is not None}

@@ -7,8 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vdgs.synth.options import SynthOptions
+
+if TYPE_CHECKING:
+    from vdgs.synth.imbalance import FlightImbalance
 
 __all__ = ["SynthOptions", "generate"]
 
@@ -17,13 +21,14 @@ def generate(
     output: Path,
     options: SynthOptions | None = None,
     progress: Callable[[str, int, int], None] | None = None,
-) -> None:
+) -> FlightImbalance:
     """Build a town, fly over it and write a COLMAP capture to `output` (which must not hold anything yet).
 
+    Returns how unevenly the flight sees the place.
     `progress(stage, done, total)` is called as the work goes on. The same options give the same bytes.
     Raises VdgsError where the extra `synth` is not installed, an option makes no capture, or `output`
     holds something already.
     """
     from vdgs.synth.generation import generate as run
 
-    run(Path(output), options or SynthOptions(), progress)
+    return run(Path(output), options or SynthOptions(), progress)

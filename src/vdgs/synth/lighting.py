@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import cv2
@@ -18,8 +19,11 @@ SKY_COLOUR = np.array([0.46, 0.62, 0.92], np.float32)
 BOUNCE_COLOUR = np.array([0.26, 0.24, 0.17], np.float32)
 HORIZON_COLOUR = np.array([0.80, 0.88, 0.98], np.float32)
 
-_CELL = 0.5
+#: Side of a cell (m), twice that on maps larger than `_LARGE` (m from the middle).
+_CELL, _LARGE = 0.5, 300.0
 _RAYS = 32
+#: Places worked on at a time.
+_AT_ONCE = 1 << 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,11 +32,12 @@ class SkyMap:
 
     openness: np.ndarray
     half_size: float
+    cell: float
 
     def at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Openness at world places by bilinear interpolation, [n] float32."""
-        u = ((x + self.half_size) / _CELL - 0.5).astype(np.float32)
-        v = ((y + self.half_size) / _CELL - 0.5).astype(np.float32)
+        u = ((x + self.half_size) / self.cell - 0.5).astype(np.float32)
+        v = ((y + self.half_size) / self.cell - 0.5).astype(np.float32)
         mapped = cv2.remap(
             self.openness, u[:, None], v[:, None], cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT, borderValue=1.0,
@@ -49,27 +54,39 @@ def _remap_long(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return mapped.ravel()[: mapped.size - padded]
 
 
-def sky_map(tracer: Tracer, terrain: Terrain, zones: ZoneMap, half_size: float) -> SkyMap:
+def sky_map(tracer: Tracer, terrain: Terrain, zones: ZoneMap, half_size: float, pool: Executor) -> SkyMap:
     """Cast cosine-distributed rays from the ground; what lies inside buildings is filled from around."""
-    side = int(np.ceil(2 * half_size / _CELL))
-    axis = (np.arange(side) + 0.5) * _CELL - half_size
+    cell = _CELL if half_size < _LARGE else 2 * _CELL
+    side = int(np.ceil(2 * half_size / cell))
+    axis = (np.arange(side) + 0.5) * cell - half_size
     x, y = (a.ravel() for a in np.meshgrid(axis, axis))
-    z = terrain.height(x, y)
-    origins = np.stack([x, y, z + 0.15], 1).astype(np.float32)
+
+    def free(start: int) -> np.ndarray:
+        part = slice(start, start + _AT_ONCE)
+        return _openness(tracer, terrain, x[part], y[part], np.arange(len(x))[part])
+
+    openness = np.concatenate(list(pool.map(free, range(0, len(x), _AT_ONCE)))).reshape(side, side)
+    open_air = (zones.at(x, y) != Zone.BUILDING).reshape(side, side).astype(np.float32)
+    blur = 0.55 / cell
+    blurred = cv2.GaussianBlur(openness * open_air, (0, 0), blur)
+    weight = cv2.GaussianBlur(open_air, (0, 0), blur)
+    filled = np.where(weight > 0.02, blurred / np.maximum(weight, 0.02), 0.6).astype(np.float32)
+    return SkyMap(filled, half_size, cell)
+
+
+def _openness(tracer: Tracer, terrain: Terrain, x: np.ndarray, y: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Share of the rays from the ground at x, y [n] that meet nothing within 30 m; `index` turns their pattern."""
+    origins = np.stack([x, y, terrain.height(x, y) + 0.15], 1).astype(np.float32)
     free = np.zeros(len(x), np.float32)
     golden = np.pi * (3 - 5**0.5)
-    turn = 2 * np.pi * ((np.arange(len(x)) * 0.7548776662) % 1)
+    turn = 2 * np.pi * ((index * 0.7548776662) % 1)
     for k in range(_RAYS):
         radius, angle = np.sqrt((k + 0.5) / _RAYS), k * golden + turn
         directions = np.stack(
             [radius * np.cos(angle), radius * np.sin(angle), np.full(len(x), np.sqrt(1 - radius**2))], 1
         )
         free += ~tracer.occluded(origins, directions.astype(np.float32), np.full(len(x), 30.0))
-    openness = (free / _RAYS).reshape(side, side)
-    open_air = (zones.at(x, y) != Zone.BUILDING).reshape(side, side).astype(np.float32)
-    blurred = cv2.GaussianBlur(openness * open_air, (0, 0), 1.1)
-    weight = cv2.GaussianBlur(open_air, (0, 0), 1.1)
-    return SkyMap(np.where(weight > 0.02, blurred / np.maximum(weight, 0.02), 0.6).astype(np.float32), half_size)
+    return free / _RAYS
 
 
 def sky_colour(directions: np.ndarray) -> np.ndarray:

@@ -98,7 +98,7 @@ def _orchard(site: Site, plot: Plot) -> None:
         for b in np.arange(-plot.depth / 2 + 3, plot.depth / 2 - 2, 5.2):
             if site.rng.random() < 0.92:
                 frame = site.frame(plot, a + site.rng.normal(0, 0.2), b + site.rng.normal(0, 0.2))
-                tree(site.builder, frame, site.rng, kind, site.rng.uniform(3.0, 3.9), fine=False)
+                tree(site.builder, frame, site.rng, kind, site.rng.uniform(3.0, 3.9), detail=2)
 
 
 def _woods(site: Site, plot: Plot) -> None:
@@ -109,7 +109,7 @@ def _woods(site: Site, plot: Plot) -> None:
             if site.rng.random() < 0.85:
                 da, db = site.rng.normal(0, 1.0, 2)
                 kind = str(site.rng.choice(["round", "round", "conifer", "bush"]))
-                tree(site.builder, site.frame(plot, a + da, b + db), site.rng, kind, fine=False)
+                tree(site.builder, site.frame(plot, a + da, b + db), site.rng, kind, detail=2)
 
 
 def _lavender(site: Site, plot: Plot) -> None:
@@ -144,7 +144,7 @@ def _shore(site: Site, plot: Plot) -> None:
         away = rng.uniform(1.5, 7.0)
         x = pond.x + (pond.rx + away) * np.cos(angle)
         y = pond.y + (pond.ry + away) * np.sin(angle)
-        if pond.distance(np.array(x), np.array(y)) < 1.0 or _on_street(site, x, y):
+        if pond.distance(np.array(x), np.array(y)) < 1.0 or on_street(site, x, y):
             continue
         p, q = site.plan.to_plan(np.array([x]), np.array([y]))
         from_here = site.frame(Plot(float(p[0]), float(q[0]), 1, 1))
@@ -153,10 +153,11 @@ def _shore(site: Site, plot: Plot) -> None:
 
 def _line_of_trees(site: Site, plot: Plot, a: float, kind: str) -> None:
     for b in np.arange(-plot.depth / 2 + 3, plot.depth / 2 - 2, 6.0):
-        tree(site.builder, site.frame(plot, a, b), site.rng, kind, fine=False)
+        tree(site.builder, site.frame(plot, a, b), site.rng, kind, detail=2)
 
 
-def _on_street(site: Site, x: float, y: float) -> bool:
+def on_street(site: Site, x: float, y: float) -> bool:
+    """Whether a place in the world lies on a street or its pavement."""
     p, q = site.plan.to_plan(np.array([x]), np.array([y]))
     return any(street.outside[0] < PAVEMENT + 1.5 for street in site.plan.beside(p, q))
 
@@ -172,7 +173,7 @@ def scatter_trees(site: Site, half_extent: float, count: int) -> None:
             a, b = x + rng.normal(0, 3.5), y + rng.normal(0, 3.5)
             here = np.array([a]), np.array([b])
             wet = any(pond.distance(*here)[0] < 2 for pond in site.terrain.ponds)
-            if wet or site.zones.at(*here)[0] != Zone.OPEN or _on_street(site, a, b):
+            if wet or site.zones.at(*here)[0] != Zone.OPEN or on_street(site, a, b):
                 continue
             p, q = site.plan.to_plan(*here)
-            tree(site.builder, site.frame(Plot(float(p[0]), float(q[0]), 1, 1)), rng, kind, fine=False)
+            tree(site.builder, site.frame(Plot(float(p[0]), float(q[0]), 1, 1)), rng, kind, detail=2)

@@ -1,4 +1,4 @@
-"""Photographs and true depth of the town from a camera."""
+"""Photographs of the town from a camera, and the rays of their pixels."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def pixel_centres(camera: Camera) -> np.ndarray:
     return np.stack([x.ravel(), y.ravel()], 1)
 
 
-def photograph(town: Town, tracer: Tracer, sky: SkyMap, camera: Camera, samples: int) -> np.ndarray:
-    """The picture that a camera takes, [height, width, 3] uint8."""
+def photograph(town: Town, tracer: Tracer, sky: SkyMap, camera: Camera, samples: int, gain: np.ndarray) -> np.ndarray:
+    """The picture that a camera takes, [height, width, 3] uint8; `gain` [3] is its exposure, per channel."""
     centres, offsets = pixel_centres(camera), sample_offsets(samples)
     step = max(1, _CHUNK // samples)
     rows = []
@@ -59,14 +59,6 @@ def photograph(town: Town, tracer: Tracer, sky: SkyMap, camera: Camera, samples:
         pixels = centres[start : start + step, None] + offsets
         rays = pixel_rays(camera, pixels.reshape(-1, 2))
         light, _ = radiance(town, tracer, sky, *rays, 1 / camera.fx)
-        rows.append(tone_map(light.reshape(-1, samples, 3).mean(1)))
+        rows.append(tone_map(light.reshape(-1, samples, 3).mean(1) * gain.astype(np.float32)))
     values = np.concatenate(rows).reshape(camera.height, camera.width, 3)
     return (values * 255 + 0.5).astype(np.uint8)
-
-
-def depth_map(tracer: Tracer, camera: Camera) -> np.ndarray:
-    """True depth along the viewing axis at pixel centres, [height, width] float32, m; inf for sky."""
-    origins, directions = pixel_rays(camera, pixel_centres(camera))
-    hits = tracer.cast(origins, directions)
-    depth = hits.distance * (directions @ camera.forward.astype(np.float32))
-    return np.where(hits.triangle >= 0, depth, np.inf).reshape(camera.height, camera.width).astype(np.float32)

@@ -14,10 +14,9 @@ import numpy as np
 
 from vdgs.cameras import Camera
 from vdgs.synth.photography import pixel_rays
+from vdgs.synth.surveying import true_visibility
 from vdgs.synth.tracing import Tracer
 
-#: An occluder this near to a point (m) is its own surface.
-_OWN_SURFACE = 0.03
 #: Pictures that look at a place from directions further apart than this are never matched (degrees).
 _WIDEST = 65.0
 
@@ -34,7 +33,8 @@ class Seeds:
 class SparseCloud:
     """True places and noisy points [n, 3] (m), colours [n, 3] uint8, mean reprojection errors [n] (px);
     observations: point index [m], image index [m], pixels [m, 2], sorted by point, then by image;
-    visibility [n, images]: in the frame and not occluded (a superset of the observations)."""
+    visibility [n, images]: in the frame and not occluded (a superset of the observations); outliers [n]: matched
+    wrongly, so that the point is not where its place is."""
 
     places: np.ndarray
     points: np.ndarray
@@ -44,6 +44,7 @@ class SparseCloud:
     observed_image: np.ndarray
     observed_px: np.ndarray
     visibility: np.ndarray
+    outliers: np.ndarray
 
 
 def pick_seeds(tracer: Tracer, camera: Camera, image: np.ndarray, count: int, rng: np.random.Generator) -> Seeds:
@@ -59,19 +60,6 @@ def pick_seeds(tracer: Tracer, camera: Camera, image: np.ndarray, count: int, rn
     met = (hits.triangle >= 0) & (hits.distance < 600)
     places = origins + directions.astype(np.float64) * hits.distance[:, None]
     return Seeds(places[met], image[row, column][met])
-
-
-def true_visibility(tracer: Tracer, cameras: list[Camera], places: np.ndarray) -> np.ndarray:
-    """Which places [n, 3] each camera sees: inside its frame and with nothing in between, [n, cameras]."""
-    visible = np.zeros((len(places), len(cameras)), bool)
-    for k, camera in enumerate(cameras):
-        inside = np.flatnonzero(camera.sees(places))
-        ray = places[inside] - camera.position
-        length = np.linalg.norm(ray, axis=1)
-        origins = np.broadcast_to(camera.position, ray.shape)
-        hidden = tracer.occluded(origins, ray / length[:, None], length - _OWN_SURFACE)
-        visible[inside[~hidden], k] = True
-    return visible
 
 
 def _matched(
@@ -156,4 +144,5 @@ def sparse_cloud(
         at = image == k
         residual[at] = np.linalg.norm(camera.project(points[point[at]])[0] - observed[at], axis=1)
     errors = np.bincount(point, residual, len(places)) / np.maximum(np.bincount(point, minlength=len(places)), 1)
-    return SparseCloud(places, points, colours, errors, point, image, observed, visible)
+    wrong = np.zeros(len(places), bool)
+    return SparseCloud(places, points, colours, errors, point, image, observed, visible, wrong)

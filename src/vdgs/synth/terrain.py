@@ -60,9 +60,10 @@ class Terrain:
         return gentle + rise * 14.0 * hills
 
     def add_to(self, builder: MeshBuilder) -> None:
-        """The ground as a grid: 1.6 m under the town, ever coarser towards the horizon."""
-        inner = np.arange(0, 1.5 * self.half_extent, 1.6)
-        outer = inner[-1] * np.geomspace(1, _REACH / 1.5, 60)[1:]
+        """The ground as a grid: 1.6 m under the town (2 m where that is wide), ever coarser towards the horizon."""
+        reach, step = (1.5, 1.6) if len(self.ponds) < 2 else (1.9, 2.0)  # a lake lies further out than the town
+        inner = np.arange(0, reach * self.half_extent, step)
+        outer = inner[-1] * np.geomspace(1, _REACH / reach, 60)[1:]
         axis = np.concatenate([-outer[::-1], -inner[:0:-1], inner, outer])
         x, y = np.meshgrid(axis, axis)
         z = self.height(x, y)

@@ -10,12 +10,19 @@ import numpy as np
 from vdgs.synth import centre, props
 from vdgs.synth.mesh import Mesh, MeshBuilder
 from vdgs.synth.outskirts import build_outskirts, edge_plots, scatter_trees
+from vdgs.synth.periphery import build_periphery
 from vdgs.synth.residential import residential_block
 from vdgs.synth.site import Plot, Site
 from vdgs.synth.streets import PAVEMENT, StreetPlan, street_plan
 from vdgs.synth.terrain import Pond, Terrain
+from vdgs.synth.towers import TALLEST, towers
 from vdgs.synth.trees import tree
 from vdgs.synth.zones import ZoneMap
+
+#: A town with more streets than this each way is grand: it has towers and a lake.
+_GRAND = 9
+#: No building of a town without towers is higher than this (m).
+_TALLEST_HOUSE = 26.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +34,9 @@ class Town:
     terrain: Terrain
     zones: ZoneMap
     half_extent: float
+    #: Places [k, 2] (m) worth flying around, the square first; and a height (m) that no building exceeds.
+    landmarks: np.ndarray
+    tallest: float
 
 
 def build_town(seed: int, extent: float) -> Town:
@@ -38,13 +48,17 @@ def build_town(seed: int, extent: float) -> Town:
     site = Site(plan, land, zones, MeshBuilder(), rng)
     plots = edge_plots(site)
     pond_plot = int(rng.integers(len(plots)))
-    site = replace(site, terrain=replace(land, ponds=(_pond(site, plots[pond_plot]),)))
-    _blocks(site)
+    grand = len(plan.p) > _GRAND
+    ponds = [_pond(site, plots[pond_plot])] + ([_lake(site, plots, pond_plot, extent)] if grand else [])
+    site = replace(site, terrain=replace(land, ponds=tuple(ponds)))
+    landmarks = _blocks(site, grand)
     build_outskirts(site, pond_plot)
     _traffic(site)
     scatter_trees(site, extent / 2 + 20, count=int(60 + extent / 2))
+    build_periphery(replace(site, rng=np.random.default_rng([seed, 11])), extent / 2)
     site.terrain.add_to(site.builder)
-    return Town(site.builder.build(), plan, site.terrain, zones, extent / 2)
+    tallest = TALLEST if grand else _TALLEST_HOUSE
+    return Town(site.builder.build(), plan, site.terrain, zones, extent / 2, landmarks, tallest)
 
 
 def _pond(site: Site, plot: Plot) -> Pond:
@@ -57,8 +71,42 @@ def _pond(site: Site, plot: Plot) -> Pond:
     return Pond(x, y, rx, ry, float(shore.min()) - 0.35)
 
 
-def _blocks(site: Site) -> None:
-    """The square in the middle, shops around it, houses further out, a park and works among them."""
+def _lake(site: Site, plots: list[Plot], pond_plot: int, extent: float) -> Pond:
+    """A lake beyond the fields of an edge of the town, away from the main streets and from the pond."""
+    plan, radius = site.plan, 0.1 * extent
+    main = np.array([plan.p[plan.p_main], plan.q[plan.q_main]])
+
+    def room(plot: Plot) -> float:
+        other = np.hypot(plot.p - plots[pond_plot].p, plot.q - plots[pond_plot].q)
+        along = abs((plot.p - main[0], plot.q - main[1])[plot.turns % 2])
+        return float(min(other, 2 * along))
+
+    plot = max(plots, key=room)
+    x, y = (float(v) for v in plan.to_world(*plot.plan(np.array(0.0), np.array(50 + 1.15 * radius))))
+    angle = np.linspace(0, 2 * np.pi, 64)
+    shore = site.terrain.height(x + 1.25 * radius * np.cos(angle), y + 1.25 * radius * np.sin(angle))
+    return Pond(x, y, radius, 0.9 * radius, float(shore.min()) - 0.35)
+
+
+def _tower_blocks(cells: list[tuple[int, int]], middle: tuple[int, int]) -> list[tuple[int, int]]:
+    """Three blocks around the middle one, a few blocks off, each another way."""
+    away = max(1, max(abs(i - middle[0]) for i, _ in cells) // 2)
+    wanted = [(middle[0] + away * np.cos(t), middle[1] + away * np.sin(t)) for t in (0.6, 2.7, 4.8)]
+    return [min(cells, key=lambda cell: np.hypot(cell[0] - a, cell[1] - b)) for a, b in wanted]
+
+
+def _landmarks(site: Site, blocks: list[tuple[int, int]]) -> np.ndarray:
+    """The middles of the blocks worth flying around, filled up to three with corners of the town, [k, 2]."""
+    plots = [site.block(i, j) for i, j in blocks]
+    middles = np.array([(plot.p, plot.q) for plot in plots])
+    corners = 0.7 * np.array([(site.plan.p[k], site.plan.q[k]) for k in (-1, 0)])
+    middles = np.concatenate([middles, corners[: max(0, 3 - len(middles))]])
+    return np.stack(site.plan.to_world(*middles.T), 1)
+
+
+def _blocks(site: Site, grand: bool) -> np.ndarray:
+    """The square in the middle, shops around it, houses further out, a park and works among them, and in a grand town
+    towers and further squares; returns the landmarks [k, 2]."""
     rows, columns = len(site.plan.q) - 1, len(site.plan.p) - 1
     i0, j0 = site.plan.p_main - 1, site.plan.q_main
     cells = [(i, j) for i in range(columns) for j in range(rows) if (i, j) != (i0, j0)]
@@ -66,6 +114,10 @@ def _blocks(site: Site) -> None:
     site.rng.shuffle(cells)
     cells.sort(key=lambda cell: away[cell])
     centre.square(site, site.block(i0, j0))
+    high = _tower_blocks(cells, (i0, j0)) if grand else []
+    for cell in high:
+        towers(site, site.block(*cell))
+    cells = [cell for cell in cells if cell not in high]
     special = [centre.shops, centre.park, centre.shops, centre.works, centre.lawn_flats]
     for k, (i, j) in enumerate(cells):
         block = site.block(i, j)
@@ -77,6 +129,7 @@ def _blocks(site: Site) -> None:
             (centre.park, centre.works, centre.lawn_flats)[int(chance / 0.22 * 3)](site, block)
         else:
             residential_block(site, block)
+    return _landmarks(site, [(i0, j0), *high])
 
 
 def _traffic(site: Site) -> None:

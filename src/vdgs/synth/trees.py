@@ -71,11 +71,11 @@ def _finish(vertices: np.ndarray, faces: np.ndarray, openness: np.ndarray, softn
 
 
 @lru_cache(maxsize=64)
-def _round_crown(variant: int, fine: bool) -> Crown:
+def _round_crown(variant: int, detail: int) -> Crown:
     """A ball of leaf clumps: every clump bulges out of the crown."""
     rng = np.random.default_rng([21, variant])
-    vertices, faces = _sphere(3 if fine else 2)
-    clumps = rng.normal(size=(26 if fine else 16, 3))
+    vertices, faces = _sphere(detail)
+    clumps = rng.normal(size=(26 if detail > 2 else 16, 3))
     clumps /= np.linalg.norm(clumps, axis=1, keepdims=True)
     angle = np.arccos(np.clip(vertices @ clumps.T, -1, 1))
     reach = rng.uniform(0.42, 0.62, len(clumps))
@@ -126,9 +126,12 @@ def tree(
     rng: np.random.Generator,
     kind: str = "round",
     height: float | None = None,
-    fine: bool = True,
+    detail: int = 3,
 ) -> None:
-    """One tree on the ground at a frame: round, poplar, conifer, blossom or bush."""
+    """One tree on the ground at a frame: round, poplar, conifer, blossom or bush.
+
+    `detail` is how often the ball that its crown is made of is subdivided: 3 nearby, 1 far off.
+    """
     tall = height or rng.uniform(*_HEIGHTS[kind])
     at = Frame(frame.x, frame.y, frame.z, rng.uniform(0, 6.28))
     seed, variant = float(rng.random()), int(rng.integers(6))
@@ -149,7 +152,7 @@ def tree(
         frustum(builder, at, (0.05 * wide + 0.16, 0.12), (-0.5, tall - upright), bark, None, 7)
     size = np.array([wide, wide * rng.uniform(0.88, 1.1), upright])
     centre = at.moved(0, 0, 0.35 * tall if kind == "bush" else tall - upright)
-    _plant(builder, _round_crown(variant, fine), centre, size, palette.pick(rng, leaves, 0.15), seed)
+    _plant(builder, _round_crown(variant, detail), centre, size, palette.pick(rng, leaves, 0.15), seed)
 
 
 def hedge(builder: MeshBuilder, frame: Frame, length: float, height: float = 1.1) -> None:

@@ -42,7 +42,7 @@ class ZoneMap:
 
     def __init__(self, half_size: float) -> None:
         self.half_size = half_size
-        self.cell = 0.05 if half_size < 180 else 0.1
+        self.cell = 0.05 if half_size < 180 else 0.1 if half_size < 450 else 0.15
         side = int(np.ceil(2 * half_size / self.cell))
         self.cells = np.zeros((side, side), np.uint8)
 

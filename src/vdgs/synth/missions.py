@@ -1,0 +1,179 @@
+"""Missions: where a drone takes its photographs, and where it looks, before wind and GPS disturb it.
+
+Each mission sees the place unevenly in its own way; `imbalance` measures how. A *climb* is a height above ground as a
+share of the flight's altitude.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from vdgs.synth.streets import StreetPlan
+
+#: A photograph's height over its width.
+_ASPECT = 0.75
+#: Climb of photographs that look aslant: they are taken lower than those that look straight down.
+_OBLIQUE_CLIMB = 0.86
+#: A place is wide if half its side is more than so many altitudes.
+_WIDE = 2.0
+_GOLDEN = np.pi * (3 - 5**0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Mission:
+    """place [n, 2] m; tilt from straight down and heading clockwise from north [n] rad; climb [n]."""
+
+    place: np.ndarray
+    tilt: np.ndarray
+    heading: np.ndarray
+    climb: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """What a mission is planned over: half the side of the square to cover and the altitude (m), how many photographs,
+    an angle to begin at (rad), the streets, and the landmarks [k, 2] m, the chief one first."""
+
+    half: float
+    altitude: float
+    count: int
+    phase: float
+    plan: StreetPlan
+    landmarks: np.ndarray
+
+
+def _down(place: np.ndarray, heading: np.ndarray) -> Mission:
+    """Photographs that look straight down."""
+    return Mission(place, np.zeros(len(place)), heading, np.ones(len(place)))
+
+
+def _joined(parts: list[Mission]) -> Mission:
+    """One mission after the other."""
+    names = ("place", "tilt", "heading", "climb")
+    return Mission(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def _spaced(path: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """`count` places at equal steps along the legs [l, 2, 2] of a path, and the headings of their legs."""
+    lengths = np.linalg.norm(path[:, 1] - path[:, 0], axis=1)
+    ends = np.cumsum(lengths)
+    travelled = (np.arange(count) + 0.5) / max(count, 1) * ends[-1]
+    leg = np.minimum(np.searchsorted(ends, travelled), len(path) - 1)
+    share = ((travelled - ends[leg] + lengths[leg]) / lengths[leg])[:, None]
+    ahead = path[leg, 1] - path[leg, 0]
+    return path[leg, 0] + share * ahead, np.arctan2(ahead[:, 0], ahead[:, 1])
+
+
+def _grid(half: float, count: int) -> Mission:
+    """A lawn-mower grid that looks straight down."""
+    lines = max(2, round(np.sqrt(count * 0.9)))
+    rows = np.linspace(-half, half, lines)
+    ends = half * np.where(np.arange(lines) % 2 == 0, 1, -1)
+    path = np.stack([np.stack([-ends, rows], 1), np.stack([ends, rows], 1)], 1)
+    return _down(*_spaced(path, count))
+
+
+def _circuits(inner: float, outer: float, spacing: float, count: int) -> Mission:
+    """Square circuits around the town that look straight down, `spacing` apart, the last one at `outer`."""
+    circuits = max(1, round((outer - inner) / spacing))
+    radii = outer - (outer - inner) / circuits * np.arange(circuits)[::-1]
+    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    sides = np.stack([corners, np.roll(corners, -1, axis=0)], 1)
+    return _down(*_spaced((radii[:, None, None, None] * sides).reshape(-1, 2, 2), count))
+
+
+def _obliques(half: float, count: int, phase: float) -> Mission:
+    """An orbit on two radii that looks inwards, 28 to 45 degrees from straight down."""
+    turn = phase + 2 * np.pi * np.arange(count) / max(count, 1)
+    radius = half * np.where(np.arange(count) % 2 == 0, 0.58, 0.9)
+    place = np.stack([radius * np.cos(turn), radius * np.sin(turn)], 1)
+    tilt = np.radians(np.where(np.arange(count) % 3 == 0, 42, 31))
+    return Mission(place, tilt, np.arctan2(-place[:, 0], -place[:, 1]), np.full(count, _OBLIQUE_CLIMB))
+
+
+def _even(over: Ground) -> Mission:
+    oblique = round(0.27 * over.count)
+    return _joined([_grid(0.8 * over.half, over.count - oblique), _obliques(over.half, oblique, over.phase)])
+
+
+def _uneven(over: Ground) -> Mission:
+    if over.half > _WIDE * over.altitude:
+        return _uneven_wide(over)
+    oblique, outskirts = round(0.27 * over.count), round(0.36 * over.count)
+    return _joined(
+        [
+            _grid(0.4 * over.half, over.count - oblique - outskirts),
+            _circuits(0.4 * over.half, 0.78 * over.half, 0.75 * over.altitude, outskirts),
+            _obliques(over.half, oblique, over.phase),
+        ]
+    )
+
+
+def _uneven_wide(over: Ground) -> Mission:
+    """The same over a wide place: most photographs over a centre that is a small part of it."""
+    oblique, outskirts = round(0.2 * over.count), round(0.22 * over.count)
+    return _joined(
+        [
+            _grid(0.25 * over.half, over.count - oblique - outskirts),
+            _circuits(0.25 * over.half, 0.8 * over.half, 1.0 * over.altitude, outskirts),
+            _obliques(0.5 * over.half, oblique, over.phase),
+        ]
+    )
+
+
+def _distant(over: Ground) -> Mission:
+    """A dense grid over the middle, and photographs that look far out: inwards across it, and away from it."""
+    far = round(0.3 * over.count)
+    turn = over.phase + _GOLDEN * np.arange(far)
+    radius = over.half * (0.25 + 0.35 * ((np.arange(far) * 0.618) % 1))
+    place = np.stack([radius * np.cos(turn), radius * np.sin(turn)], 1)
+    outwards = np.arange(far) % 3 != 0
+    heading = np.arctan2(place[:, 0], place[:, 1]) + np.where(outwards, 0, np.pi)
+    looking = Mission(place, np.radians(np.where(outwards, 60.0, 54.0)), heading, np.full(far, _OBLIQUE_CLIMB))
+    return _joined([_grid(0.3 * over.half, over.count - far), looking])
+
+
+def _orbits(over: Ground) -> Mission:
+    """Two rings of photographs about each landmark, all looking at its foot."""
+    centres = np.resize(np.arange(len(over.landmarks)), over.count)
+    rank = np.arange(over.count) // len(over.landmarks)
+    rings = np.where(rank % 2 == 0, 0.75, 1.25) * over.altitude
+    turn = over.phase + centres + 2 * np.pi * rank / max(1, over.count // len(over.landmarks))
+    away = np.stack([np.cos(turn), np.sin(turn)], 1)
+    climb = np.where(rank % 2 == 0, 0.95, _OBLIQUE_CLIMB)
+    tilt = np.arctan2(rings, climb * over.altitude)
+    place = over.landmarks[centres] + rings[:, None] * away
+    return Mission(place, tilt, np.arctan2(-away[:, 0], -away[:, 1]), climb)
+
+
+def _corridor(over: Ground) -> Mission:
+    """Three lanes along the main street and beyond its ends: straight down in the middle, aslant at the sides."""
+    lane = np.arange(over.count) % 3 - 1
+    q = np.linspace(-1.25, 1.25, over.count) * over.half
+    p = over.plan.p[over.plan.p_main] + 0.3 * over.altitude * lane
+    place = np.stack(over.plan.to_world(p, q), 1)
+    ahead = np.stack(over.plan.to_world(p, q + 2.0), 1) - place
+    heading = np.arctan2(ahead[:, 0], ahead[:, 1]) + np.where(lane > 0, np.pi, 0)
+    tilt = np.radians(np.where(lane == 0, 0.0, 35.0))
+    return Mission(place, tilt, heading, np.where(lane == 0, 1.0, _OBLIQUE_CLIMB))
+
+
+#: The missions by the name of the option `--flight`.
+MISSIONS: dict[str, Callable[[Ground], Mission]] = {
+    "even": _even,
+    "uneven": _uneven,
+    "distant": _distant,
+    "orbits": _orbits,
+    "corridor": _corridor,
+}
+
+
+def altitude_for_overlap(extent: float, count: int, overlap: float, focal: float) -> float:
+    """The altitude (m) at which `count` photographs, were they an even grid over `extent` metres a side, would each
+    share `overlap` of their side with the next (mean of the two sides of the picture; `focal` in image widths)."""
+    spacing = extent / np.sqrt(count)
+    side_per_altitude = np.sqrt(_ASPECT) / focal
+    return float(spacing / (1 - overlap) / side_per_altitude)

@@ -1,0 +1,210 @@
+"""Flights over the generated place: each is uneven in its own way, tests lie all over it, the truth is true."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("embreex")
+
+from vdgs.captures.loading import load_capture
+from vdgs.captures.options import CaptureOptions
+from vdgs.errors import VdgsError
+from vdgs.synth import SynthOptions, generate
+from vdgs.synth.disturbances import disturbed, exposure_gains, with_outliers
+from vdgs.synth.flight import fly, pinhole
+from vdgs.synth.held_out import held_out_cameras
+from vdgs.synth.imbalance import flight_imbalance, survey
+from vdgs.synth.mesh import Material, MeshBuilder
+from vdgs.synth.options import ResolvedOptions
+from vdgs.synth.sparse import SparseCloud
+from vdgs.synth.surveying import count_views, surface_places, view_truth
+from vdgs.synth.town import Town, build_town
+from vdgs.synth.tracing import Tracer
+from vdgs.synth.truth import load_truth, pack_depth, unpack_depth, visibility_map_from_truth
+
+FLIGHTS = ("uneven", "even", "distant", "orbits", "corridor")
+TOY = SynthOptions(size="toy", width=64, height=48, samples_per_pixel=1, points=300, seed=1, truth=True)
+
+
+@pytest.fixture(scope="module")
+def town() -> Town:
+    return build_town(5, 120.0)
+
+
+@pytest.fixture(scope="module")
+def tracer(town: Town) -> Tracer:
+    return Tracer(town.mesh)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("toy") / "capture"
+    generate(folder, replace(TOY, exposure_stops=0.3, outliers=0.1, pose_noise_px=0.5))
+    return folder
+
+
+def options_of(flight: str, images: int = 60, **more: object) -> ResolvedOptions:
+    return replace(SynthOptions(images=images, **more), flight=flight).resolved()  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("flight", FLIGHTS)
+@pytest.mark.parametrize("images", [41, 120])
+def test_flights_take_what_was_asked_for_and_hit_nothing(flight: str, images: int, town: Town, tracer: Tracer) -> None:
+    cameras = fly(options_of(flight, images), town)
+    assert len(cameras) == images
+    places = np.stack([camera.position for camera in cameras])
+    down = tracer.cast(places.astype(np.float32), np.tile(np.float32([0, 0, -1]), (images, 1)))
+    assert (down.distance > 5).all(), "a camera is inside a building or right above it"
+    steepest = max(camera.forward[2] for camera in cameras)
+    assert steepest < -np.cos(np.radians(70 if flight in ("distant", "orbits") else 52)), "too near to the horizon"
+
+
+def test_each_flight_is_uneven_in_its_own_way(town: Town, tracer: Tracer) -> None:
+    found, share_in_middle, far = {}, {}, {}
+    for flight in FLIGHTS:
+        cameras = fly(options_of(flight), town)
+        places, views = survey(tracer, town.mesh, cameras, 60.0, np.random.default_rng(0))
+        found[flight] = flight_imbalance(views, len(cameras))
+        far[flight] = (np.abs(places[:, :2]).max(1) > 90).sum()
+        at = np.array([camera.position[:2] for camera in cameras])
+        share_in_middle[flight] = np.mean(np.abs(at).max(1) < 0.22 * 120)
+    assert found["uneven"].gini > found["even"].gini
+    assert share_in_middle["uneven"] > 1.2 * share_in_middle["even"]
+    assert far["distant"] > 1.3 * max(far["even"], far["uneven"])
+    assert all(0 < each.gini < 1 and each.quantiles[5] >= 1 for each in found.values())
+
+
+@pytest.mark.parametrize("flight", FLIGHTS)
+def test_test_views_fall_all_over_what_was_seen(flight: str, town: Town, tracer: Tracer) -> None:
+    options = options_of(flight, width=64, height=48)
+    training = fly(options, town)
+    places, views = survey(tracer, town.mesh, training, 60.0, np.random.default_rng(0))
+    held = held_out_cameras(tracer, town.terrain, training, places, 8, options, np.random.default_rng(3))
+    by_tests = count_views(tracer, held, places) > 0
+    every_eighth = count_views(tracer, training[::8][:8], places) > 0
+    poor = views <= np.percentile(views, 25)
+    assert by_tests[poor].mean() > every_eighth[poor].mean(), "poorly seen places are tested on less than by n-th"
+    shares = [(view_truth(tracer, camera, training)[1] > 0).mean() for camera in held]
+    assert np.mean(shares) > 0.85, "tests show what no training photograph saw"
+
+
+def test_overlap_sets_the_altitude(town: Town) -> None:
+    heights = [
+        np.median([camera.position[2] for camera in fly(options_of("even", overlap=overlap), town)])
+        for overlap in (0.6, 0.8)
+    ]
+    assert heights[1] / heights[0] == pytest.approx(2.0, rel=0.15)
+    with pytest.raises(VdgsError, match=r"--overlap 0\.1 with"):
+        fly(options_of("even", overlap=0.1), town)
+
+
+def test_what_stands_in_between_hides() -> None:
+    """A wall above flat ground: places behind it are in the frustum and yet not seen."""
+    builder = MeshBuilder()
+    ground = np.array([(-50, -50, 0), (50, -50, 0), (50, 50, 0), (-50, 50, 0)], float)
+    roof = np.array([(-5, -5, 10), (5, -5, 10), (5, 5, 10), (-5, 5, 10)], float)
+    for ring in (ground, roof):
+        builder.polygon(ring, Material.PLASTER, np.ones(3))
+    mesh = builder.build()
+    camera = pinhole(np.eye(4), options_of("even", width=64, height=64))
+    rigid = np.eye(4)
+    rigid[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    rigid[:3, 3] = [0, 0, 40]
+    above = replace(camera, camera_from_world=rigid)
+    places = np.array([(0, 0, 0), (0, 0, 10), (12, 0, 0), (200, 0, 0)], float)
+    assert count_views(Tracer(mesh), [above, above], places).tolist() == [0, 2, 2, 0]
+    depth, views = view_truth(Tracer(mesh), above, [above])
+    assert set(np.unique(np.round(depth))) == {30.0, 40.0}
+    assert (views == 1).all()
+    spread = surface_places(mesh, 50.0, 4000, np.random.default_rng(0))
+    assert np.mean(spread[:, 2] > 5) == pytest.approx(100 / 10100, abs=0.01)
+
+
+def test_a_generated_capture_is_split_by_its_own_lists(capture: Path) -> None:
+    tested = load_capture(capture, CaptureOptions(up="z"))
+    validated = load_capture(capture, CaptureOptions(up="z", validation=True))
+    assert {view.name.split("_")[0] for view in tested.train_views} == {"drone"}
+    assert {view.name.split("_")[0] for view in tested.test_views} == {"test"}
+    assert {view.name.split("_")[0] for view in validated.test_views} == {"validation"}
+    assert [view.name for view in tested.train_views] == [view.name for view in validated.train_views]
+    assert len(tested.train_views) == 24
+
+
+def test_truth_is_read_back_at_the_size_in_use(capture: Path) -> None:
+    truth = load_truth(capture)
+    whole = load_capture(capture, CaptureOptions(up="z"))
+    half = load_capture(capture, CaptureOptions(up="z", downscale=2))
+    for view, small in zip(whole.test_views, half.test_views, strict=True):
+        visibility = visibility_map_from_truth(view)
+        assert visibility.shape == (48, 64)
+        np.testing.assert_array_equal(np.isnan(visibility), np.isinf(truth.depth(view.name)))
+        assert np.nanmax(visibility) <= 24
+        assert np.nanmean(visibility > 0) > 0.6
+        assert truth.visibility_maps(half)(small.camera).shape == (24, 32)
+    with pytest.raises(VdgsError, match="test and validation"):
+        visibility_map_from_truth(whole.train_views[0])
+    with pytest.raises(VdgsError, match="no truth"):
+        load_truth(capture / "images")
+
+
+def test_the_flight_says_how_uneven_it_is(capture: Path) -> None:
+    facts = json.loads((capture / "truth" / "flight.json").read_text())
+    assert facts["flight"] == "uneven"
+    assert facts["photographs"] == 24
+    assert facts["quantiles"]["5"] <= facts["quantiles"]["95"]
+
+
+def test_disturbances_are_written_and_known(capture: Path) -> None:
+    with np.load(capture / "truth" / "cameras.npz", allow_pickle=False) as cameras:
+        assert np.std(np.log2(cameras["gains"])) > 0.05
+        assert len(cameras["names"]) == len(cameras["camera_from_world"]) == 24 + 3 + 3
+    with np.load(capture / "truth" / "points.npz", allow_pickle=False) as points:
+        assert points["outliers"].mean() == pytest.approx(0.1, abs=0.02)
+
+
+def test_depth_is_kept_to_a_few_thousandths_of_a_percent() -> None:
+    depth = np.geomspace(0.5, 20_000, 5000).reshape(50, 100).astype(np.float32)
+    depth[0, :7] = np.inf
+    back = unpack_depth(*pack_depth(depth))
+    np.testing.assert_array_equal(np.isinf(back), np.isinf(depth))
+    np.testing.assert_allclose(back[1:], depth[1:], rtol=1.2e-4)
+    for constant in (np.full((2, 2), 7.0, np.float32), np.full((2, 2), np.inf, np.float32)):
+        np.testing.assert_allclose(unpack_depth(*pack_depth(constant)), constant)
+
+
+def test_noise_has_the_size_that_was_asked_for(town: Town) -> None:
+    cameras = fly(options_of("even", images=120), town)
+    shifts = []
+    for true, noisy in zip(cameras, disturbed(cameras, 0.8, 60.0, np.random.default_rng(0)), strict=True):
+        below = true.position + true.forward * 60.0
+        shifts.append((noisy.project(below[None])[0] - true.project(below[None])[0])[0])
+    assert np.std(shifts) == pytest.approx(0.8, rel=0.2)
+    gains = np.log2(exposure_gains(4000, 0.5, np.random.default_rng(0)))
+    assert gains[:, 1].std() == pytest.approx(0.5, rel=0.2)
+    assert np.abs(np.diff(gains[:, 1])).mean() < 0.6 * gains[:, 1].std(), "exposure drifts, it does not flicker"
+    assert (exposure_gains(5, 0.0, np.random.default_rng(0)) == 1).all()
+
+
+def test_outliers_lie_on_a_ray_that_saw_them(town: Town) -> None:
+    cameras = fly(options_of("even", images=3), town)
+    rng = np.random.default_rng(0)
+    places = rng.normal(0, 10, (50, 3))
+    point, image = np.repeat(np.arange(50), 3), np.tile(np.arange(3), 50)
+    cloud = SparseCloud(
+        places, places.copy(), np.zeros((50, 3), np.uint8), np.zeros(50), point, image, rng.normal(size=(150, 2)),
+        np.ones((50, 3), bool), np.zeros(50, bool),
+    )  # fmt: skip
+    wrong = with_outliers(cloud, cameras, 0.2, rng)
+    assert wrong.outliers.sum() == 10
+    np.testing.assert_array_equal(wrong.points[~wrong.outliers], places[~wrong.outliers])
+    true_ray, ray = (each[wrong.outliers] - cameras[0].position for each in (places, wrong.points))
+    np.testing.assert_allclose(np.cross(true_ray, ray), 0, atol=1e-6 * np.abs(ray).max() ** 2)
+    lengths = np.bincount(wrong.observed_point)
+    assert (lengths[wrong.outliers] == 2).all()
+    assert (lengths[~wrong.outliers] == 3).all()
+    assert len(wrong.observed_px) == len(wrong.observed_image) == lengths.sum()
