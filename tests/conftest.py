@@ -13,6 +13,7 @@ CORE = (
     "evaluation",
     "anchors",
     "cameras",
+    "comparators",
     "compensation",
     "decoder",
     "growth",

@@ -206,7 +206,7 @@ class RenderArguments:
 
 @dataclass(frozen=True)
 class SynthArguments:
-    """Generate a small aerial town seen by an uneven drone flight, as a COLMAP capture."""
+    """Generate an aerial place and a drone flight over it, as a COLMAP capture."""
 
     output: Positional[Path]
     """Folder for the capture; it must not exist or be empty."""
@@ -384,8 +384,8 @@ def synth(arguments: list[str]) -> None:
                 tasks[stage] = bar.add_task(stage, total=total)
             bar.update(tasks[stage], completed=done)
 
-        generate(asked.output, asked.options, show)
-    console.print(f"capture: {asked.output}", highlight=False)
+        found = generate(asked.output, asked.options, show)
+    console.print(f"{found.line}\ncapture: {asked.output}", highlight=False)
 
 
 def bench(arguments: list[str]) -> None:

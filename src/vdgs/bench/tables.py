@@ -5,7 +5,7 @@ from __future__ import annotations
 from vdgs.bench.definitions import Group, Table
 from vdgs.bench.methods import BETA_G, BLOCKS, GAMMA, LAMBDA_VIS, T_LOW
 
-LAB = ("toy-uneven", "toy-even")
+LAB = ("toy-uneven", "toy-distant", "toy-even")
 
 
 def _sweep(title: str, prefix: str, values: tuple[float, ...]) -> Group:
