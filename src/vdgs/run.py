@@ -16,7 +16,7 @@ import yaml
 
 from vdgs import __version__
 from vdgs.config import MethodConfig, differences, from_dict, to_dict
-from vdgs.errors import RunError
+from vdgs.errors import RunError, VdgsError
 from vdgs.files import read_json, write_json, write_text
 from vdgs.stages.keys import StageKeys, stage_keys
 
@@ -147,11 +147,14 @@ class RunFolder:
         return self.path / "partition"
 
     def partition_facts(self) -> dict[str, Any]:
-        """What partition.json says; empty if the scene is not cut yet."""
+        """What partition.json says; empty if the scene is not cut yet. RunError if the file is damaged."""
         file = self.partition / "partition.json"
-        facts = read_json(file) if file.exists() else {}
+        try:
+            facts = read_json(file) if file.exists() else {}
+        except VdgsError:
+            facts = None
         if not isinstance(facts, dict):
-            raise RunError(f"{file}: is damaged. Delete it and run: vdgs partition {self.path}")
+            raise RunError(f"{file}: is damaged. Cut the scene again: vdgs partition {self.path}")
         return facts
 
     @property
