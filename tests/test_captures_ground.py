@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from captures_support import data_folder, moved, tiny_scene, write_colmap
@@ -101,6 +101,9 @@ def test_up_contradicts_a_georeference_that_is_asked_for(tmp_path):
 
 
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 1e-3))
+@example([0.0, 1e-05, -1.0])
+@example([0.0, 0.0, -1.0])
+@example([1e-170, 0.0, -1.0])
 def test_the_smallest_rotation_to_z(vector):
     unit = np.array(vector) / np.linalg.norm(vector)
     rotation = rotation_to_z(unit)

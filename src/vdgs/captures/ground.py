@@ -208,9 +208,11 @@ def _shape(points: np.ndarray) -> np.ndarray:
 def rotation_to_z(up: np.ndarray) -> np.ndarray:
     """The smallest rotation [3, 3] that takes the unit vector `up` to z (half a turn about x for -z)."""
     x, y, z = up / np.linalg.norm(up)
-    if z < -1 + 1e-9:
+    across = x * x + y * y
+    if z < 0 and across < 1e-300:
         return np.diag([1.0, -1.0, -1.0])
-    a = 1 / (1 + z)
+    # 1 / (1 + z) without its cancellation near -z.
+    a = 1 / (1 + z) if z >= 0 else (1 - z) / across
     return np.array([[1 - a * x * x, -a * x * y, -x], [-a * x * y, 1 - a * y * y, -y], [x, y, z]])
 
 
