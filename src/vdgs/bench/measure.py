@@ -30,6 +30,12 @@ GROUPS_FILE = "by_visibility.json"
 NAMES = ("squared_error", "ssim", "squared_error_cc", "ssim_cc")
 
 
+def evaluated(run: Path) -> Path:
+    """Where the figures of a run's final model are: the merged one, or the coarse one of a run without blocks."""
+    merged = run / "evaluation"
+    return merged if (merged / "metrics.json").exists() else run / "coarse" / "evaluation"
+
+
 def measure_groups(reference: Path, runs: Mapping[Path, str], bins: int, tell: Callable[[str], None]) -> None:
     """Write GROUPS_FILE into every run of a scene that has none for this reference and its key.
 
@@ -49,7 +55,7 @@ def measure_groups(reference: Path, runs: Mapping[Path, str], bins: int, tell: C
             photograph, seen = images.get(index), v_at(view.camera)
             mask = None if photograph.mask is None else photograph.mask.numpy() > 0
             for folder in left:
-                picture = _read_picture(folder / "evaluation" / "renders" / f"{stems[index]}.png")
+                picture = _read_picture(evaluated(folder) / "renders" / f"{stems[index]}.png")
                 histograms[folder].add(seen, pixel_values(picture, photograph.image.numpy(), mask), mask)
     for folder in left:
         write_json(folder / GROUPS_FILE, jsonable(wanted[folder] | {"groups": histograms[folder].bins(bins)}))

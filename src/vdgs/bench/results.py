@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from vdgs.bench.measure import GROUPS_FILE
+from vdgs.bench.measure import GROUPS_FILE, evaluated
 from vdgs.bench.plan import Plan, PlannedRun
 from vdgs.bench.processes import Ended
 from vdgs.bench.worker import RECORD
@@ -60,7 +60,7 @@ def as_json(results: list[Result]) -> list[dict[str, Any]]:
 
 def _read(output: Path, planned: PlannedRun) -> tuple[dict[str, float | None], tuple[dict[str, Any], ...]]:
     run = RunFolder(output / planned.folder)
-    metrics, record = read_json(run.evaluation / "metrics.json"), read_json(run.path / RECORD)
+    metrics, record = read_json(evaluated(run.path) / "metrics.json"), read_json(run.path / RECORD)
     figures: dict[str, float | None] = {name: metrics.get(name) for name in QUALITY}
     figures |= {"anchors": metrics.get("n_anchors"), "model_bytes": metrics.get("model_bytes"), "fps": metrics["fps"]}
     figures |= _costs(run, "blocks" in planned.stages, record.get("seconds", {}))
