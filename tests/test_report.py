@@ -276,7 +276,9 @@ def test_values_of_any_kind_are_survived(tmp_path, value):
         path = run.path / file
         if path.suffix == ".json":
             write(path, _replaced(json.loads(path.read_text()), value))
-    Page(write_report(run))
+    report = write_report(run)
+    Page(report)  # refuses tags that do not balance
+    assert report.read_text(encoding="utf-8").rstrip().endswith("</html>")
 
 
 def _replaced(content, value):
