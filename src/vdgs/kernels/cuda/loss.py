@@ -1,0 +1,78 @@
+"""Photometric loss on a GPU: L1 and SSIM with their gradient (source/loss.cu)."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vdgs.kernels.cuda.launching import Program
+from vdgs.kernels.reference.loss import Photometric, check_images
+
+#: Side of the tile that one block of threads does: kTile of the source.
+TILE_PX = 16
+PROGRAM = Program("loss.cu")
+
+
+def photometric_loss(
+    image: Float[Tensor, "h w 3"],
+    target: UInt8[Tensor, "h w 3"],
+    mask: UInt8[Tensor, "h w"] | None = None,
+    *,
+    ssim_weight: float = 0.2,
+    program: Program = PROGRAM,
+) -> Photometric:
+    """As `reference.loss.photometric_loss`, for float32 images on a CUDA device. Differentiable once.
+
+    Everything stays on the device and nothing waits for it. The gradient is computed together with the loss where the
+    image asks for one; until then 36 bytes a pixel are taken for it. Same bits every time. Raises TypeError for
+    tensors elsewhere, ValueError for tensors on several devices, CudaUnavailable where the kernel cannot be run.
+    """
+    check_images(image, target, mask)
+    if image.dtype != torch.float32:
+        raise TypeError(f"image must be float32, not {image.dtype}")
+    return Photometric(*_Photometric.apply(image, target, mask, ssim_weight, program))
+
+
+class _Photometric(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, mask: Tensor | None, ssim_weight: float, program: Program
+    ) -> tuple[Tensor, ...]:
+        pictures = [None if t is None else t.detach().contiguous() for t in (image, target, mask)]
+        loss, l1, ssim, ctx.gradient = _run(pictures, ssim_weight, ctx.needs_input_grad[0], program)
+        ctx.mark_non_differentiable(l1, ssim)
+        ctx.set_materialize_grads(False)
+        return loss, l1, ssim
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, scale: Tensor | None, *_: Any) -> tuple[Tensor | None, ...]:
+        # A product even with 1: to look at the number would wait for the device.
+        return None if scale is None else ctx.gradient * scale, None, None, None, None
+
+
+def _run(
+    pictures: list[Tensor | None], ssim_weight: float, with_gradient: bool, program: Program
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """Loss, L1, SSIM (scalars) and the gradient of the loss, for contiguous image, target and mask."""
+    image, _, mask = pictures
+    assert image is not None
+    height, width, _ = image.shape
+    size = ctypes.c_int(height), ctypes.c_int(width)
+    grid, block = (-(-width // TILE_PX), -(-height // TILE_PX)), (TILE_PX, TILE_PX)
+    tiles, weight = grid[0] * grid[1], ctypes.c_float(ssim_weight)
+
+    slopes = image.new_empty(3, height, width, 3) if with_gradient else None
+    sums = image.new_empty(tiles, 2, dtype=torch.float64)
+    program.launch("photometric_forward", grid, block, *pictures, *size, slopes, sums)
+    kept = image.new_full((1,), height * width, dtype=torch.int64) if mask is None else (mask != 0).sum()
+    loss, l1, ssim = (image.new_empty(()) for _ in range(3))
+    program.launch("photometric_total", (1,), block, sums, ctypes.c_int(tiles), kept, weight, loss, l1, ssim)
+    gradient = torch.empty_like(image) if with_gradient else None
+    if gradient is not None:
+        program.launch("photometric_backward", grid, block, *pictures, *size, slopes, kept, weight, gradient)
+    return loss, l1, ssim, gradient

@@ -1,0 +1,71 @@
+"""A stand-in for the CUDA driver that runs a kernel's own text on the processor (cuda_on_host.h)."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from vdgs.kernels.cuda.driver import Grid
+from vdgs.kernels.cuda.launching import read_source
+
+HERE = Path(__file__).parent
+
+
+def host_compiler() -> str | None:
+    """A C++ compiler of this machine, if there is one."""
+    return next(filter(None, map(shutil.which, filter(None, (os.environ.get("CXX"), "c++", "g++", "clang++")))), None)
+
+
+def build_on_host(source: str, folder: Path) -> ctypes.CDLL:
+    """A source of vdgs.kernels.cuda as a library for the processor; `host_NAME` runs one thread of a kernel."""
+    text = read_source(source)
+    kernels = re.findall(r'extern "C" __global__ void(?: __launch_bounds__\(\w+\))?\s+(\w+)\(', text)
+    assert kernels, f"no kernel in {source}"
+    exported = "\n".join(f"HOST_KERNEL({name})" for name in kernels)
+    (folder / "host.cpp").write_text(f'#include "cuda_on_host.h"\n{text}\n{exported}\n')
+    library = folder / "host.so"
+    command = [str(host_compiler()), "-std=c++17", "-O1", "-fPIC", "-shared", "-I", str(HERE), str(folder / "host.cpp")]
+    done = subprocess.run([*command, "-o", str(library)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return ctypes.CDLL(str(library))
+
+
+class HostDriver:
+    """`vdgs.kernels.cuda.driver.Driver` on tensors in main memory."""
+
+    device_type = "cpu"
+
+    def __init__(self, library: ctypes.CDLL, backwards: bool = False):
+        self._library, self.backwards = library, backwards
+        #: Modules loaded and kernels launched: (name, grid, block).
+        self.loaded: list[bytes] = []
+        self.launched: list[tuple[str, Grid, Grid]] = []
+        self._names: dict[int, str] = {}
+
+    def capability(self, device: torch.device) -> tuple[int, int]:
+        return 8, 6
+
+    def load(self, code: bytes, device: torch.device) -> int:
+        self.loaded.append(code)
+        return len(self.loaded)
+
+    def function(self, module: int, name: str) -> int:
+        address = ctypes.cast(getattr(self._library, f"host_{name}"), ctypes.c_void_p).value
+        assert address is not None
+        self._names[address] = name
+        return address
+
+    def launch(self, function: int, grid: Grid, block: Grid, device: torch.device, arguments: Any) -> None:
+        self.launched.append((self._names[function], grid, block))
+        whole = self._library.host_launch(
+            ctypes.c_void_p(function), (ctypes.c_uint * 3)(*grid), (ctypes.c_uint * 3)(*block), arguments,
+            int(self.backwards),
+        )  # fmt: skip
+        assert whole, "some threads of a block ended while others wait for them"
