@@ -74,6 +74,17 @@ def _run(verb: str, arguments: list[str]) -> int:
     except OSError as error:  # a disk that is full, a folder that cannot be written: no news from a traceback
         print(f"vdgs {verb}: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
         return 1
+    except (MemoryError, RuntimeError) as error:
+        from vdgs.memory import is_out_of_memory
+
+        if not is_out_of_memory(error):
+            raise
+        print(
+            f"vdgs {verb}: out of memory ({str(error).strip().splitlines()[0] if str(error) else 'no room'}). What was "
+            "saved is kept. Smaller photographs (--downscale 2), a smaller --width or fewer --jobs need less.",
+            file=sys.stderr,
+        )
+        return 1
 
 
 if __name__ == "__main__":

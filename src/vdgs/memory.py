@@ -1,15 +1,46 @@
-"""How much memory this process takes, and took at most."""
+"""How much memory this process takes, took at most and may still take; and what a failure to get some looks like."""
 
 from __future__ import annotations
 
 import ctypes
+import errno
 import gc
 import resource
 import sys
 from contextlib import suppress
 from pathlib import Path
 
+import psutil
+
 from vdgs.kernels.native import module
+
+#: How the libraries word it: torch on the CPU (Linux, Windows), C++, OpenCV.
+OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "Insufficient memory", "CUDA out of memory")
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an exception means that memory could not be had, in main memory or on a card."""
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        return True
+    return any(words in str(error) for words in OUT_OF_MEMORY)
+
+
+def available_bytes() -> int:
+    """What this process may still take: of the machine's free memory, of its container's, of its own limit."""
+    free = [psutil.virtual_memory().available]
+    with suppress(OSError, ValueError):  # a Linux control group that sets a limit
+        group = Path("/sys/fs/cgroup")
+        free.append(int((group / "memory.max").read_text()) - _taken_by(group))
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY:
+        free.append(limit - psutil.Process().memory_info().vms)
+    return max(0, min(free))
+
+
+def _taken_by(group: Path) -> int:
+    """Memory of a control group that is not a mere copy of files."""
+    facts = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+    return int((group / "memory.current").read_text()) - int(facts["inactive_file"])
 
 
 def peak_memory_bytes() -> int:

@@ -67,6 +67,8 @@ class TrainingState:
     #: Time spent and largest memory used so far, over all processes that worked on this state.
     seconds: float = 0.0
     peak_memory_bytes: int = 0
+    #: False while a step changes tensors: one that is broken off there leaves no state that may be saved.
+    whole: bool = True
 
 
 @dataclass(frozen=True)
@@ -164,6 +166,8 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
     (image_gradient,) = torch.autograd.grad(photometric.loss, image)
     gradients = drawn.backward(image_gradient, volume_weight)
+    psnr = _psnr(image.detach(), target, mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
+    state.whole = False
     _move(state, stage, rows, gradients, weights, camera)
 
     growing = iteration + 1 <= config.growth.until * config.iterations
@@ -175,7 +179,8 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
         report = replace(report, **grow(state, stage))
     if state.iteration % REORDER_INTERVAL == 0:
         reorder(state)
-    _smooth(state, value, image.detach(), target, mask)
+    _smooth(state, value, psnr)
+    state.whole = True
     return report
 
 
@@ -296,14 +301,18 @@ def mean_colour(images: TrainingImages, count: int, downscale: int, at_most: int
     return red, green, blue
 
 
-def _smooth(state: TrainingState, loss: float, image: Tensor, target: Tensor, mask: Tensor | None) -> None:
-    """Update the smoothed loss and, every tenth step, PSNR (for people and for the divergence check)."""
+def _psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float | None:
+    """PSNR of a training view; None where the mask keeps nothing."""
+    squared = (image.clamp(0, 1) - target.float() / 255.0) ** 2
+    counted = squared if mask is None else squared[mask > 0]
+    return -10.0 * math.log10(max(float(counted.mean()), 1e-10)) if counted.numel() else None
+
+
+def _smooth(state: TrainingState, loss: float, psnr: float | None) -> None:
+    """Update the smoothed loss and, where it was taken, PSNR (for people and for the divergence check)."""
     state.loss = _moving(state.loss, loss, 0.98)
-    if state.iteration % PSNR_INTERVAL == 0:
-        squared = (image.clamp(0, 1) - target.float() / 255.0) ** 2
-        counted = squared if mask is None else squared[mask > 0]
-        if counted.numel():
-            state.psnr = _moving(state.psnr, -10.0 * math.log10(max(float(counted.mean()), 1e-10)), 0.9)
+    if psnr is not None:
+        state.psnr = _moving(state.psnr, psnr, 0.9)
     if state.iteration > 100:
         state.best_loss = min(state.best_loss, state.loss)
         if state.loss > 0.3 and state.loss > 4 * state.best_loss:

@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image
 
 from vdgs.errors import CaptureError
+from vdgs.memory import is_out_of_memory
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
 #: Headers that announce more pixels than this are refused rather than decoded.
@@ -141,13 +142,17 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: cannot be read ({error.strerror or error}).") from error
     try:
         pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
-    except cv2.error:
+    except cv2.error as error:
+        if is_out_of_memory(error):
+            raise
         pixels = None
     if pixels is not None and pixels.ndim in (2, 3) and (pixels.ndim == 2 or pixels.shape[2] in (3, 4)):
         return pixels
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))[:, :, ::-1]
+    except MemoryError:
+        raise
     except Exception as error:  # whatever Pillow finds wrong with it
         raise CaptureError(f"{path}: cannot be decoded ({error}). Copy it again or remove it.") from None
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import torch
 from rich.console import Console
 
@@ -24,6 +23,7 @@ from vdgs.config_checks import validate
 from vdgs.decoder import Decoder
 from vdgs.errors import VdgsError
 from vdgs.files import read_json, write_json
+from vdgs.memory import available_bytes
 from vdgs.run import RunFolder
 from vdgs.run_options import WatchOptions
 from vdgs.stages.watching import continue_or_start, finish, train_watched
@@ -111,7 +111,7 @@ def camera_height(capture: Capture) -> float:
 
 def image_budget(options: WatchOptions) -> int:
     """Bytes for decoded photographs."""
-    return int(options.image_memory_gb * 1e9) or psutil.virtual_memory().available // 4
+    return int(options.image_memory_gb * 1e9) or available_bytes() // 4
 
 
 def _train(run: RunFolder, capture: Capture, config: TrainConfig, options: WatchOptions, console: Console) -> None:
@@ -120,15 +120,14 @@ def _train(run: RunFolder, capture: Capture, config: TrainConfig, options: Watch
     anchors, voxel = initial_anchors(
         capture.points, capture.point_colours, [view.camera for view in views], config.anchors
     )
-    budget = image_budget(options)
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
-    with ImageCache(views, budget, downscales=factors) as images:
+    with ImageCache(views, image_budget(options), downscales=factors) as images:
         background = (0.0, 0.0, 0.0)
         if config.loss.background != "black":
             background = mean_colour(images, len(views), factors[-1])
         stage = Stage(config, images, len(views), voxel, camera_height(capture), background)
         state = continue_or_start(folder, stage, lambda: _start(anchors, stage), console)
-        _announce(capture, state, config, budget, console)
+        _announce(capture, state, config, console)
         train_watched(folder, state, stage, options, console)
     facts = {"capture": capture_facts(capture), "version": __version__, "iterations": state.iteration}
     finish(folder, state, AnchorModel(state.anchors, state.decoder, voxel, background, facts), console)
@@ -143,14 +142,11 @@ def _start(anchors: Anchors, stage: Stage) -> TrainingState:
     return start_state(anchors, decoder, stage)
 
 
-def _announce(capture: Capture, state: TrainingState, config: TrainConfig, budget: int, console: Console) -> None:
+def _announce(capture: Capture, state: TrainingState, config: TrainConfig, console: Console) -> None:
     camera = capture.train_views[0].camera
-    pixels = sum(view.camera.width * view.camera.height for view in capture.train_views)
     console.print(
         f"{capture.root} ({capture.images}): {len(capture.train_views)} training and {len(capture.test_views)} test "
         f"views of {camera.width}x{camera.height}, {len(capture.points):,} points, {len(state.anchors):,} anchors, "
-        f"{config.iterations:,} iterations\n"
-        f"memory: images {min(budget, 3 * pixels * 4 // 3) / 1e9:.2f} GB (at most {budget / 1e9:.1f}), "
-        "about 1 kB an anchor, 2.5 kB while it is in view",
+        f"{config.iterations:,} iterations",
         highlight=False,
     )

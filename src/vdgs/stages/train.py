@@ -9,12 +9,12 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-import psutil
 from rich.console import Console
 
 from vdgs.errors import RunError, VdgsError
 from vdgs.executors.local import Job, default_jobs, run_jobs
 from vdgs.kernels.native.module import threads as threads_available
+from vdgs.memory import available_bytes
 from vdgs.run import RunFolder, StageFolder
 from vdgs.run_options import WatchOptions
 from vdgs.stages.block import blocks_of
@@ -43,7 +43,7 @@ def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console)
         if not left:
             console.print(f"{path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
             return
-        free = psutil.virtual_memory().available
+        free = available_bytes()
         at_once, threads = default_jobs(len(left), threads_available(), free, _block_bytes(run))
         if jobs:
             at_once, threads = min(jobs, len(left)), max(1, threads_available() // min(jobs, len(left)))

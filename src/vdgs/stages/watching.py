@@ -3,38 +3,37 @@
 from __future__ import annotations
 
 import math
+import re
 import signal
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import cv2
 from rich.console import Console
 
 from vdgs.anchors import AnchorModel
 from vdgs.checkpoints import discard_after, load_newest, save_state
 from vdgs.errors import RunError, TrainingDiverged, VdgsError
-from vdgs.memory import peak_memory_bytes, return_unused
+from vdgs.memory import is_out_of_memory, peak_memory_bytes, return_unused
 from vdgs.run import StageFolder
 from vdgs.run_options import WatchOptions
+from vdgs.stages.memory_notes import after_failure, announce, kind_of, need_of
 from vdgs.stages.progress import TrainingProgress
 from vdgs.tensor_files import size_and_checksum
 from vdgs.training import Stage, StepReport, TrainingState, from_saved, to_saved, train
 
-#: What to do about a diverging loss and about missing memory, in the coarse stage and in a block.
+#: What to do about a diverging loss, in the coarse stage and in a block.
 AFTER_DIVERGENCE = {
     "coarse": "Lower --rates.* or raise --growth.threshold in a new --output, and look at the photographs with "
     "`vdgs inspect`.",
     "block": "Lower --block.offset-rate and --block.feature-rate or raise --block.growth.threshold (with --redo).",
 }
-SAVE_MEMORY = {
-    "coarse": "Three settings help, in a new --output: smaller photographs (--images images_4, or --downscale 2), "
-    "fewer anchors (--growth.max-anchors), less memory for photographs (--image-memory-gb, also when this run is "
-    "continued).",
-    "block": "Three settings help: fewer blocks at once (--jobs 1), more and smaller blocks (vdgs partition --blocks), "
-    "fewer anchors (--block.growth.max-anchors).",
-}
+#: As what missing memory arrives, among others (`is_out_of_memory`): from Python and C++, torch, the system, OpenCV.
+MEMORY_ERRORS = (MemoryError, RuntimeError, OSError, cv2.error)
 #: Seconds between two notes of the progress in status.json.
 STATUS_SECONDS = 2.0
 
@@ -82,10 +81,11 @@ def train_watched(
 ) -> None:
     """Train to the end of the stage, showing, logging and saving on the way.
 
-    Raises Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged and VdgsError (out of memory, a photograph
-    that is gone, a full disk), each with what is kept.
+    Says first how much memory it will take. Raises Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged and
+    VdgsError (out of memory, a photograph that is gone, a full disk), each with what is kept.
     """
-    kind = "block" if stage.frozen_decoder else "coarse"
+    kind, need = kind_of(stage), need_of(state, stage)
+    announce(need, kind, console)
     try:
         with stop_requests() as stop:
             folder.set_status("running", iteration=state.iteration, iterations=stage.config.iterations)
@@ -93,12 +93,15 @@ def train_watched(
     except TrainingDiverged as error:
         folder.set_status("failed", iteration=state.iteration, why=str(error))
         raise TrainingDiverged(f"{error} {_kept(folder)} {AFTER_DIVERGENCE[kind]}") from error
-    except (MemoryError, RuntimeError) as error:
+    except MEMORY_ERRORS as error:
         if not is_out_of_memory(error):
             raise
+        traceback.clear_frames(error.__traceback__)  # they hold the pictures and splats of the step that failed
+        kept = _rescue(folder, state)
         folder.set_status("failed", iteration=state.iteration, why="out of memory")
         raise VdgsError(
-            f"{folder.path}: out of memory with {len(state.anchors):,} anchors. {_kept(folder)} {SAVE_MEMORY[kind]}"
+            f"{folder.path}: out of memory with {len(state.anchors):,} anchors{_wanted(error)}. {kept} "
+            + after_failure(need, state, stage)
         ) from error
     except VdgsError as error:  # a photograph that is gone, a full disk: every step so far is whole
         folder.set_status("failed", iteration=state.iteration, why=str(error))
@@ -135,10 +138,6 @@ def identity(model: Path) -> str:
     return f"{size}-{checksum:08x}"
 
 
-def is_out_of_memory(error: BaseException) -> bool:
-    return isinstance(error, MemoryError) or "not enough memory" in str(error) or "bad_alloc" in str(error)
-
-
 def _loop(
     folder: StageFolder, state: TrainingState, stage: Stage, options: WatchOptions, console: Console,
     stop: Callable[[], bool],
@@ -168,6 +167,28 @@ def _kept(folder: StageFolder) -> str:
     if kept is None:
         return "No state was saved yet."
     return f"The state of iteration {kept.iteration} is kept in {folder.checkpoints}."
+
+
+def _rescue(folder: StageFolder, state: TrainingState) -> str:
+    """Save the state after memory ran out, if every step of it is whole and there is room; what is kept then."""
+    return_unused()
+    if state.whole:
+        try:
+            save_state(folder.checkpoints, to_saved(state))
+        except (VdgsError, *MEMORY_ERRORS):
+            pass  # what was saved before is still there
+        else:
+            return f"The state of iteration {state.iteration} is saved in {folder.checkpoints}."
+    try:
+        return _kept(folder)
+    except MEMORY_ERRORS:
+        return f"States that were saved before are kept in {folder.checkpoints}."
+
+
+def _wanted(error: BaseException) -> str:
+    """How much was asked for in vain, where the error says so."""
+    asked = re.search(r"allocate ([\d.]+) (bytes|[KMG]iB)", str(error))
+    return f" ({asked.group(1)} {asked.group(2)} more could not be had)" if asked else ""
 
 
 class _Clock:

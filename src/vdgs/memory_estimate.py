@@ -1,0 +1,141 @@
+"""How much memory training will take, before it takes it, and which settings make it less.
+
+The figures per anchor and per pixel are measured: `benchmarks/step.py`, docs/results.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+Kind = Literal["coarse", "block"]
+
+#: A process of vdgs with everything imported.
+PROGRAM_BYTES = 350_000_000
+#: The picture being trained on: itself, its gradient, its target, what the rasteriser notes, the next ones in advance.
+BYTES_PER_PIXEL = 150
+#: What a step makes of an anchor in view, for each of its Gaussians (measured with ten: 1.55 kB an anchor).
+STEP_BYTES_PER_OFFSET = 155
+#: Anchors may grow to so many times their number where nothing limits them (choice; real captures: 1.2 to 3).
+GROWTH = 3.0
+#: Numbers of an anchor apart from its offsets: place, feature, log-scales.
+PLAIN_FLOATS = 3 + 32 + 6
+
+
+@dataclass(frozen=True)
+class Need:
+    """What training works on, as far as memory is concerned."""
+
+    #: Anchors when it starts, and at most (0: no limit, `GROWTH` times as many).
+    anchors: int
+    max_anchors: int
+    #: Gaussians of an anchor.
+    offsets: int
+    #: Largest share of the anchors that one photograph sees.
+    seen: float
+    #: Pixels of the largest photograph.
+    pixels: int
+    #: Decoded photographs that are kept.
+    images_bytes: int
+    #: Anchors that are drawn but never move.
+    surroundings: int = 0
+
+    @property
+    def grown(self) -> int:
+        """Anchors at the end: `max_anchors` stops growth and removes nothing."""
+        free = round(GROWTH * self.anchors)
+        return max(self.anchors, min(free, self.max_anchors)) if self.max_anchors else free
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Bytes, by what takes them."""
+
+    program: int
+    images: int
+    picture: int
+    anchors: int
+    grown_anchors: int
+
+    @property
+    def start(self) -> int:
+        return self.program + self.images + self.picture + self.anchors
+
+    @property
+    def total(self) -> int:
+        """With anchors grown."""
+        return self.program + self.images + self.picture + self.grown_anchors
+
+
+@dataclass(frozen=True)
+class Advice:
+    """A setting that saves memory: its option, what it needs, and the bytes that it saves by estimate."""
+
+    setting: str
+    saves: int
+
+    def __str__(self) -> str:
+        return f"{self.setting} saves about {in_gb(self.saves)}"
+
+
+def bytes_per_anchor(offsets: int, seen: float) -> float:
+    """Parameters, two moments and statistics of an anchor, and what steps make of the share that is in view."""
+    kept = 4 * (3 * (PLAIN_FLOATS + 3 * offsets) + 2 * offsets + 2)
+    return kept + seen * STEP_BYTES_PER_OFFSET * offsets
+
+
+def estimate(need: Need) -> Estimate:
+    """What training takes, at its start and once its anchors have grown."""
+    each = bytes_per_anchor(need.offsets, need.seen)
+    in_view = need.seen * STEP_BYTES_PER_OFFSET * need.offsets
+    frozen = need.surroundings * (4 * (PLAIN_FLOATS + 3 * need.offsets) + in_view)
+    return Estimate(
+        PROGRAM_BYTES, need.images_bytes, BYTES_PER_PIXEL * need.pixels,
+        round(each * need.anchors + frozen), round(each * need.grown + frozen),
+    )  # fmt: skip
+
+
+def advice(need: Need, kind: Kind, to_save: int) -> list[Advice]:
+    """Settings that help, the one that saves most first. `to_save` bytes decide how low a limit of anchors must be.
+
+    What would save less than a hundredth of the whole is left out.
+    """
+    whole = estimate(need)
+    found = [_fewer_anchors(need, kind, to_save)]
+    if kind == "coarse":
+        smaller = estimate(replace(need, pixels=need.pixels // 4, images_bytes=need.images_bytes // 4))
+        found.append(Advice("--downscale 2 or --images images_2 (smaller photographs)", whole.total - smaller.total))
+    else:
+        half = estimate(replace(need, anchors=need.anchors // 2))
+        found.append(Advice("vdgs partition with twice the --blocks (smaller blocks)", whole.total - half.total))
+        found.append(Advice("one less of --jobs (blocks at once)", whole.total))
+    kept = min(need.images_bytes, 50_000_000)
+    found.append(
+        Advice(f"--image-memory-gb {kept / 1e9:.2f} (fewer photographs kept in memory)", need.images_bytes - kept)
+    )
+    worth = [each for each in found if each.saves > whole.total / 100]
+    return sorted(worth, key=lambda each: -each.saves)
+
+
+def _fewer_anchors(need: Need, kind: Kind, to_save: int) -> Advice:
+    """A limit of anchors that saves `to_save` bytes, if one does: growth can be forbidden, but no anchor removed."""
+    option = "--growth.max-anchors" if kind == "coarse" else "--block.growth.max-anchors"
+    too_many = to_save / bytes_per_anchor(need.offsets, need.seen)
+    limit = max(need.anchors, int(need.grown - too_many) // 1000 * 1000, 1)
+    saved = estimate(need).total - estimate(replace(need, max_anchors=limit)).total
+    return Advice(f"{option} {limit} (less growth)", saved)
+
+
+def describe(found: Estimate, available: int, place: str) -> str:
+    """One line: what is needed, what for, and what there is."""
+    grown = f", {in_gb(found.grown_anchors)} once they have grown" if found.grown_anchors > found.anchors else ""
+    return (
+        f"memory by estimate: {in_gb(found.start)} at the start, {in_gb(found.total)} at most (photographs "
+        f"{in_gb(found.images)}, one picture {in_gb(found.picture)}, anchors {in_gb(found.anchors)}{grown}); "
+        f"{place} has {in_gb(available)} free"
+    )
+
+
+def in_gb(size: int) -> str:
+    """Bytes for people."""
+    return f"{size / 1e9:.2f} GB" if size < 10e9 else f"{size / 1e9:.0f} GB"
