@@ -1,40 +1,21 @@
-"""Training under the eyes of a person: shown, logged, saved, stopped and continued. The same for every stage."""
+"""Training under the eyes of a person: logged, saved, stopped and continued. The same for every kind of state."""
 
 from __future__ import annotations
 
-import math
 import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
 
 from rich.console import Console
 
-from vdgs.anchors import AnchorModel
-from vdgs.checkpoints import discard_after, load_newest, save_state
+from vdgs.checkpoints import SavedState, discard_after, load_newest, save_state
 from vdgs.errors import RunError, TrainingDiverged, VdgsError
 from vdgs.memory import peak_memory_bytes, return_unused
 from vdgs.run import StageFolder
-from vdgs.run_options import WatchOptions
-from vdgs.stages.progress import TrainingProgress
-from vdgs.tensor_files import size_and_checksum
-from vdgs.training import Stage, StepReport, TrainingState, from_saved, to_saved, train
 
-#: What to do about a diverging loss and about missing memory, in the coarse stage and in a block.
-AFTER_DIVERGENCE = {
-    "coarse": "Lower --rates.* or raise --growth.threshold in a new --output, and look at the photographs with "
-    "`vdgs inspect`.",
-    "block": "Lower --block.offset-rate and --block.feature-rate or raise --block.growth.threshold (with --redo).",
-}
-SAVE_MEMORY = {
-    "coarse": "Three settings help, in a new --output: smaller photographs (--images images_4, or --downscale 2), "
-    "fewer anchors (--growth.max-anchors), less memory for photographs (--image-memory-gb, also when this run is "
-    "continued).",
-    "block": "Three settings help: fewer blocks at once (--jobs 1), more and smaller blocks (vdgs partition --blocks), "
-    "fewer anchors (--block.growth.max-anchors).",
-}
 #: Seconds between two notes of the progress in status.json.
 STATUS_SECONDS = 2.0
 
@@ -45,12 +26,48 @@ class Stopped(VdgsError):
     stopped = True
 
 
-def continue_or_start(
-    folder: StageFolder, stage: Stage, start: Callable[[], TrainingState], console: Console
-) -> TrainingState:
+class WatchedState(Protocol):
+    """What every state of a training says of itself."""
+
+    iteration: int
+    seconds: float
+    peak_memory_bytes: int
+
+
+State = TypeVar("State", bound=WatchedState)
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """A training as the one who watches it sees it."""
+
+    folder: StageFolder
+    state: WatchedState
+    #: The whole state as it is saved.
+    to_saved: Callable[[], SavedState]
+    #: Where training stands, for status.json.
+    facts: Callable[[], dict[str, Any]]
+    #: How large the model is, in words ("12,000 anchors").
+    size: Callable[[], str]
+    #: What a person may do about a loss that diverges, and about missing memory.
+    after_divergence: str
+    save_memory: str
+
+    def save(self) -> None:
+        save_state(self.folder.checkpoints, self.to_saved())
+
+
+def restore_or_start(
+    folder: StageFolder,
+    iterations: int,
+    start: Callable[[], State],
+    restore: Callable[[SavedState], State],
+    advice: str,
+    console: Console,
+) -> State:
     """The newest whole state in the folder, or a new one; the log ends where the state does.
 
-    Raises RunError for a state that this version cannot read or that is beyond the last iteration.
+    Raises RunError, with `advice`, for a state that this version cannot read, and for one beyond the last iteration.
     """
     folder.checkpoints.mkdir(parents=True, exist_ok=True)
     saved, complaints = load_newest(folder.checkpoints)
@@ -62,105 +79,80 @@ def continue_or_start(
         state = start()
     else:
         try:
-            state = from_saved(saved, stage)
+            state = restore(saved)
         except (KeyError, TypeError, ValueError) as error:
-            raise RunError(
-                f"{folder.checkpoints}: holds a state of another version ({error}). Start a new --output."
-            ) from error
-        if state.iteration > stage.config.iterations:
-            raise RunError(
-                f"{folder.checkpoints}: is at iteration {state.iteration}, beyond {stage.config.iterations}."
-            )
+            raise RunError(f"{folder.checkpoints}: holds a state of another version ({error}). {advice}") from error
+        if state.iteration > iterations:
+            raise RunError(f"{folder.checkpoints}: is at iteration {state.iteration}, beyond {iterations}.")
         discard_after(folder.checkpoints, state.iteration)
         console.print(f"continuing at iteration {state.iteration}")
     folder.cut_log(state.iteration)
     return state
 
 
-def train_watched(
-    folder: StageFolder, state: TrainingState, stage: Stage, options: WatchOptions, console: Console
-) -> None:
-    """Train to the end of the stage, showing, logging and saving on the way.
+def watch(training: Watched, loop: Callable[[Callable[[], bool]], bool]) -> None:
+    """Run `loop(stop)`, which trains until complete (True) or asked to stop, and note in status.json how it ends.
 
     Raises Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged and VdgsError (out of memory, a photograph
     that is gone, a full disk), each with what is kept.
     """
-    kind = "block" if stage.frozen_decoder else "coarse"
+    folder, state = training.folder, training.state
     try:
         with stop_requests() as stop:
-            folder.set_status("running", iteration=state.iteration, iterations=stage.config.iterations)
-            complete = _loop(folder, state, stage, options, console, stop)
+            folder.set_status("running", **training.facts())
+            complete = loop(stop)
     except TrainingDiverged as error:
         folder.set_status("failed", iteration=state.iteration, why=str(error))
-        raise TrainingDiverged(f"{error} {_kept(folder)} {AFTER_DIVERGENCE[kind]}") from error
+        raise TrainingDiverged(f"{error} {_kept(folder)} {training.after_divergence}".rstrip()) from error
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
         folder.set_status("failed", iteration=state.iteration, why="out of memory")
         raise VdgsError(
-            f"{folder.path}: out of memory with {len(state.anchors):,} anchors. {_kept(folder)} {SAVE_MEMORY[kind]}"
+            f"{folder.path}: out of memory with {training.size()}. {_kept(folder)} {training.save_memory}"
         ) from error
     except VdgsError as error:  # a photograph that is gone, a full disk: every step so far is whole
         folder.set_status("failed", iteration=state.iteration, why=str(error))
-        save_state(folder.checkpoints, to_saved(state))
+        training.save()
         raise
     if not complete:
-        save_state(folder.checkpoints, to_saved(state))
-        folder.set_status("stopped", iteration=state.iteration, iterations=stage.config.iterations)
+        training.save()
+        folder.set_status("stopped", **training.facts())
         raise Stopped(f"Stopped at iteration {state.iteration}; saved. The same command continues.")
 
 
-def finish(folder: StageFolder, state: TrainingState, model: AnchorModel, console: Console) -> None:
-    """Save the model of a stage that is complete, mark it done and say so."""
-    save_state(folder.checkpoints, to_saved(state))
-    model.save(folder.model)
-    folder.set_status(
-        "done", iteration=state.iteration, iterations=state.iteration, anchors=len(state.anchors),
-        model=identity(folder.model),
-        seconds=state.seconds, psnr_training=None if math.isnan(state.psnr) else state.psnr,
-        peak_memory_bytes=state.peak_memory_bytes,
-    )  # fmt: skip
-    minutes, seconds = divmod(round(state.seconds), 60)
-    console.print(
-        f"trained {state.iteration} iterations in {minutes} min {seconds} s: {len(state.anchors):,} anchors, "
-        f"PSNR of training views {state.psnr:.2f} dB, peak memory {state.peak_memory_bytes / 1e9:.1f} GB\n"
-        f"model: {folder.model}",
-        highlight=False,
-    )
+class Keeper:
+    """After every step: the state's account of time and memory (across interruptions), saved states, status.json."""
 
+    def __init__(self, training: Watched, save_every: int):
+        self._training, self._save_every = training, save_every
+        self._last = self._noted = time.monotonic()
 
-def identity(model: Path) -> str:
-    """What tells this model file from any other."""
-    size, checksum = size_and_checksum(model)
-    return f"{size}-{checksum:08x}"
+    def tick(self) -> None:
+        """Add the time since the last step to the state's account."""
+        now, state = time.monotonic(), self._training.state
+        state.seconds += now - self._last
+        state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
+        self._last = now
+
+    def keep(self, facts: Callable[[], dict[str, Any]], flush_log: Callable[[], None] | None = None) -> None:
+        """Save the state and note `facts` in status.json, each where it is time.
+
+        The log is flushed before the state is saved: a run that continues there must not miss lines of it.
+        """
+        training = self._training
+        if training.state.iteration % self._save_every == 0:
+            if flush_log is not None:
+                flush_log()
+            return_unused()
+            training.save()
+        if time.monotonic() - self._noted > STATUS_SECONDS:
+            self._noted = time.monotonic()
+            training.folder.set_status("running", **facts())
 
 
 def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or "not enough memory" in str(error) or "bad_alloc" in str(error)
-
-
-def _loop(
-    folder: StageFolder, state: TrainingState, stage: Stage, options: WatchOptions, console: Console,
-    stop: Callable[[], bool],
-) -> bool:  # fmt: skip
-    """Train until complete (True) or asked to stop."""
-    clock, board = _Clock(state), _board(folder, options, state.iteration)
-    noted = time.monotonic()
-    with TrainingProgress(console, folder, stage.config, state.iteration, board) as progress:
-
-        def after_step(state: TrainingState, report: StepReport) -> None:
-            nonlocal noted
-            clock.tick()
-            progress.step(state, report)
-            if state.iteration % options.save_every == 0:
-                progress.flush()  # before the state: a run that continues there must not miss lines of its log
-                return_unused()
-                save_state(folder.checkpoints, to_saved(state))
-            if time.monotonic() - noted > STATUS_SECONDS:
-                noted = time.monotonic()
-                folder.set_status("running", **progress.facts(state))
-
-        return train(state, stage, stop=stop, after_step=after_step)
 
 
 def _kept(folder: StageFolder) -> str:
@@ -168,19 +160,6 @@ def _kept(folder: StageFolder) -> str:
     if kept is None:
         return "No state was saved yet."
     return f"The state of iteration {kept.iteration} is kept in {folder.checkpoints}."
-
-
-class _Clock:
-    """Keeps the state's account of time and memory, across interruptions."""
-
-    def __init__(self, state: TrainingState):
-        self._state, self._last = state, time.monotonic()
-
-    def tick(self) -> None:
-        now = time.monotonic()
-        self._state.seconds += now - self._last
-        self._state.peak_memory_bytes = max(self._state.peak_memory_bytes, peak_memory_bytes())
-        self._last = now
 
 
 @contextmanager
@@ -199,13 +178,3 @@ def stop_requests() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _board(folder: StageFolder, options: WatchOptions, iteration: int) -> Any:
-    if not options.tensorboard:
-        return None
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise VdgsError('TensorBoard is not installed: pip install "vdgs[tensorboard]"') from error
-    return SummaryWriter(str(folder.path / "tensorboard"), purge_step=iteration)
