@@ -87,7 +87,7 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     print(describe())
     if arguments.run:
-        from vdgs.evaluation.of_run import open_run
+        from vdgs.stages.opening import open_run
 
         run = open_run(arguments.run)
         model, cameras = run.model, [view.camera for view in run.capture.train_views]

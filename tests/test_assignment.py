@@ -1,201 +1,24 @@
-"""Camera assignment: what a score means, whom each block gets, and what is kept of it."""
+"""Camera assignment: whom each block gets, and what is kept of it."""
 
 from __future__ import annotations
 
 import io
 import json
 from dataclasses import replace
-from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
-import shapely
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from captures_support import look_down
-from native_choice import every_instruction_set, on_threads, using
-from vdgs.anchors import AnchorModel, Anchors
-from vdgs.cameras import Camera
-from vdgs.config import AssignmentConfig
-from vdgs.decoder import Decoder
+from assignment_support import CONFIG, MODES, camera, hand_made, scene, skyward, strips
 from vdgs.errors import RunError
 from vdgs.kernels import native as kernels
 from vdgs.partition.assignment import ABOVE_THRESHOLD, BEST_BLOCK, NOT_ASSIGNED, TOPPED_UP, assign
 from vdgs.partition.assignment_tables import assignment_rows, assignment_table, explain
-from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.saving import load_scores, save_scores
-from vdgs.partition.scores import Scores, reduced, score_matrix, select_splats
-from vdgs.render import decode_rows, render, visible_rows
-
-MODES = ("coverage", "literal", "leave_one_out", "frustum")
-RENDERED = MODES[:3]
-CONFIG = AssignmentConfig(longest_side_px=48, min_cameras=0)
-WIDTH = 24.0
-
-
-@cache
-def scene() -> AnchorModel:
-    """Opaque ground 24 wide and 6 deep, anchors in random order."""
-    rng = np.random.default_rng(0)
-    x, y = np.meshgrid(np.arange(0.2, WIDTH, 0.4), np.arange(0.2, 6, 0.4))
-    ground = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    rng.shuffle(ground)
-    n, g = len(ground), torch.Generator().manual_seed(0)
-    anchors = Anchors(
-        positions=torch.from_numpy(ground.astype(np.float32)),
-        features=torch.randn(n, 32, generator=g),
-        offsets=0.3 * torch.randn(n, 4, 3, generator=g),
-        log_scales=torch.full((n, 6), float(np.log(0.6))),
-    )
-    tensors = Decoder.initial(4, False, 0, 1, g).tensors()
-    tensors["opacity_b2"] = tensors["opacity_b2"] + 3.0  # what is in view is opaque
-    tensors["colour_b2"] = tensors["colour_b2"] + 1.0  # and lighter than the black behind it
-    return AnchorModel(anchors, Decoder.from_tensors(tensors), 0.4, (0.5, 0.5, 0.5), {})
-
-
-def strips(count: int, margin: float = 0.5) -> Blocks:
-    """Blocks side by side along x."""
-    edges = np.linspace(0, WIDTH, count + 1)
-    cores = [shapely.box(a, 0, b, 6) for a, b in pairwise(edges)]
-    return Blocks(tuple(Block(core, core.buffer(margin, join_style="mitre")) for core in cores))
-
-
-def camera(x: float, y: float = 3.0, height: float = 4.0, tilt_deg: float = 0.0) -> Camera:
-    pose = look_down(np.array([x, y, height]), tilt_deg, 90.0)
-    return Camera(pose, 70.0, 70.0, 32.0, 24.0, 64, 48)
-
-
-def flight() -> list[Camera]:
-    return [camera(float(x), tilt_deg=tilt) for x, tilt in zip(np.linspace(1, 23, 9), [0, 20, 0] * 3, strict=True)]
-
-
-def skyward() -> Camera:
-    """A camera beneath which lies the last of four strips, and that sees nothing."""
-    return camera(22.0, height=5.0, tilt_deg=180.0)
-
-
-def hand_made(scores, held=None, mode="coverage") -> Scores:
-    values = np.array(scores, np.float32)
-    held = (values > 0).astype(np.int32) if held is None else np.array(held, np.int32)
-    anchors = np.full(values.shape[1], 1000, np.int64)
-    return Scores(mode, values, held, values.copy(), anchors, np.zeros(len(values), np.int64))
-
-
-# What a score means
-
-
-@pytest.mark.parametrize("mode", RENDERED)
-def test_one_block_is_the_whole_scene(mode):
-    config = replace(CONFIG, mode=mode)
-    scores = score_matrix(scene(), strips(1), [*flight(), skyward()], config)
-    assert np.array_equal(scores.covered[:, 0], [1.0] * 9 + [0.0])
-    assert np.array_equal(scores.held[:, 0] > 0, [True] * 9 + [False])
-    if mode == "leave_one_out":
-        assert (scores.scores[:9, 0] > 0.5).all()
-    else:
-        assert np.array_equal(scores.scores[:, 0], [1.0] * 9 + [float(mode == "literal")])
-
-
-@every_instruction_set
-def test_the_splats_of_a_block_draw_what_the_block_alone_draws(instructions):
-    model, blocks, view = scene(), strips(3), camera(8.0, tilt_deg=30.0)
-    places = model.anchors.positions[:, :2].double().numpy()
-    with using(instructions), torch.no_grad():
-        rows = visible_rows(model.anchors, view)
-        splats = decode_rows(model.anchors, rows, model.decoder.weights, view)
-        anchor = rows[splats.source.long() // 4]
-        for index in range(3):
-            reached = torch.from_numpy(blocks.reaches(index, places))
-            some = select_splats(splats, reached[anchor].nonzero().squeeze(1))
-            ours = kernels.rasterise(
-                some.means_px, some.conics, some.colours, some.opacities, some.depths, torch.zeros(3),
-                view.width, view.height,
-            )  # fmt: skip
-            alone = render(replace(model, anchors=model.anchors.select(reached)), view, background=(0.0, 0.0, 0.0))
-            assert torch.equal(ours.image, alone.image)
-            assert torch.equal(ours.alpha, alone.alpha)
-
-
-def expected_scores(mode: str, model: AnchorModel, blocks: Blocks, view: Camera) -> list[float]:
-    """The definitions, block by block, from whole renders of parts of the model."""
-    positions, black = model.anchors.positions, (0.0, 0.0, 0.0)
-    places = positions[:, :2].double().numpy()
-    part = lambda keep: replace(model, anchors=model.anchors.select(torch.from_numpy(keep)))  # noqa: E731
-    small = reduced(view, CONFIG)
-    full, scores = render(model, small, background=black), []
-    for index in range(len(blocks)):
-        own = blocks.owner(places) == index
-        block = render(part(blocks.reaches(index, places)), small, background=black)
-        alike = (block.image - full.image).abs().mean(-1) < CONFIG.tau
-        if mode == "coverage":
-            drawn = full.alpha > 0.5
-            scores.append(float((alike & drawn & (block.alpha > 0.5)).sum() / drawn.sum()))
-        elif mode == "literal":
-            scores.append(float(alike.float().mean()))
-        elif mode == "frustum":
-            scores.append(float(view.sees(positions.double().numpy()[own]).mean()))
-        else:
-            rest = render(part(~own), small, background=black).image
-            target = (full.image.clamp(0, 1) * 255).round().to(torch.uint8)
-            scores.append(1 - float(kernels.photometric_loss(rest, target, None).ssim))
-    return scores
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_scores_are_what_whole_renders_give(mode):
-    blocks, views = strips(4), flight()[1:4]
-    scores = score_matrix(scene(), blocks, views, replace(CONFIG, mode=mode))
-    expected = [expected_scores(mode, scene(), blocks, view) for view in views]
-    assert scores.scores == pytest.approx(np.array(expected), abs=3e-3)
-    assert np.count_nonzero(scores.scores > 0.1) >= 3
-    everything = scene().anchors.positions.double().numpy()
-    owner = blocks.owner(everything[:, :2])
-    assert scores.held.tolist() == [np.bincount(owner[view.sees(everything)], minlength=4).tolist() for view in views]
-    assert scores.anchors.tolist() == np.bincount(owner, minlength=4).tolist()
-    assert np.isnan(scores.covered).all() == (mode == "frustum")
-
-
-def test_empty_pixels_count_in_literal_mode_alone():
-    """From high above, the scene fills a small part of the picture: the rest matches any block, however far."""
-    views = [camera(WIDTH / 2, height=60.0)]
-    literal, coverage = (score_matrix(scene(), strips(4), views, replace(CONFIG, mode=m)) for m in MODES[1::-1])
-    assert (literal.scores > 0.8).all()
-    assert (coverage.scores < 0.5).all()
-    assert np.array_equal(literal.covered, coverage.scores)
-    empty = score_matrix(scene(), strips(4), [skyward()], replace(CONFIG, mode="literal"))
-    assert (empty.scores == 1).all()
-
-
-@pytest.mark.parametrize("mode", ["coverage", "leave_one_out", "frustum"])
-def test_a_block_out_of_view_scores_nothing(mode):
-    scores = score_matrix(scene(), strips(4), [camera(2.0)], replace(CONFIG, mode=mode))
-    assert scores.scores[0, 0] > 0.05
-    assert scores.scores[0, 2:].tolist() == [0.0, 0.0]
-    assert scores.held[0, 2:].tolist() == [0, 0]
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_scores_depend_on_no_other_camera_and_on_no_number_of_threads(mode):
-    config, views, blocks = replace(CONFIG, mode=mode), flight(), strips(3)
-    order, told = np.random.default_rng(1).permutation(len(views)), []
-    with on_threads(1):
-        alone = score_matrix(scene(), blocks, views, config)
-    with on_threads(3):
-        shuffled = score_matrix(scene(), blocks, [views[i] for i in order], config, lambda *done: told.append(done))
-    for name in ("scores", "held", "covered", "beneath"):
-        assert np.array_equal(getattr(alone, name)[order], getattr(shuffled, name), equal_nan=name == "covered")
-    assert told == [(i + 1, 9) for i in range(9)]
-
-
-def test_pictures_are_made_smaller_and_never_larger():
-    big = replace(camera(0.0), width=6400, height=4800)
-    assert (reduced(big, CONFIG).width, reduced(big, CONFIG).height) == (48, 36)
-    assert reduced(camera(0.0), AssignmentConfig()).width == 64
-
+from vdgs.partition.scores import score_matrix
 
 # Whom each block gets
 

@@ -338,6 +338,13 @@ def test_a_finished_bench_trains_nothing_again(benched):
     assert len(before) > 3
 
 
+def test_a_shared_coarse_stage_is_trained_once(benched):
+    (shared,) = benched.glob("runs/tiny/shared-coarse-*/0/coarse")
+    taken = benched / "runs" / "tiny" / "full" / "0" / "coarse"
+    assert (taken / "model.safetensors").samefile(shared / "model.safetensors")
+    assert (taken / "status.json").read_text() == (shared / "status.json").read_text()
+
+
 def test_other_settings_do_not_discard_what_is_trained(benched):
     before = models(benched)
     with pytest.raises(VdgsError, match=r"training\.iterations: 60 -> 180"):

@@ -28,6 +28,7 @@ from vdgs.evaluation.by_block import (
     border_pixels,
     label_map,
 )
+from vdgs.evaluation.photographs import Photographs
 from vdgs.evaluation.seams import SEAM_VIEWS, block_table, evaluate_blocks
 from vdgs.kernels.types import Raster
 from vdgs.render import render
@@ -256,9 +257,8 @@ class Plane:
         return drawn._replace(image=drawn.image + torch.from_numpy(noise))
 
     def evaluate(self, output: Path, mask: np.ndarray | None = None) -> dict:
-        return evaluate_blocks(
-            self.views, self.load_image, lambda _: mask, self.coarse, self.merged, self.block, quadrants(), output
-        )
+        photographs = Photographs(self.views, self.load_image, lambda _: mask)
+        return evaluate_blocks(photographs, self.coarse, self.merged, self.block, quadrants(), output)
 
 
 ONE_BLOCK = camera_above(-3.5, -3.5, 2.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -18,8 +19,9 @@ from rich.console import Console
 from evaluation_support import as_render, noisy, photograph, real_photographs, view
 from vdgs.errors import CaptureError, RunError, TrainingDiverged
 from vdgs.evaluation import metrics, pictures, saving
-from vdgs.evaluation.evaluate import EvaluationSettings, ModelFacts, evaluate
+from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import Lpips, LpipsScores
+from vdgs.evaluation.photographs import Photographs
 
 NAMES = ["a/b.jpg", "c/b.jpg", "a/b.png", "plain.jpg"]
 
@@ -31,6 +33,7 @@ class City:
         rng = np.random.default_rng(0)
         self.views = [view(name, shift=float(i)) for i, name in enumerate(NAMES)]
         self.photographs = [photograph(rng) for _ in NAMES]
+        self.taken = Photographs(self.views, self.load_image)
         self.renders = [noisy(each, rng, 0.02 * (i + 1)) for i, each in enumerate(self.photographs)]
 
     def load_image(self, which):
@@ -59,10 +62,8 @@ def read(path: Path):
 
 def test_what_is_written_is_what_was_measured(city: City, tmp_path: Path):
     facts = ModelFacts(n_anchors=1234, model_bytes=10**6)
-    result = evaluate(
-        city.views, city.load_image, city.render, tmp_path, visibility_map=city.visibility,
-        facts=facts, lpips_note="LPIPS is null: no weights.",
-    )  # fmt: skip
+    model = MeasuredModel(city.render, city.visibility, facts)
+    result = evaluate(city.taken, model, tmp_path, lpips_note="LPIPS is null: no weights.")
     assert result == read(tmp_path / "metrics.json")
     rows = read(tmp_path / "per_view.json")
     assert [row["name"] for row in rows] == NAMES
@@ -83,7 +84,7 @@ def test_what_is_written_is_what_was_measured(city: City, tmp_path: Path):
 
 
 def test_quality_by_visibility(city: City, tmp_path: Path):
-    result = evaluate(city.views, city.load_image, city.render, tmp_path, visibility_map=city.visibility)
+    result = evaluate(city.taken, MeasuredModel(city.render, city.visibility), tmp_path)
     empty, *bins = result["by_visibility"]
     assert empty["lower"] is None
     assert empty["pixels"] == 4 * 2 * 64
@@ -99,7 +100,7 @@ def test_quality_by_visibility(city: City, tmp_path: Path):
 
 def test_the_same_twice(city: City, tmp_path: Path):
     for folder in ("one", "two"):
-        evaluate(city.views, city.load_image, city.render, tmp_path / folder, visibility_map=city.visibility)
+        evaluate(city.taken, MeasuredModel(city.render, city.visibility), tmp_path / folder)
     one, two = (read(tmp_path / folder / "metrics.json") for folder in ("one", "two"))
     assert {**one, "fps": 0} == {**two, "fps": 0}
     for file in (tmp_path / "one").rglob("*.png"):
@@ -111,7 +112,7 @@ def test_masks_are_respected(city: City, tmp_path: Path):
     mask[:, :32] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     masked = view(NAMES[0], mask=tmp_path / "mask.png")
-    result = evaluate([masked], city.load_image, city.render, tmp_path / "out")
+    result = evaluate(Photographs([masked], city.load_image), MeasuredModel(city.render), tmp_path / "out")
     left = metrics.psnr(city.renders[0][:, :32], city.photographs[0][:, :32])
     assert result["psnr"] == pytest.approx(left, abs=1e-9)
     assert read(tmp_path / "out" / "per_view.json")[0]["kept_pixels"] == 48 * 32
@@ -121,7 +122,8 @@ def test_a_view_that_is_masked_entirely_leaves_the_means_alone(city: City, tmp_p
     def load_mask(which):
         return np.full((48, 64), which.name != NAMES[1])
 
-    result = evaluate(city.views, city.load_image, city.render, tmp_path, load_mask=load_mask)
+    taken = replace(city.taken, load_mask=load_mask)
+    result = evaluate(taken, MeasuredModel(city.render), tmp_path)
     rows = read(tmp_path / "per_view.json")
     assert rows[1]["psnr"] is rows[1]["ssim_cc"] is None
     assert result["psnr"] == pytest.approx(np.mean([rows[i]["psnr"] for i in (0, 2, 3)]))
@@ -131,7 +133,7 @@ def test_a_perfect_render_is_null_not_infinity(city: City, tmp_path: Path):
     def perfect(camera):
         return as_render(city.photographs[round(camera.camera_from_world[0, 3])])
 
-    result = evaluate(city.views, city.load_image, perfect, tmp_path)
+    result = evaluate(city.taken, MeasuredModel(perfect), tmp_path)
     assert result["psnr"] is None
     assert result["ssim"] == pytest.approx(1.0)
 
@@ -145,12 +147,12 @@ def test_lpips_is_measured_raw_and_corrected(city: City, tmp_path: Path):
             error = float(metrics.squared_error(image, reference).mean())
             return LpipsScores(error, 2 * error)
 
-    result = evaluate(city.views, city.load_image, city.render, tmp_path, lpips=Fake())
+    result = evaluate(city.taken, MeasuredModel(city.render), tmp_path, lpips=Fake())
     rows = read(tmp_path / "per_view.json")
     assert result["lpips_vgg_01"] == pytest.approx(2 * result["lpips_vgg"])
     assert rows[0]["lpips_vgg_cc"] == pytest.approx(10 ** (-rows[0]["psnr_cc"] / 10))
     plain = EvaluationSettings(colour_correction=False, comparisons=False, contact_views=2)
-    result = evaluate(city.views, city.load_image, city.render, tmp_path / "plain", settings=plain)
+    result = evaluate(city.taken, MeasuredModel(city.render), tmp_path / "plain", settings=plain)
     assert result["psnr_cc"] is None
     assert not (tmp_path / "plain" / "comparisons").exists()
 
@@ -158,7 +160,7 @@ def test_lpips_is_measured_raw_and_corrected(city: City, tmp_path: Path):
 def test_the_table_shows_the_figures(city: City, tmp_path: Path):
     out = StringIO()
     result = evaluate(
-        city.views, city.load_image, city.render, tmp_path, visibility_map=city.visibility,
+        city.taken, MeasuredModel(city.render, city.visibility), tmp_path,
         lpips_note="LPIPS is null: no weights.", console=Console(file=out, width=100),
     )  # fmt: skip
     text = out.getvalue()
@@ -169,16 +171,17 @@ def test_the_table_shows_the_figures(city: City, tmp_path: Path):
 
 
 def test_what_cannot_be_evaluated_is_said(city: City, tmp_path: Path):
+    model = MeasuredModel(city.render)
     with pytest.raises(RunError, match="no test views"):
-        evaluate([], city.load_image, city.render, tmp_path)
+        evaluate(replace(city.taken, views=[]), model, tmp_path)
     with pytest.raises(CaptureError, match=r"a/b.jpg is 60 x 48 pixels, its camera 64 x 48"):
-        evaluate(city.views, lambda v: city.load_image(v)[:, :60], city.render, tmp_path)
+        evaluate(replace(city.taken, load_image=lambda v: city.load_image(v)[:, :60]), model, tmp_path)
     with pytest.raises(CaptureError, match=r"gone\.png"):
-        evaluate([view(NAMES[0], mask=tmp_path / "gone.png")], city.load_image, city.render, tmp_path)
+        evaluate(replace(city.taken, views=[view(NAMES[0], mask=tmp_path / "gone.png")]), model, tmp_path)
     broken = as_render(city.renders[0])
     broken.image[3, 4, 1] = torch.nan
     with pytest.raises(TrainingDiverged, match="not finite"):
-        evaluate(city.views, city.load_image, lambda camera: broken, tmp_path)
+        evaluate(city.taken, MeasuredModel(lambda camera: broken), tmp_path)
     assert not (tmp_path / "metrics.json").exists()
 
 
@@ -230,7 +233,8 @@ def test_on_photographs(tmp_path: Path):
         index = round(camera.camera_from_world[0, 3])
         return as_render(noisy(cv2.GaussianBlur(photographs[index], (0, 0), 1.0), rng, 0.01))
 
-    result = evaluate(views, lambda v: photographs[int(v.name[0])], render, tmp_path)
+    taken = Photographs(views, lambda v: photographs[int(v.name[0])])
+    result = evaluate(taken, MeasuredModel(render), tmp_path)
     assert 20 < result["psnr"] < 40
     assert result["psnr_cc"] >= result["psnr"]
     assert 0.3 < result["ssim"] < 1

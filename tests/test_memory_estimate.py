@@ -114,7 +114,7 @@ def test_a_limit_of_the_process_counts():
 LIMITED = """
 import resource, sys
 import psutil
-import vdgs.stages.watching as watching
+import vdgs.stages.anchor_watching as watching
 
 train = watching.train
 

@@ -16,7 +16,7 @@ from vdgs.evaluation.metrics import to_8bit
 from vdgs.evaluation.saving import file_stems, write_png
 from vdgs.render import render, render_values
 from vdgs.stages.opening import TrainedRun, open_run
-from vdgs.verbs import RenderArguments
+from vdgs.verbs.results import RenderArguments
 from vdgs.video import VideoWriter
 
 #: Pace of a film of separate views.

@@ -114,7 +114,7 @@ def take_coarse(source: Path, target: Path) -> None:
     partial = target / f".coarse.{os.getpid()}"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    for name in ("status.json", "log.jsonl"):
+    for name in ("key", "status.json", "log.jsonl"):
         if (source / "coarse" / name).exists():
             shutil.copy2(source / "coarse" / name, partial / name)
     model = source / "coarse" / "model.safetensors"

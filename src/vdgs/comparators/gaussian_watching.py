@@ -1,6 +1,6 @@
 """3DGS in training under the eyes of a person: shown, logged, saved, stopped and continued.
 
-The twin of `vdgs.stages.watching`, for another kind of state.
+The twin of `vdgs.stages.anchor_watching`, for another kind of state.
 """
 
 from __future__ import annotations
@@ -8,12 +8,13 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 from rich.console import Console
 
 from vdgs.captures.capture import Capture
-from vdgs.checkpoints import discard_after, load_newest, save_state
+from vdgs.checkpoints import save_state
 from vdgs.comparators.gaussian_model import GaussiansModel, initial_gaussians
 from vdgs.comparators.gaussian_training import (
     GaussiansConfig,
@@ -27,12 +28,10 @@ from vdgs.comparators.gaussian_training import (
     to_saved,
     train,
 )
-from vdgs.errors import RunError, TrainingDiverged, VdgsError
-from vdgs.memory import peak_memory_bytes, return_unused
 from vdgs.run import StageFolder
 from vdgs.run_options import WatchOptions
 from vdgs.stages.progress import LOG_INTERVAL, PLAIN_SECONDS
-from vdgs.stages.watching import STATUS_SECONDS, Stopped, is_out_of_memory, stop_requests
+from vdgs.stages.watching import Keeper, Watched, restore_or_start, watch
 
 
 def continue_or_start(
@@ -42,83 +41,54 @@ def continue_or_start(
 
     Raises RunError for a state that this version cannot read.
     """
-    saved, complaints = load_newest(folder.checkpoints)
-    for complaint in complaints:
-        console.print(f"[yellow]note[/] {complaint}")
-    if saved is None:
-        state = start_state(
-            initial_gaussians(capture.points, capture.point_colours, config.initial_opacity, config.degree)
-        )
-    else:
-        try:
-            state = from_saved(saved)
-        except (KeyError, TypeError, ValueError) as error:
-            raise RunError(
-                f"{folder.checkpoints}: holds a state of another version ({error}). Choose another output folder."
-            ) from error
-        discard_after(folder.checkpoints, state.iteration)
-        console.print(f"continuing at iteration {state.iteration}")
-    folder.cut_log(state.iteration)
-    return state
+
+    def start() -> GaussiansState:
+        points, colours = capture.points, capture.point_colours
+        return start_state(initial_gaussians(points, colours, config.initial_opacity, config.degree))
+
+    return restore_or_start(folder, config.iterations, start, from_saved, "Choose another output folder.", console)
 
 
 def train_watched(
     folder: StageFolder, state: GaussiansState, stage: GaussiansStage, options: WatchOptions, console: Console
 ) -> None:
-    """Train to the end, showing, logging and saving on the way.
+    """Train to the end, showing, logging and saving on the way. Raises what `watch` raises."""
+    journal = _Journal(folder, stage.config, console)
+    training = Watched(
+        folder, state,
+        to_saved=lambda: to_saved(state),
+        facts=lambda: journal.facts(state),
+        size=lambda: f"{len(state.gaussians):,} Gaussians",
+        after_divergence="",
+        save_memory=lambda: "Set density.max_gaussians or use smaller photographs, in another output folder.",
+    )  # fmt: skip
 
-    Raises Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged and VdgsError (out of memory, a photograph
-    that is gone, a full disk).
-    """
-    watch = _Watch(folder, state, stage, options, console)
-    try:
-        folder.set_status("running", **watch.facts(state))
-        with stop_requests() as stop:
-            complete = train(state, stage, stop=stop, after_step=watch.after_step)
-    except TrainingDiverged as error:
-        folder.set_status("failed", iteration=state.iteration, why=str(error))
-        raise TrainingDiverged(f"{error} States saved before it are kept in {folder.checkpoints}.") from error
-    except (MemoryError, RuntimeError) as error:
-        if not is_out_of_memory(error):
-            raise
-        folder.set_status("failed", iteration=state.iteration, why="out of memory")
-        raise VdgsError(
-            f"{folder.path}: out of memory with {len(state.gaussians):,} Gaussians. Set density.max_gaussians or use "
-            "smaller photographs, in another output folder."
-        ) from error
-    except VdgsError as error:  # a photograph that is gone, a full disk: every step so far is whole
-        folder.set_status("failed", iteration=state.iteration, why=str(error))
-        save_state(folder.checkpoints, to_saved(state))
-        raise
-    if not complete:
-        save_state(folder.checkpoints, to_saved(state))
-        folder.set_status("stopped", **watch.facts(state))
-        raise Stopped(f"Stopped at iteration {state.iteration}; saved. The same command continues.")
+    def loop(stop: Callable[[], bool]) -> bool:
+        keeper = Keeper(training, options.save_every)
+
+        def after_step(state: GaussiansState, report: GaussiansReport) -> None:
+            keeper.tick()
+            journal.step(state, report)
+            keeper.keep(training.facts)
+
+        return train(state, stage, stop=stop, after_step=after_step)
+
+    watch(training, loop)
 
 
-class _Watch:
-    """What happens after every step: time, log.jsonl, status.json, a line now and then, saved states."""
+class _Journal:
+    """log.jsonl and a line now and then."""
 
-    def __init__(
-        self, folder: StageFolder, state: GaussiansState, stage: GaussiansStage, options: WatchOptions, console: Console
-    ):
-        self._folder, self._config, self._options, self._console = folder, stage.config, options, console
-        self._last = self._noted = self._shown = time.monotonic()
+    def __init__(self, folder: StageFolder, config: GaussiansConfig, console: Console):
+        self._folder, self._config, self._console = folder, config, console
+        self._shown = time.monotonic()
 
-    def after_step(self, state: GaussiansState, report: GaussiansReport) -> None:
-        now = time.monotonic()
-        state.seconds, self._last = state.seconds + now - self._last, now
-        state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
+    def step(self, state: GaussiansState, report: GaussiansReport) -> None:
+        """Log and show one step."""
         if state.iteration % LOG_INTERVAL == 0 or report.cloned is not None:
             self._log(state, report)
-        if state.iteration % self._options.save_every == 0:
-            return_unused()
-            save_state(self._folder.checkpoints, to_saved(state))
-        if now - self._noted > STATUS_SECONDS:
-            self._noted = now
-            self._folder.set_status("running", **self.facts(state))
-        if now - self._shown > PLAIN_SECONDS:
-            self._shown = now
+        if time.monotonic() - self._shown > PLAIN_SECONDS:
+            self._shown = time.monotonic()
             self._console.print(
                 f"{state.iteration}/{self._config.iterations}  loss {state.loss:.4f}  PSNR {state.psnr:.2f} dB  "
                 f"{len(state.gaussians):,} Gaussians",

@@ -27,7 +27,7 @@ from rich.console import Console
 
 from vdgs import __version__
 from vdgs.cameras import Camera
-from vdgs.captures.capture import Capture, View
+from vdgs.captures.capture import Capture
 from vdgs.captures.checks import check_images
 from vdgs.captures.facts import capture_facts, refuse_another_capture
 from vdgs.captures.images import ImageCache
@@ -38,9 +38,9 @@ from vdgs.comparators.spherical_harmonics import MAX_DEGREE
 from vdgs.config import differences, to_dict
 from vdgs.errors import RunError, VdgsError
 from vdgs.evaluation import saving
-from vdgs.evaluation.evaluate import EvaluationSettings, ModelFacts, evaluate
+from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import load_lpips
-from vdgs.evaluation.of_run import EVALUATION_IMAGES_BYTES
+from vdgs.evaluation.of_run import cached_photographs
 from vdgs.files import read_json, write_json
 from vdgs.run import RunFolder, StageFolder
 from vdgs.run_options import WatchOptions
@@ -132,27 +132,11 @@ def evaluate_gaussians(
     RunError without test views or for another capture than the model's.
     """
     refuse_another_capture(output, model.facts.get("capture", {}), capture)
-    views = capture.test_views
-    index = {view.name: i for i, view in enumerate(views)}
     lpips, note = load_lpips(lpips_weights)
-    with ImageCache(views, EVALUATION_IMAGES_BYTES) as images:
-
-        def load_mask(view: View) -> np.ndarray | None:
-            mask = images.get(index[view.name]).mask
-            return None if mask is None else mask.numpy() > 0
-
+    measured = MeasuredModel(model.render, visibility_map, _facts(trained))
+    with cached_photographs(capture.test_views) as photographs:
         result = evaluate(
-            views,
-            load_image=lambda view: images.get(index[view.name]).image.numpy(),
-            render=model.render,
-            output=output,
-            visibility_map=visibility_map,
-            lpips=lpips,
-            lpips_note=note,
-            load_mask=load_mask,
-            facts=_facts(trained),
-            settings=settings,
-            console=console,
+            photographs, measured, output, lpips=lpips, lpips_note=note, settings=settings, console=console
         )
     result = {**result, "n_gaussians": len(model.gaussians)}
     saving.write_json(output / "metrics.json", result)

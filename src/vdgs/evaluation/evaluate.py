@@ -13,12 +13,11 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -32,6 +31,7 @@ from vdgs.evaluation import metrics, pictures, saving
 from vdgs.evaluation.by_visibility import QUANTILE_BINS, VisibilityHistogram, mean_or_none, view_bins
 from vdgs.evaluation.colour import correct_colours
 from vdgs.evaluation.lpips import MIN_SIDE_PX, Lpips
+from vdgs.evaluation.photographs import Photographs
 from vdgs.evaluation.tables import metrics_table
 
 RAW = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")
@@ -57,6 +57,16 @@ class ModelFacts:
     peak_memory_bytes: int | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class MeasuredModel:
+    """A model as the evaluation sees it."""
+
+    render: Callable[[Camera], RenderedView]
+    #: V per pixel [h, w], NaN where the model shows nothing; without it there are no figures by visibility.
+    visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]] | None = None
+    facts: ModelFacts = ModelFacts()
+
+
 @dataclass(frozen=True)
 class EvaluationSettings:
     """What to measure and draw."""
@@ -75,12 +85,10 @@ class EvaluationSettings:
 
 @dataclass(frozen=True, eq=False)
 class _Inputs:
-    """Where the images of a view come from."""
+    """What every view is measured with."""
 
-    load_image: Callable[[View], UInt8[np.ndarray, "h w 3"]]
-    load_mask: Callable[[View], Bool[np.ndarray, "h w"] | None]
-    render: Callable[[Camera], RenderedView]
-    visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]] | None
+    photographs: Photographs
+    model: MeasuredModel
     lpips: Lpips | None
     settings: EvaluationSettings
     output: Path
@@ -106,64 +114,48 @@ class _Pair:
 
 
 def evaluate(
-    views: Sequence[View],
-    load_image: Callable[[View], UInt8[np.ndarray, "h w 3"]],
-    render: Callable[[Camera], RenderedView],
+    photographs: Photographs,
+    model: MeasuredModel,
     output: Path,
     *,
-    visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]] | None = None,
     lpips: Lpips | None = None,
     lpips_note: str = "",
-    load_mask: Callable[[View], Bool[np.ndarray, "h w"] | None] | None = None,
-    facts: ModelFacts | None = None,
     settings: EvaluationSettings | None = None,
     console: Console | None = None,
 ) -> dict[str, Any]:
     """Render and measure every view, write `output`, and return what `metrics.json` holds.
 
-    `visibility_map(camera)` is V per pixel [h, w], NaN where the model shows nothing. `lpips_note` says
-    why LPIPS is null. `load_mask` reads `view.mask_path` by default (white = keep). A table is printed to
-    `console` if there is one. fps is one over the median time of `render`, which on a GPU includes waiting
-    for it.
+    `lpips_note` says why LPIPS is null. A table is printed to `console` if there is one. fps is one over the median
+    time of `model.render`, which on a GPU includes waiting for it.
 
     Raises RunError without views, CaptureError where a photograph or mask does not fit its camera,
     TrainingDiverged where a render is not finite.
     """
+    views = photographs.views
     if not views:
         raise RunError(
             f"{output}: there are no test views to evaluate. Hold some out when the capture is read "
             "(by default every 8th image is)."
         )
     settings = settings or EvaluationSettings()
-    inputs = _Inputs(load_image, load_mask or read_mask, render, visibility_map, lpips, settings, output)
+    inputs = _Inputs(photographs, model, lpips, settings, output)
     names = ["squared_error", "ssim"] + ["squared_error_cc", "ssim_cc"] * settings.colour_correction
-    gathered = _Gathered(histogram=VisibilityHistogram(names) if visibility_map else None)
+    gathered = _Gathered(histogram=VisibilityHistogram(names) if model.visibility_map else None)
     stems = saving.file_stems([view.name for view in views])
     on_sheet = set(np.linspace(0, len(views) - 1, min(len(views), settings.contact_views)).round().astype(int))
     for index, view in enumerate(views):
         _evaluate_view(view, stems[index], index in on_sheet, inputs, gathered)
-    result = _summary(gathered, facts or ModelFacts(), lpips_note, settings)
+    result = _summary(gathered, model.facts, lpips_note, settings)
     _write(output, result, gathered, len(views))
     if console is not None:
         console.print(metrics_table(result))
     return result
 
 
-def read_mask(view: View) -> Bool[np.ndarray, "h w"] | None:
-    """The view's mask at the size of its camera, true where it is white; None where it has none."""
-    if view.mask_path is None:
-        return None
-    mask = cv2.imread(str(view.mask_path), cv2.IMREAD_GRAYSCALE) if view.mask_path.is_file() else None
-    if mask is None:
-        raise CaptureError(f"{view.mask_path}: the mask of {view.name} cannot be read. Restore or remove it.")
-    size = (view.camera.width, view.camera.height)
-    return cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 127
-
-
 def _evaluate_view(view: View, stem: str, on_sheet: bool, inputs: _Inputs, gathered: _Gathered) -> None:
     settings = inputs.settings
-    reference, mask = _photograph(view, inputs)
-    image, seconds = _rendered(view, inputs.render)
+    reference, mask = _photograph(view, inputs.photographs)
+    image, seconds = _rendered(view, inputs.model.render)
     saving.write_png(inputs.output / "renders" / f"{stem}.png", image)
     raw = _Pair(image, reference, mask)
     maps = _maps(raw, "")
@@ -189,8 +181,10 @@ def _evaluate_view(view: View, stem: str, on_sheet: bool, inputs: _Inputs, gathe
     _draw(view, stem, on_sheet, raw, row, inputs, gathered)
 
 
-def _photograph(view: View, inputs: _Inputs) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
-    reference, mask = inputs.load_image(view), inputs.load_mask(view)
+def _photograph(
+    view: View, photographs: Photographs
+) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
+    reference, mask = photographs.load_image(view), photographs.load_mask(view)
     wanted = (view.camera.height, view.camera.width)
     for what, shape in (
         ("photograph", reference.shape[:2]),
@@ -261,9 +255,9 @@ def _count_visibility(
     mask: Bool[np.ndarray, "h w"] | None,
 ) -> float | None:
     """Pool the pixels by V; the mean V of what the view sees, None where nothing is known."""
-    if inputs.visibility_map is None or gathered.histogram is None:
+    if inputs.model.visibility_map is None or gathered.histogram is None:
         return None
-    visibility = np.asarray(inputs.visibility_map(view.camera))
+    visibility = np.asarray(inputs.model.visibility_map(view.camera))
     gathered.histogram.add(visibility, maps, mask)
     seen = ~np.isnan(visibility) if mask is None else mask & ~np.isnan(visibility)
     return float(visibility[seen].mean(dtype=np.float64)) if seen.any() else None

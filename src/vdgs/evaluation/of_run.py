@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,9 @@ from vdgs.cameras import Camera
 from vdgs.captures.capture import View
 from vdgs.captures.images import ImageCache
 from vdgs.errors import RunError
-from vdgs.evaluation.evaluate import EvaluationSettings, ModelFacts, evaluate
+from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import load_lpips
+from vdgs.evaluation.photographs import Photographs
 from vdgs.render import render, render_values
 from vdgs.run import RunFolder
 from vdgs.stages.opening import TrainedRun
@@ -32,8 +34,6 @@ def evaluate_run(run: TrainedRun, lpips_weights: Path | None, bins: int, console
     if bins < 1:
         raise RunError(f"--bins is {bins}; it must be at least 1")
     output = evaluation_folder(run.folder, run.name)
-    views = run.capture.test_views
-    index = {view.name: i for i, view in enumerate(views)}
     lpips, note = load_lpips(lpips_weights)
     facts = ModelFacts(
         model=run.name,
@@ -42,26 +42,26 @@ def evaluate_run(run: TrainedRun, lpips_weights: Path | None, bins: int, console
         train_seconds=run.status.get("seconds"),
         peak_memory_bytes=run.status.get("peak_memory_bytes"),
     )
+    model = MeasuredModel(lambda camera: render(run.model, camera), visibility_map(run), facts)
+    with cached_photographs(run.capture.test_views) as photographs:
+        evaluate(
+            photographs, model, output,
+            lpips=lpips, lpips_note=note, settings=EvaluationSettings(visibility_bins=bins), console=console,
+        )  # fmt: skip
+    console.print(f"pictures and figures: {output}", highlight=False)
+
+
+@contextmanager
+def cached_photographs(views: Sequence[View]) -> Iterator[Photographs]:
+    """The photographs and masks of views, decoded when they are asked for."""
+    index = {view.name: i for i, view in enumerate(views)}
     with ImageCache(views, EVALUATION_IMAGES_BYTES) as images:
 
         def load_mask(view: View) -> np.ndarray | None:
             mask = images.get(index[view.name]).mask
             return None if mask is None else mask.numpy() > 0
 
-        evaluate(
-            views,
-            load_image=lambda view: images.get(index[view.name]).image.numpy(),
-            render=lambda camera: render(run.model, camera),
-            output=output,
-            visibility_map=visibility_map(run),
-            lpips=lpips,
-            lpips_note=note,
-            load_mask=load_mask,
-            facts=facts,
-            settings=EvaluationSettings(visibility_bins=bins),
-            console=console,
-        )
-    console.print(f"pictures and figures: {output}", highlight=False)
+        yield Photographs(views, lambda view: images.get(index[view.name]).image.numpy(), load_mask)
 
 
 def evaluation_folder(run: RunFolder, name: str) -> Path:

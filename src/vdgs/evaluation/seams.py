@@ -6,7 +6,7 @@ OUTPUT/seams/NAME.png   coarse | merged | merged with the borders of blocks | er
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from vdgs.evaluation.by_block import (
     label_map,
 )
 from vdgs.evaluation.metrics import masked_mean, psnr_of, squared_error, to_8bit
+from vdgs.evaluation.photographs import Photographs
 from vdgs.evaluation.tables import shown
 from vdgs.kernels.types import Raster
 from vdgs.partition.blocks import Blocks
@@ -69,8 +70,7 @@ class SeamView:
 class _Inputs:
     """Where the images of a view come from."""
 
-    load_image: Callable[[View], UInt8[np.ndarray, "h w 3"]]
-    load_mask: Callable[[View], Bool[np.ndarray, "h w"] | None]
+    photographs: Photographs
     render_coarse: Callable[[Camera], Raster]
     render_merged: Callable[[Camera], Raster]
     render_block: Callable[[int, Camera], Raster | None]
@@ -88,9 +88,7 @@ class _Gathered:
 
 
 def evaluate_blocks(
-    views: Sequence[View],
-    load_image: Callable[[View], UInt8[np.ndarray, "h w 3"]],
-    load_mask: Callable[[View], Bool[np.ndarray, "h w"] | None],
+    photographs: Photographs,
     render_coarse: Callable[[Camera], Raster],
     render_merged: Callable[[Camera], Raster],
     render_block: Callable[[int, Camera], Raster | None],
@@ -104,9 +102,10 @@ def evaluate_blocks(
     it was trained, among its frozen surroundings; None where the block was not trained, whose figure is then null.
     Raises RunError without views.
     """
+    views = photographs.views
     if not views:
         raise RunError(f"{output}: there are no test views. Hold some out when the capture is read.")
-    inputs = _Inputs(load_image, load_mask, render_coarse, render_merged, render_block, blocks)
+    inputs = _Inputs(photographs, render_coarse, render_merged, render_block, blocks)
     gathered = _Gathered(BlockMetrics(len(blocks), RENDERS))
     for view, stem in zip(views, saving.file_stems([view.name for view in views]), strict=True):
         _measure(view, stem, inputs, gathered)
@@ -125,7 +124,7 @@ def evaluate_blocks(
 
 
 def _measure(view: View, stem: str, inputs: _Inputs, gathered: _Gathered) -> None:
-    reference, mask = inputs.load_image(view), inputs.load_mask(view)
+    reference, mask = inputs.photographs.load_image(view), inputs.photographs.load_mask(view)
     drawn = inputs.render_merged(view.camera)
     labels = label_map(drawn, view.camera, inputs.blocks)
     coarse, merged = _eight_bits(inputs.render_coarse(view.camera)), _eight_bits(drawn)

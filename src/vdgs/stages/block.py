@@ -31,9 +31,9 @@ from vdgs.partition.blocks import Blocks, load_blocks
 from vdgs.partition.saving import load_scores
 from vdgs.run import RunFolder, StageFolder
 from vdgs.run_options import WatchOptions
+from vdgs.stages.anchor_watching import continue_or_start, finish, identity, train_watched
 from vdgs.stages.coarse import camera_height, image_budget, note_without_growth
 from vdgs.stages.opening import open_run
-from vdgs.stages.watching import continue_or_start, finish, identity, train_watched
 from vdgs.training import Stage, start_state
 
 #: Cells on each side of the table of the ramp.

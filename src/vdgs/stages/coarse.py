@@ -26,7 +26,7 @@ from vdgs.files import read_json, write_json
 from vdgs.memory import available_bytes
 from vdgs.run import RunFolder
 from vdgs.run_options import WatchOptions
-from vdgs.stages.watching import continue_or_start, finish, train_watched
+from vdgs.stages.anchor_watching import continue_or_start, finish, train_watched
 from vdgs.training import Stage, TrainingState, mean_colour, start_state
 
 

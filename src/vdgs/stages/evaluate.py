@@ -9,14 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from vdgs.anchors import AnchorModel
 from vdgs.cameras import Camera
-from vdgs.captures.capture import View
-from vdgs.captures.images import ImageCache
-from vdgs.evaluation.of_run import EVALUATION_IMAGES_BYTES, evaluate_run, evaluation_folder
+from vdgs.evaluation.of_run import cached_photographs, evaluate_run, evaluation_folder
 from vdgs.evaluation.saving import write_json
 from vdgs.evaluation.seams import block_table, evaluate_blocks
 from vdgs.files import read_record
@@ -68,20 +65,12 @@ def _forget(output: Path) -> None:
 
 
 def _evaluate_blocks(opened: TrainedRun) -> dict[str, Any]:
-    run, views = opened.folder, opened.capture.test_views
+    run = opened.folder
     coarse, blocks = AnchorModel.load(run.coarse.model), blocks_of(run)
     alone = _BlocksAlone(run, coarse)
-    index = {view.name: i for i, view in enumerate(views)}
-    with ImageCache(views, EVALUATION_IMAGES_BYTES) as images:
-
-        def load_mask(view: View) -> np.ndarray | None:
-            mask = images.get(index[view.name]).mask
-            return None if mask is None else mask.numpy() > 0
-
+    with cached_photographs(opened.capture.test_views) as photographs:
         return evaluate_blocks(
-            views,
-            load_image=lambda view: images.get(index[view.name]).image.numpy(),
-            load_mask=load_mask,
+            photographs,
             render_coarse=lambda camera: render(coarse, camera, depth=True),
             render_merged=lambda camera: render(opened.model, camera, depth=True),
             render_block=alone.render,

@@ -12,9 +12,9 @@ from vdgs.errors import RunError
 from vdgs.memory import forget_peak, peak_memory_bytes
 from vdgs.merging import merge
 from vdgs.run import RunFolder
+from vdgs.stages.anchor_watching import identity
 from vdgs.stages.block import blocks_of, views_of_block
 from vdgs.stages.opening import open_run
-from vdgs.stages.watching import identity
 
 
 def merge_run(path: Path, incomplete: bool, console: Console) -> None:

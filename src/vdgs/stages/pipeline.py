@@ -17,7 +17,7 @@ from vdgs.stages.evaluate import evaluate_stage, is_measured
 from vdgs.stages.merge import merge_run
 from vdgs.stages.partition import measure_visibility, partition_run
 from vdgs.stages.train import train_blocks
-from vdgs.verbs import RunArguments
+from vdgs.verbs.starting import RunArguments
 
 
 def run_all(asked: RunArguments, console: Console) -> None:

@@ -1,37 +1,24 @@
-"""Training under the eyes of a person: shown, logged, saved, stopped and continued. The same for every stage."""
+"""Training under the eyes of a person: logged, saved, stopped and continued. The same for every kind of state."""
 
 from __future__ import annotations
 
-import math
 import re
 import signal
 import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
 
 import cv2
 from rich.console import Console
 
-from vdgs.anchors import AnchorModel
-from vdgs.checkpoints import discard_after, load_newest, save_state
+from vdgs.checkpoints import SavedState, discard_after, load_newest, save_state
 from vdgs.errors import RunError, TrainingDiverged, VdgsError
 from vdgs.memory import is_out_of_memory, peak_memory_bytes, return_unused
 from vdgs.run import StageFolder
-from vdgs.run_options import WatchOptions
-from vdgs.stages.memory_notes import after_failure, announce, kind_of, need_of
-from vdgs.stages.progress import TrainingProgress
-from vdgs.tensor_files import size_and_checksum
-from vdgs.training import Stage, StepReport, TrainingState, from_saved, to_saved, train
 
-#: What to do about a diverging loss, in the coarse stage and in a block.
-AFTER_DIVERGENCE = {
-    "coarse": "Lower --rates.* or raise --growth.threshold in a new --output, and look at the photographs with "
-    "`vdgs inspect`.",
-    "block": "Lower --block.offset-rate and --block.feature-rate or raise --block.growth.threshold (with --redo).",
-}
 #: As what missing memory arrives, among others (`is_out_of_memory`): from Python and C++, torch, the system, OpenCV.
 MEMORY_ERRORS = (MemoryError, RuntimeError, OSError, cv2.error)
 #: Seconds between two notes of the progress in status.json.
@@ -44,12 +31,50 @@ class Stopped(VdgsError):
     stopped = True
 
 
-def continue_or_start(
-    folder: StageFolder, stage: Stage, start: Callable[[], TrainingState], console: Console
-) -> TrainingState:
+class WatchedState(Protocol):
+    """What every state of a training says of itself."""
+
+    iteration: int
+    seconds: float
+    peak_memory_bytes: int
+
+
+State = TypeVar("State", bound=WatchedState)
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """A training as the one who watches it sees it."""
+
+    folder: StageFolder
+    state: WatchedState
+    #: The whole state as it is saved.
+    to_saved: Callable[[], SavedState]
+    #: Where training stands, for status.json.
+    facts: Callable[[], dict[str, Any]]
+    #: How large the model is, in words ("12,000 anchors").
+    size: Callable[[], str]
+    #: What a person may do about a loss that diverges, and about missing memory.
+    after_divergence: str
+    save_memory: Callable[[], str]
+    #: Whether every step of the state is whole, so that it may be saved though a step was broken off.
+    whole: Callable[[], bool] = lambda: False
+
+    def save(self) -> None:
+        save_state(self.folder.checkpoints, self.to_saved())
+
+
+def restore_or_start(
+    folder: StageFolder,
+    iterations: int,
+    start: Callable[[], State],
+    restore: Callable[[SavedState], State],
+    advice: str,
+    console: Console,
+) -> State:
     """The newest whole state in the folder, or a new one; the log ends where the state does.
 
-    Raises RunError for a state that this version cannot read or that is beyond the last iteration.
+    Raises RunError, with `advice`, for a state that this version cannot read, and for one beyond the last iteration.
     """
     folder.checkpoints.mkdir(parents=True, exist_ok=True)
     saved, complaints = load_newest(folder.checkpoints)
@@ -61,105 +86,78 @@ def continue_or_start(
         state = start()
     else:
         try:
-            state = from_saved(saved, stage)
+            state = restore(saved)
         except (KeyError, TypeError, ValueError) as error:
-            raise RunError(
-                f"{folder.checkpoints}: holds a state of another version ({error}). Start a new --output."
-            ) from error
-        if state.iteration > stage.config.iterations:
-            raise RunError(
-                f"{folder.checkpoints}: is at iteration {state.iteration}, beyond {stage.config.iterations}."
-            )
+            raise RunError(f"{folder.checkpoints}: holds a state of another version ({error}). {advice}") from error
+        if state.iteration > iterations:
+            raise RunError(f"{folder.checkpoints}: is at iteration {state.iteration}, beyond {iterations}.")
         discard_after(folder.checkpoints, state.iteration)
         console.print(f"continuing at iteration {state.iteration}")
     folder.cut_log(state.iteration)
     return state
 
 
-def train_watched(
-    folder: StageFolder, state: TrainingState, stage: Stage, options: WatchOptions, console: Console
-) -> None:
-    """Train to the end of the stage, showing, logging and saving on the way.
+def watch(training: Watched, loop: Callable[[Callable[[], bool]], bool]) -> None:
+    """Run `loop(stop)`, which trains until complete (True) or asked to stop, and note in status.json how it ends.
 
-    Says first how much memory it will take. Raises Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged and
-    VdgsError (out of memory, a photograph that is gone, a full disk), each with what is kept.
+    Raises Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged and VdgsError (out of memory, a photograph
+    that is gone, a full disk), each with what is kept.
     """
-    kind, need = kind_of(stage), need_of(state, stage)
-    announce(need, kind, console)
+    folder, state = training.folder, training.state
     try:
         with stop_requests() as stop:
-            folder.set_status("running", iteration=state.iteration, iterations=stage.config.iterations)
-            complete = _loop(folder, state, stage, options, console, stop)
+            folder.set_status("running", **training.facts())
+            complete = loop(stop)
     except TrainingDiverged as error:
         folder.set_status("failed", iteration=state.iteration, why=str(error))
-        raise TrainingDiverged(f"{error} {_kept(folder)} {AFTER_DIVERGENCE[kind]}") from error
+        raise TrainingDiverged(f"{error} {_kept(folder)} {training.after_divergence}".rstrip()) from error
     except MEMORY_ERRORS as error:
         if not is_out_of_memory(error):
             raise
         traceback.clear_frames(error.__traceback__)  # they hold the pictures and splats of the step that failed
-        kept = _rescue(folder, state)
+        kept = _rescue(training)
         folder.set_status("failed", iteration=state.iteration, why="out of memory")
         raise VdgsError(
-            f"{folder.path}: out of memory with {len(state.anchors):,} anchors{_wanted(error)}. {kept} "
-            + after_failure(need, state, stage)
+            f"{folder.path}: out of memory with {training.size()}{_wanted(error)}. {kept} {training.save_memory()}"
         ) from error
     except VdgsError as error:  # a photograph that is gone, a full disk: every step so far is whole
         folder.set_status("failed", iteration=state.iteration, why=str(error))
-        save_state(folder.checkpoints, to_saved(state))
+        training.save()
         raise
     if not complete:
-        save_state(folder.checkpoints, to_saved(state))
-        folder.set_status("stopped", iteration=state.iteration, iterations=stage.config.iterations)
+        training.save()
+        folder.set_status("stopped", **training.facts())
         raise Stopped(f"Stopped at iteration {state.iteration}; saved. The same command continues.")
 
 
-def finish(folder: StageFolder, state: TrainingState, model: AnchorModel, console: Console) -> None:
-    """Save the model of a stage that is complete, mark it done and say so."""
-    save_state(folder.checkpoints, to_saved(state))
-    model.save(folder.model)
-    folder.set_status(
-        "done", iteration=state.iteration, iterations=state.iteration, anchors=len(state.anchors),
-        model=identity(folder.model),
-        seconds=state.seconds, psnr_training=None if math.isnan(state.psnr) else state.psnr,
-        peak_memory_bytes=state.peak_memory_bytes,
-    )  # fmt: skip
-    minutes, seconds = divmod(round(state.seconds), 60)
-    console.print(
-        f"trained {state.iteration} iterations in {minutes} min {seconds} s: {len(state.anchors):,} anchors, "
-        f"PSNR of training views {state.psnr:.2f} dB, peak memory {state.peak_memory_bytes / 1e9:.1f} GB\n"
-        f"model: {folder.model}",
-        highlight=False,
-    )
+class Keeper:
+    """After every step: the state's account of time and memory (across interruptions), saved states, status.json."""
 
+    def __init__(self, training: Watched, save_every: int):
+        self._training, self._save_every = training, save_every
+        self._last = self._noted = time.monotonic()
 
-def identity(model: Path) -> str:
-    """What tells this model file from any other."""
-    size, checksum = size_and_checksum(model)
-    return f"{size}-{checksum:08x}"
+    def tick(self) -> None:
+        """Add the time since the last step to the state's account."""
+        now, state = time.monotonic(), self._training.state
+        state.seconds += now - self._last
+        state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
+        self._last = now
 
+    def keep(self, facts: Callable[[], dict[str, Any]], flush_log: Callable[[], None] | None = None) -> None:
+        """Save the state and note `facts` in status.json, each where it is time.
 
-def _loop(
-    folder: StageFolder, state: TrainingState, stage: Stage, options: WatchOptions, console: Console,
-    stop: Callable[[], bool],
-) -> bool:  # fmt: skip
-    """Train until complete (True) or asked to stop."""
-    clock, board = _Clock(state), _board(folder, options, state.iteration)
-    noted = time.monotonic()
-    with TrainingProgress(console, folder, stage.config, state.iteration, board) as progress:
-
-        def after_step(state: TrainingState, report: StepReport) -> None:
-            nonlocal noted
-            clock.tick()
-            progress.step(state, report)
-            if state.iteration % options.save_every == 0:
-                progress.flush()  # before the state: a run that continues there must not miss lines of its log
-                return_unused()
-                save_state(folder.checkpoints, to_saved(state))
-            if time.monotonic() - noted > STATUS_SECONDS:
-                noted = time.monotonic()
-                folder.set_status("running", **progress.facts(state))
-
-        return train(state, stage, stop=stop, after_step=after_step)
+        The log is flushed before the state is saved: a run that continues there must not miss lines of it.
+        """
+        training = self._training
+        if training.state.iteration % self._save_every == 0:
+            if flush_log is not None:
+                flush_log()
+            return_unused()
+            training.save()
+        if time.monotonic() - self._noted > STATUS_SECONDS:
+            self._noted = time.monotonic()
+            training.folder.set_status("running", **facts())
 
 
 def _kept(folder: StageFolder) -> str:
@@ -169,16 +167,17 @@ def _kept(folder: StageFolder) -> str:
     return f"The state of iteration {kept.iteration} is kept in {folder.checkpoints}."
 
 
-def _rescue(folder: StageFolder, state: TrainingState) -> str:
+def _rescue(training: Watched) -> str:
     """Save the state after memory ran out, if every step of it is whole and there is room; what is kept then."""
     return_unused()
-    if state.whole:
+    folder = training.folder
+    if training.whole():
         try:
-            save_state(folder.checkpoints, to_saved(state))
+            training.save()
         except (VdgsError, *MEMORY_ERRORS):
             pass  # what was saved before is still there
         else:
-            return f"The state of iteration {state.iteration} is saved in {folder.checkpoints}."
+            return f"The state of iteration {training.state.iteration} is saved in {folder.checkpoints}."
     try:
         return _kept(folder)
     except MEMORY_ERRORS:
@@ -189,19 +188,6 @@ def _wanted(error: BaseException) -> str:
     """How much was asked for in vain, where the error says so."""
     asked = re.search(r"allocate ([\d.]+) (bytes|[KMG]iB)", str(error))
     return f" ({asked.group(1)} {asked.group(2)} more could not be had)" if asked else ""
-
-
-class _Clock:
-    """Keeps the state's account of time and memory, across interruptions."""
-
-    def __init__(self, state: TrainingState):
-        self._state, self._last = state, time.monotonic()
-
-    def tick(self) -> None:
-        now = time.monotonic()
-        self._state.seconds += now - self._last
-        self._state.peak_memory_bytes = max(self._state.peak_memory_bytes, peak_memory_bytes())
-        self._last = now
 
 
 @contextmanager
@@ -220,13 +206,3 @@ def stop_requests() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _board(folder: StageFolder, options: WatchOptions, iteration: int) -> Any:
-    if not options.tensorboard:
-        return None
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise VdgsError('TensorBoard is not installed: pip install "vdgs[tensorboard]"') from error
-    return SummaryWriter(str(folder.path / "tensorboard"), purge_step=iteration)

@@ -1,0 +1,108 @@
+"""Anchors in training under the eyes of a person: what the coarse stage and a block show, log and advise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from vdgs.anchors import AnchorModel
+from vdgs.checkpoints import save_state
+from vdgs.errors import VdgsError
+from vdgs.run import StageFolder
+from vdgs.run_options import WatchOptions
+from vdgs.stages.memory_notes import after_failure, announce, kind_of, need_of
+from vdgs.stages.progress import TrainingProgress
+from vdgs.stages.watching import Keeper, Watched, restore_or_start, watch
+from vdgs.tensor_files import size_and_checksum
+from vdgs.training import Stage, StepReport, TrainingState, from_saved, to_saved, train
+
+#: What to do about a diverging loss, in the coarse stage and in a block.
+AFTER_DIVERGENCE = {
+    "coarse": "Lower --rates.* or raise --growth.threshold in a new --output, and look at the photographs with "
+    "`vdgs inspect`.",
+    "block": "Lower --block.offset-rate and --block.feature-rate or raise --block.growth.threshold (with --redo).",
+}
+
+
+def continue_or_start(
+    folder: StageFolder, stage: Stage, start: Callable[[], TrainingState], console: Console
+) -> TrainingState:
+    """The newest whole state in the folder, or a new one; the log ends where the state does.
+
+    Raises RunError for a state that this version cannot read or that is beyond the last iteration.
+    """
+    return restore_or_start(
+        folder, stage.config.iterations, start, lambda saved: from_saved(saved, stage), "Start a new --output.", console
+    )
+
+
+def train_watched(
+    folder: StageFolder, state: TrainingState, stage: Stage, options: WatchOptions, console: Console
+) -> None:
+    """Train to the end of the stage, showing, logging and saving on the way.
+
+    Says first how much memory it will take. Raises what `watch` raises.
+    """
+    kind, need = kind_of(stage), need_of(state, stage)
+    announce(need, kind, console)
+    training = Watched(
+        folder, state,
+        to_saved=lambda: to_saved(state),
+        facts=lambda: {"iteration": state.iteration, "iterations": stage.config.iterations},
+        size=lambda: f"{len(state.anchors):,} anchors",
+        after_divergence=AFTER_DIVERGENCE[kind],
+        save_memory=lambda: after_failure(need, state, stage),
+        whole=lambda: state.whole,
+    )  # fmt: skip
+
+    def loop(stop: Callable[[], bool]) -> bool:
+        keeper, board = Keeper(training, options.save_every), _board(folder, options, state.iteration)
+        with TrainingProgress(console, folder, stage.config, state.iteration, board) as progress:
+
+            def after_step(state: TrainingState, report: StepReport) -> None:
+                keeper.tick()
+                progress.step(state, report)
+                keeper.keep(lambda: progress.facts(state), progress.flush)
+
+            return train(state, stage, stop=stop, after_step=after_step)
+
+    watch(training, loop)
+
+
+def finish(folder: StageFolder, state: TrainingState, model: AnchorModel, console: Console) -> None:
+    """Save the model of a stage that is complete, mark it done and say so."""
+    save_state(folder.checkpoints, to_saved(state))
+    model.save(folder.model)
+    folder.set_status(
+        "done", iteration=state.iteration, iterations=state.iteration, anchors=len(state.anchors),
+        model=identity(folder.model),
+        seconds=state.seconds, psnr_training=None if math.isnan(state.psnr) else state.psnr,
+        peak_memory_bytes=state.peak_memory_bytes,
+    )  # fmt: skip
+    minutes, seconds = divmod(round(state.seconds), 60)
+    console.print(
+        f"trained {state.iteration} iterations in {minutes} min {seconds} s: {len(state.anchors):,} anchors, "
+        f"PSNR of training views {state.psnr:.2f} dB, peak memory {state.peak_memory_bytes / 1e9:.1f} GB\n"
+        f"model: {folder.model}",
+        highlight=False,
+    )
+
+
+def identity(model: Path) -> str:
+    """What tells this model file from any other."""
+    size, checksum = size_and_checksum(model)
+    return f"{size}-{checksum:08x}"
+
+
+def _board(folder: StageFolder, options: WatchOptions, iteration: int) -> Any:
+    if not options.tensorboard:
+        return None
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise VdgsError('TensorBoard is not installed: pip install "vdgs[tensorboard]"') from error
+    return SummaryWriter(str(folder.path / "tensorboard"), purge_step=iteration)

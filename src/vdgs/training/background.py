@@ -1,0 +1,31 @@
+"""The colour behind the scene: the mean of the photographs, in training with noise that fades to nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vdgs.training.state import Stage, TrainingImages
+
+
+def mean_colour(images: TrainingImages, count: int, downscale: int, at_most: int = 32) -> tuple[float, float, float]:
+    """Mean colour in [0, 1] of the pixels that count, over up to `at_most` evenly chosen training views."""
+    total, pixels = np.zeros(3), 0
+    for index in np.unique(np.linspace(0, count - 1, min(count, at_most)).astype(int)):
+        image, mask = images.get(int(index), downscale)
+        colours = image.numpy().reshape(-1, 3) if mask is None else image.numpy()[mask.numpy() > 0]
+        total += colours.sum(0, dtype=np.float64)
+        pixels += len(colours)
+    red, green, blue = (float(np.float32(value)) for value in total / (255.0 * max(pixels, 1)))
+    return red, green, blue
+
+
+def background_at(stage: Stage, iteration: int) -> Tensor:
+    """Colour [3] behind the scene at this iteration (from 0)."""
+    colour = torch.tensor(stage.background)
+    noise = stage.config.loss.background_noise * (1 - iteration / stage.config.iterations)
+    if noise == 0:
+        return colour
+    generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)
+    return colour + noise * (2 * torch.rand(3, generator=generator) - 1)

@@ -1,0 +1,154 @@
+"""The training loop: one for the coarse stage and for blocks; what differs is data (`Stage`).
+
+Each step is a function of the state and the iteration number, and everything random is drawn from (seed, iteration).
+A run that is stopped and continued is therefore the run that was not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from vdgs.cameras import Camera
+from vdgs.errors import TrainingDiverged
+from vdgs.kernels import native as kernels
+from vdgs.kernels.decode_types import DecoderWeights, SplatGradients, Splats
+from vdgs.optimiser import rates_at
+from vdgs.render import decode_rows, visible_rows
+from vdgs.step import draw_view, move_anchors
+from vdgs.training.background import background_at
+from vdgs.training.growing import grow, reorder
+from vdgs.training.schedule import downscale_at, view_at
+from vdgs.training.state import Stage, StepReport, TrainingState
+
+#: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
+REFERENCE_HEIGHT = 10.0
+#: Every so many iterations anchors are put into Morton order, so that neighbours in space are neighbours in memory.
+REORDER_INTERVAL = 1000
+#: Every so many iterations the PSNR of the training view is taken, for people.
+PSNR_INTERVAL = 10
+
+
+def train_step(state: TrainingState, stage: Stage) -> StepReport:
+    """One step: render a training view, compare, move what was visible, count, perhaps grow.
+
+    Changes `state` in place. Raises TrainingDiverged if the loss or a gradient is not finite.
+    """
+    config, iteration = stage.config, state.iteration
+    downscale = downscale_at(iteration, config)
+    view = view_at(iteration, stage.image_count, config.seed)
+    target, mask = stage.images.get(view, downscale)
+    camera = stage.images.camera(view, downscale)
+
+    rows = visible_rows(state.anchors, camera)
+    weights = state.decoder.for_image(view if stage.appearance_of is None else stage.appearance_of[view])
+    around = _surroundings(stage, weights, camera)
+    with torch.no_grad():
+        drawn = draw_view(
+            decode_rows(state.anchors, rows, weights, camera), camera, background_at(stage, iteration), around
+        )
+    image = drawn.image.requires_grad_(True)
+    photometric = kernels.photometric_loss(image, target, mask, ssim_weight=config.loss.ssim_weight)
+    volume_weight = _volume_weight(stage)
+    loss = photometric.loss.detach()
+    if volume_weight and len(drawn.source):
+        loss = loss + volume_weight * drawn.volume
+    value = float(loss)
+    if not math.isfinite(value):
+        raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
+    (image_gradient,) = torch.autograd.grad(photometric.loss, image)
+    gradients = drawn.backward(image_gradient, volume_weight)
+    psnr = _psnr(image.detach(), target, mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
+    state.whole = False
+    _move(state, stage, rows, gradients, weights, camera)
+
+    growing = iteration + 1 <= config.growth.until * config.iterations
+    if growing and iteration + 1 > config.growth.statistics_from:
+        state.statistics.add_view(rows, drawn.source, drawn.opacities, gradients.means_px, camera.width, camera.height)
+    state.iteration += 1
+    report = StepReport(value, float(photometric.l1), float(photometric.ssim), len(rows), len(drawn.source))
+    if growing and state.iteration >= config.growth.start and state.iteration % config.growth.interval == 0:
+        report = replace(report, **grow(state, stage))
+    if state.iteration % REORDER_INTERVAL == 0:
+        reorder(state)
+    _smooth(state, value, psnr)
+    state.whole = True
+    return report
+
+
+@torch.no_grad()
+def _surroundings(stage: Stage, weights: DecoderWeights, camera: Camera) -> Splats | None:
+    """The splats of the frozen anchors around a block: drawn, but out of autograd's sight."""
+    if stage.surroundings is None or not len(stage.surroundings):
+        return None
+    return decode_rows(stage.surroundings, visible_rows(stage.surroundings, camera), weights, camera)
+
+
+def _volume_weight(stage: Stage) -> float:
+    """Weight of the mean volume in the loss, for the unit of this scene."""
+    return stage.config.loss.volume_weight / (stage.camera_height / REFERENCE_HEIGHT) ** 3
+
+
+def _move(
+    state: TrainingState, stage: Stage, rows: Tensor, gradients: SplatGradients, weights: DecoderWeights, camera: Camera
+) -> None:
+    """One step of Adam for the visible anchors and the decoder."""
+    config, step = stage.config, state.iteration + 1
+    rates = rates_at(config.rates, state.iteration / config.iterations)
+    finite = move_anchors(state.anchors, rows, gradients, weights, camera, state.optimiser, rates, step, stage.mobility)
+    finite &= state.optimiser.update_decoder(state.decoder, rates, step)
+    if not finite:
+        raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")
+
+
+def _psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float | None:
+    """PSNR of a training view; None where the mask keeps nothing."""
+    squared = (image.clamp(0, 1) - target.float() / 255.0) ** 2
+    counted = squared if mask is None else squared[mask > 0]
+    return -10.0 * math.log10(max(float(counted.mean()), 1e-10)) if counted.numel() else None
+
+
+def _smooth(state: TrainingState, loss: float, psnr: float | None) -> None:
+    """Update the smoothed loss and, where it was taken, PSNR (for people and for the divergence check)."""
+    state.loss = _moving(state.loss, loss, 0.98)
+    if psnr is not None:
+        state.psnr = _moving(state.psnr, psnr, 0.9)
+    if state.iteration > 100:
+        state.best_loss = min(state.best_loss, state.loss)
+        if state.loss > 0.3 and state.loss > 4 * state.best_loss:
+            raise TrainingDiverged(
+                f"The smoothed loss rose to {state.loss:.3f} from {state.best_loss:.3f} by iteration {state.iteration}."
+            )
+
+
+def _moving(before: float, value: float, keep: float) -> float:
+    return value if math.isnan(before) else keep * before + (1 - keep) * value
+
+
+def train(
+    state: TrainingState,
+    stage: Stage,
+    *,
+    stop: Callable[[], bool],
+    after_step: Callable[[TrainingState, StepReport], None],
+    prefetch: int = 4,
+) -> bool:
+    """Steps until the stage is complete or `stop()` is true. True if complete.
+
+    `after_step` sees every step (progress, log, saving).
+    """
+    config = stage.config
+    while state.iteration < config.iterations:
+        if stop():
+            return False
+        ahead = range(state.iteration + 1, min(state.iteration + 1 + prefetch, config.iterations))
+        for iteration in ahead:
+            view = view_at(iteration, stage.image_count, config.seed)
+            stage.images.prefetch([view], downscale_at(iteration, config))
+        report = train_step(state, stage)
+        after_step(state, report)
+    return True

@@ -1,0 +1,23 @@
+"""The verbs of the command line: options as dataclasses, each handed to the room that does the work.
+
+Nothing heavy is imported before the options are parsed, so that help and usage errors come at once.
+"""
+
+from __future__ import annotations
+
+import os
+
+from vdgs.verbs.benching import bench
+from vdgs.verbs.captures import inspect, synth
+from vdgs.verbs.machine import doctor
+from vdgs.verbs.results import eval, render, report
+from vdgs.verbs.stages import merge, partition, train, visibility
+from vdgs.verbs.starting import coarse, run
+
+__all__ = [
+    "bench", "coarse", "doctor", "eval", "inspect", "merge", "partition", "render", "report", "run", "synth", "train",
+    "visibility",
+]  # fmt: skip
+
+# torch's OpenMP threads must block, not spin, beside the kernels' own pool; read once, when torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

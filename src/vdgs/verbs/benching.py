@@ -1,0 +1,66 @@
+"""The verb that trains and measures methods side by side: `bench`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from tyro.conf import Positional
+
+from vdgs.verbs.shared import open_console
+
+
+@dataclass(frozen=True)
+class BenchArguments:
+    """Train methods on scenes with several seeds and write tables, a figure and a verdict.
+
+    The same command continues what was stopped; finished runs are kept.
+    """
+
+    table: Positional[Literal["table1", "table2", "table3", "table4", "efficiency", "toy"]]
+    """table1 to table4: those of the paper; efficiency: its paragraph; toy: a small one in a minute or two."""
+    output: Path
+    """Folder for runs and results; new, or the one to continue."""
+    seeds: int | None = None
+    """How many seeds (0, 1, ...); by default as many as the table has."""
+    scenes: tuple[str, ...] = ()
+    """Other scenes than the table's, by name: tiny, toy-uneven, town-even, copr, residence, sci-art, ..."""
+    methods: tuple[str, ...] = ()
+    """Other methods than the table's, by name: full, baseline, no-blocking, vastgaussian, lambda-vis-0, ..."""
+    data: Path | None = None
+    """Folder that holds the captures which are not generated: residence-pixsfm, copr, ..."""
+    scale_iterations: float = 1.0
+    """Factor on the iterations of every scene."""
+    iterations_total: int | None = None
+    """Iterations that every method may spend on a scene, shared out as the scene's own; overrides the factor."""
+    max_anchors: int = 0
+    """No growth beyond this many anchors, of the scene or of all blocks together; 0 for no limit."""
+    validation: bool = False
+    """Measure on training photographs that are held out instead of on the test views: for choosing settings."""
+    jobs: int = 1
+    """Runs at once; cores are shared among them."""
+    redo: bool = False
+    """Allow other settings than those of the runs that are there to discard what they trained."""
+    lpips_weights: Path | None = None
+    """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
+    bins: int = 4
+    """Number of groups by visibility."""
+
+
+def bench(arguments: list[str]) -> None:
+    asked = tyro.cli(BenchArguments, args=arguments, prog="vdgs bench")
+    from vdgs.bench.bench import BenchSettings, run_bench
+    from vdgs.bench.plan import Choices
+
+    choices = Choices(
+        asked.seeds, asked.scenes, asked.methods, asked.scale_iterations, asked.iterations_total, asked.max_anchors,
+        asked.validation,
+    )  # fmt: skip
+    run_bench(
+        BenchSettings(
+            asked.table, asked.output, choices, asked.data, asked.jobs, asked.bins, asked.lpips_weights, asked.redo
+        ),
+        open_console(),
+    )

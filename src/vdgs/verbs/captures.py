@@ -1,0 +1,67 @@
+"""Verbs about captures: look at one (`inspect`), generate one (`synth`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, arg
+
+from vdgs.captures.options import CaptureOptions
+from vdgs.synth.options import SynthOptions
+from vdgs.verbs.shared import open_console
+
+
+@dataclass(frozen=True)
+class InspectArguments:
+    """Say what a capture holds and how well its photographs cover the place, in a table and figures."""
+
+    capture: Positional[Path]
+    """Folder of the capture."""
+    output: Path
+    """Folder for report.json and the figures."""
+    check: bool = True
+    """Decode every photograph once, to find damaged ones."""
+    options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
+
+
+def inspect(arguments: list[str]) -> None:
+    asked = tyro.cli(InspectArguments, args=arguments, prog="vdgs inspect")
+    from vdgs.captures.checks import check_images
+    from vdgs.captures.loading import load_capture
+    from vdgs.inspect import inspect_capture, print_report
+
+    capture = load_capture(asked.capture, asked.options)
+    if asked.check:
+        check_images(capture)
+    print_report(inspect_capture(capture, asked.output))
+
+
+@dataclass(frozen=True)
+class SynthArguments:
+    """Generate an aerial place and a drone flight over it, as a COLMAP capture."""
+
+    output: Positional[Path]
+    """Folder for the capture; it must not exist or be empty."""
+    options: Annotated[SynthOptions, arg(name="")] = field(default_factory=SynthOptions)
+
+
+def synth(arguments: list[str]) -> None:
+    asked = tyro.cli(SynthArguments, args=arguments, prog="vdgs synth")
+    from rich.progress import Progress, TaskID
+
+    from vdgs.synth import generate
+
+    console = open_console()
+    with Progress(console=console, disable=not console.is_terminal) as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def show(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done)
+
+        found = generate(asked.output, asked.options, show)
+    console.print(f"{found.line}\ncapture: {asked.output}", highlight=False)

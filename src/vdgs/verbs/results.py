@@ -1,0 +1,86 @@
+"""Verbs that show what a run came to: `eval`, `report`, `render`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from tyro.conf import Positional
+
+from vdgs.verbs.shared import open_console, use_threads
+
+
+@dataclass(frozen=True)
+class EvalArguments:
+    """Render the test views of a run and measure them: metrics.json, per_view.json, pictures, a table."""
+
+    run: Positional[Path]
+    """Run folder."""
+    model: Literal["best", "coarse", "merged"] = "best"
+    """Which model; `best` is the merged one where there is one."""
+    lpips_weights: Path | None = None
+    """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
+    bins: int = 4
+    """Number of visibility quantiles by which metrics are reported."""
+    threads: int = 0
+    """Threads of the kernels; 0 for all cores."""
+
+
+def eval(arguments: list[str]) -> None:
+    asked = tyro.cli(EvalArguments, args=arguments, prog="vdgs eval")
+    from vdgs.stages.evaluate import evaluate_stage
+
+    use_threads(asked.threads)
+    evaluate_stage(asked.run, asked.model, asked.lpips_weights, asked.bins, open_console())
+
+
+@dataclass(frozen=True)
+class ReportArguments:
+    """Write RUN/report.html: one file with the figures, metrics, pictures and settings of a run."""
+
+    run: Positional[Path]
+    """Run folder."""
+
+
+def report(arguments: list[str]) -> None:
+    asked = tyro.cli(ReportArguments, args=arguments, prog="vdgs report")
+    from vdgs.report import write_report
+    from vdgs.run import RunFolder
+
+    open_console().print(f"report: {write_report(RunFolder(asked.run))}", highlight=False)
+
+
+@dataclass(frozen=True)
+class RenderArguments:
+    """Render a run: its test views, its training views, or a camera path; as PNG files or a video."""
+
+    run: Positional[Path]
+    """Run folder."""
+    output: Path
+    """Folder for PNG files, or a file that ends in .mp4."""
+    views: Literal["test", "train", "orbit", "flyover"] = "test"
+    """Which cameras; `orbit` and `flyover` are paths made from the capture."""
+    path: Path | None = None
+    """JSON file with a camera path (docs/conventions.md); overrides --views."""
+    seconds: float = 0.0
+    """Length of a camera path; 0: what its file says, or 12 seconds."""
+    fps: float = 0.0
+    """Frames per second of a camera path and of the video; 0: what its file says, or 30 (2 for separate views)."""
+    width: int = 0
+    """Image width; 0 takes that of the training views."""
+    kind: Literal["image", "depth", "visibility"] = "image"
+    """What to draw: the picture, expected depth, or the number of cameras that see each place."""
+    model: Literal["best", "coarse", "merged"] = "best"
+    """Which model; `best` is the merged one where there is one."""
+    threads: int = 0
+    """Threads of the kernels; 0 for all cores."""
+
+
+def render(arguments: list[str]) -> None:
+    asked = tyro.cli(RenderArguments, args=arguments, prog="vdgs render")
+    from vdgs.render_run import render_run
+
+    use_threads(asked.threads)
+    render_run(asked, open_console())

@@ -1,0 +1,70 @@
+"""What verbs have in common: presets, the settings that a run recorded, threads, the console."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from vdgs.config import PRESETS, MethodConfig, PresetName
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from vdgs.run import RunFolder
+
+
+def named_preset(arguments: list[str]) -> PresetName:
+    """The preset named on the command line: it decides the defaults of all other options."""
+    for place, argument in enumerate(arguments):
+        value = argument.partition("=")[2] if argument.startswith("--preset=") else None
+        if argument == "--preset" and place + 1 < len(arguments):
+            value = arguments[place + 1]
+        if value in PRESETS:
+            return value  # type: ignore[return-value]
+    return "paper"
+
+
+def recorded_run(arguments: list[str], kind: type, prog: str) -> tuple[RunFolder, MethodConfig]:
+    """The run that the arguments name and its settings: they are the defaults of the options, and of their help where
+    the run is named."""
+    from vdgs.run import RunFolder
+
+    if "-h" in arguments or "--help" in arguments:
+        named = next((RunFolder(Path(a)) for a in arguments if (Path(a) / "config.yaml").is_file()), None)
+        return (named, named.method()) if named else tyro.cli(kind, args=arguments, prog=prog)
+    run = RunFolder(tyro.cli(kind, args=arguments, prog=prog).run)
+    return run, run.method()
+
+
+def change_settings(run: RunFolder, method: MethodConfig, redo: bool) -> None:
+    """Give the run other settings for later stages, if they are other."""
+    from vdgs.config import to_dict
+    from vdgs.config_checks import validate
+    from vdgs.errors import VdgsError
+
+    problems = validate(method)
+    if problems:
+        raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
+    wanted = run.settings() | to_dict(method)
+    if wanted != run.settings():
+        with run.locked():
+            for line in run.change(wanted, redo):
+                open_console().print(f"[yellow]changed[/] {line}", highlight=False)
+
+
+def use_threads(count: int) -> None:
+    import torch
+
+    from vdgs.kernels.native.module import set_threads, threads
+
+    if count > 0:
+        set_threads(count)
+    torch.set_num_threads(max(1, threads()))
+
+
+def open_console() -> Console:
+    from rich.console import Console
+
+    return Console(soft_wrap=True)

@@ -1,0 +1,116 @@
+"""Verbs that take a run one stage further: `visibility`, `partition`, `train`, `merge`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, arg
+
+from vdgs.config import AssignmentConfig, BlockConfig, MergeConfig, PartitionConfig
+from vdgs.run_options import WatchOptions
+from vdgs.verbs.shared import change_settings, open_console, recorded_run, use_threads
+
+
+@dataclass(frozen=True)
+class VisibilityArguments:
+    """Count how many training cameras see each part of a run's scene; writes a map and the distribution."""
+
+    run: Positional[Path]
+    """Run folder with a coarse model."""
+
+
+def visibility(arguments: list[str]) -> None:
+    asked = tyro.cli(VisibilityArguments, args=arguments, prog="vdgs visibility")
+    from vdgs.run import RunFolder
+    from vdgs.stages.partition import measure_visibility
+
+    measure_visibility(RunFolder(asked.run), open_console())
+
+
+@dataclass(frozen=True)
+class PartitionArguments:
+    """Cut a run's scene into blocks by place and visibility, and give each block its cameras."""
+
+    run: Positional[Path]
+    """Run folder with a coarse model."""
+    redo: bool = False
+    """Allow another cut to discard blocks that are trained."""
+    why: str | None = None
+    """Name of a training photograph: also say how well it shows each block and why it was assigned or not."""
+    threads: int = 0
+    """Threads of the kernels; 0 for all cores. The result does not depend on it."""
+    partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
+    assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
+
+
+def partition(arguments: list[str]) -> None:
+    run, method = recorded_run(arguments, PartitionArguments, "vdgs partition")
+    default = PartitionArguments(tyro.MISSING, partition=method.partition, assignment=method.assignment)
+    asked = tyro.cli(PartitionArguments, args=arguments, prog="vdgs partition", default=default)
+    from vdgs.stages.partition import explain_view, partition_run
+
+    use_threads(asked.threads)
+    change_settings(run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.redo)
+    partition_run(run, open_console())
+    if asked.why is not None:
+        explain_view(run, asked.why, open_console())
+
+
+@dataclass(frozen=True)
+class TrainArguments:
+    """Train the blocks of a run. The same command continues; blocks may also be trained on several machines."""
+
+    run: Positional[Path]
+    """Run folder that is cut into blocks."""
+    block: int | None = None
+    """Only this block, in this process; without it all of them, several at once."""
+    jobs: int = 0
+    """Blocks trained at once; 0 takes what cores and memory allow."""
+    redo: bool = False
+    """Allow other settings to discard blocks that are trained with the old ones."""
+    threads: int = 0
+    """Threads of the kernels for --block; 0 for all cores. The result does not depend on it."""
+    settings: Annotated[BlockConfig, arg(name="block")] = field(default_factory=BlockConfig)
+    watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+
+
+def train(arguments: list[str]) -> None:
+    run, method = recorded_run(arguments, TrainArguments, "vdgs train")
+    default = TrainArguments(tyro.MISSING, settings=method.block)
+    asked = tyro.cli(TrainArguments, args=arguments, prog="vdgs train", default=default)
+    change_settings(run, replace(method, block=asked.settings), asked.redo)
+    if asked.block is not None:
+        from vdgs.executors.parent import stop_when_parent_dies
+        from vdgs.stages.block import train_block
+
+        stop_when_parent_dies()
+        use_threads(asked.threads)
+        train_block(asked.run, asked.block, asked.watching, open_console())
+    else:
+        from vdgs.stages.train import train_blocks
+
+        train_blocks(asked.run, asked.watching, asked.jobs, open_console())
+
+
+@dataclass(frozen=True)
+class MergeArguments:
+    """Merge the trained blocks of a run into one scene."""
+
+    run: Positional[Path]
+    """Run folder whose blocks are trained."""
+    incomplete: bool = False
+    """Let the coarse model stand in for blocks that are missing or failed."""
+    merge: Annotated[MergeConfig, arg(name="")] = field(default_factory=MergeConfig)
+
+
+def merge(arguments: list[str]) -> None:
+    run, method = recorded_run(arguments, MergeArguments, "vdgs merge")
+    default = MergeArguments(tyro.MISSING, merge=method.merge)
+    asked = tyro.cli(MergeArguments, args=arguments, prog="vdgs merge", default=default)
+    from vdgs.stages.merge import merge_run
+
+    change_settings(run, replace(method, merge=asked.merge), redo=False)
+    merge_run(asked.run, asked.incomplete, open_console())

@@ -1,0 +1,104 @@
+"""Verbs that start a run from a capture: its first stage (`coarse`), all of them (`run`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, arg
+
+from vdgs.captures.options import CaptureOptions
+from vdgs.config import (
+    PRESETS,
+    AssignmentConfig,
+    BlockConfig,
+    MergeConfig,
+    MethodConfig,
+    PartitionConfig,
+    PresetName,
+    TrainConfig,
+)
+from vdgs.run_options import WatchOptions
+from vdgs.verbs.shared import named_preset, open_console, use_threads
+
+
+@dataclass(frozen=True)
+class CoarseArguments:
+    """Train the global anchor model of a capture. The same command continues a run that was stopped."""
+
+    capture: Positional[Path]
+    """Folder of the capture."""
+    output: Path
+    """Run folder; new, or the run to continue."""
+    preset: PresetName = "paper"
+    """`paper`: the paper's settings (100 000 iterations). `laptop`: a good result in minutes on a CPU."""
+    threads: int = 0
+    """Threads of the kernels; 0 for all cores. The result does not depend on it."""
+    options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
+    training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
+    watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+
+
+def coarse(arguments: list[str]) -> None:
+    preset = named_preset(arguments)
+    default = CoarseArguments(tyro.MISSING, tyro.MISSING, preset, training=PRESETS[preset].training)
+    asked = tyro.cli(CoarseArguments, args=arguments, prog="vdgs coarse", default=default)
+    from vdgs.stages.coarse import begin_run, train_coarse
+
+    use_threads(asked.threads)
+    method = replace(PRESETS[preset], training=asked.training)
+    run, capture = begin_run(asked.capture, asked.output, asked.options, method)
+    train_coarse(run, capture, asked.watching, open_console())
+
+
+@dataclass(frozen=True)
+class RunArguments:
+    """Do everything: coarse model, visibility, blocks, cameras, block training, merge, metrics, report.
+
+    The same command continues a run that was stopped; finished stages are skipped.
+    """
+
+    capture: Positional[Path]
+    """Folder of the capture."""
+    output: Path
+    """Run folder; new, or the run to continue."""
+    preset: PresetName = "paper"
+    """`paper`: the paper's settings (100 000 + 50 000 iterations a block). `laptop`: a good result in minutes."""
+    redo: bool = False
+    """Allow other settings than the run has to discard what was trained with the old ones."""
+    jobs: int = 0
+    """Blocks trained at once; 0 takes what cores and memory allow."""
+    incomplete: bool = False
+    """Go on if a block fails: the coarse model stands in for it."""
+    lpips_weights: Path | None = None
+    """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
+    bins: int = 4
+    """Number of visibility quantiles by which metrics are reported."""
+    threads: int = 0
+    """Threads of the kernels; 0 for all cores. The result does not depend on it."""
+    options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
+    training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
+    partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
+    assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
+    block: BlockConfig = field(default_factory=BlockConfig)
+    merge: MergeConfig = field(default_factory=MergeConfig)
+    watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+
+    def method(self) -> MethodConfig:
+        return MethodConfig(self.training, self.partition, self.assignment, self.block, self.merge)
+
+
+def run(arguments: list[str]) -> None:
+    preset = named_preset(arguments)
+    settings = PRESETS[preset]
+    default = RunArguments(
+        tyro.MISSING, tyro.MISSING, preset, training=settings.training, partition=settings.partition,
+        assignment=settings.assignment, block=settings.block, merge=settings.merge,
+    )  # fmt: skip
+    asked = tyro.cli(RunArguments, args=arguments, prog="vdgs run", default=default)
+    from vdgs.stages.pipeline import run_all
+
+    use_threads(asked.threads)
+    run_all(asked, open_console())
