@@ -217,6 +217,11 @@ def _torch() -> list[Check]:
     return checks
 
 
+def _cuda() -> list[Check]:
+    checks: list[Check] = importlib.import_module("vdgs.doctor_cuda").looks()
+    return checks
+
+
 def _extras() -> list[Check]:
     """Each optional group of packages: present, or what it would add and how to get it."""
     checks = []
@@ -335,5 +340,5 @@ def _gb(size_bytes: int) -> str:
 
 
 _LOOKS: tuple[Callable[[], list[Check]], ...] = (
-    _versions, _dependencies, _processor, _kernels, _threads, _memory, _torch, _extras, _lpips, _film, _disk,
+    _versions, _dependencies, _processor, _kernels, _threads, _memory, _torch, _cuda, _extras, _lpips, _film, _disk,
 )  # fmt: skip

@@ -21,7 +21,7 @@ from vdgs.verbs.starting import RunArguments
 
 
 def run_all(asked: RunArguments, console: Console) -> None:
-    """Everything from a capture to a report.
+    """Everything from a capture to a report, on a device that is chosen already (`vdgs.devices`).
 
     Raises what the stages raise; all that was finished before stays, and the same command continues.
     """
@@ -37,7 +37,7 @@ def run_all(asked: RunArguments, console: Console) -> None:
     partition_run(run, console)
     _title(console, "block training")
     try:
-        train_blocks(run.path, asked.watching, asked.jobs, console)
+        train_blocks(run.path, asked.watching, asked.jobs, console, asked.device)
     except RunError as error:
         if not asked.incomplete:
             raise

@@ -26,11 +26,11 @@ PROCESS_BYTES, ANCHOR_BYTES, GROWTH = 400_000_000, 2_500, 2.0
 FROZEN_BYTES = 300
 
 
-def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console) -> None:
+def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console, device: str = "cpu") -> None:
     """Train, or continue, all blocks of a run that are not finished.
 
-    `jobs` processes at once; 0 takes as many as cores and memory allow. Raises RunError if a block failed (the others
-    are trained first), Stopped after Ctrl-C or SIGTERM (every block saved).
+    `jobs` processes at once, each on `device`; 0 takes as many as cores and memory allow. Raises RunError if a block
+    failed (the others are trained first), Stopped after Ctrl-C or SIGTERM (every block saved).
     """
     options.check()
     if jobs < 0:
@@ -55,7 +55,7 @@ def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console)
         began = time.monotonic()
         for index in left:
             _queue(run.block(index), key)
-        commands = [_job(run, index, threads, budget / at_once, options) for index in left]
+        commands = [_job(run, index, threads, budget / at_once, options, device) for index in left]
         outcomes = run_jobs(commands, at_once=at_once, retries=2, console=console)
     if any(outcome.state == "stopped" for outcome in outcomes):
         raise Stopped("Stopped; every block that was training is saved. The same command continues.")
@@ -69,10 +69,10 @@ def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console)
     console.print(f"blocks trained in {(time.monotonic() - began) / 60:.1f} min", highlight=False)
 
 
-def _job(run: RunFolder, index: int, threads: int, image_gb: float, options: WatchOptions) -> Job:
+def _job(run: RunFolder, index: int, threads: int, image_gb: float, options: WatchOptions, device: str) -> Job:
     command = [
         sys.executable, "-m", "vdgs.cli", "train", str(run.path), "--block", str(index), "--threads", str(threads),
-        "--image-memory-gb", f"{image_gb:.3f}", "--save-every", str(options.save_every),
+        "--image-memory-gb", f"{image_gb:.3f}", "--save-every", str(options.save_every), "--device", device,
     ]  # fmt: skip
     if options.tensorboard:
         command.append("--tensorboard")

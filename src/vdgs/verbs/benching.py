@@ -9,7 +9,7 @@ from typing import Literal
 import tyro
 from tyro.conf import Positional
 
-from vdgs.verbs.shared import open_console
+from vdgs.verbs.shared import open_console, use_device
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,8 @@ class BenchArguments:
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     bins: int = 4
     """Number of groups by visibility."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 
 
 def bench(arguments: list[str]) -> None:
@@ -54,6 +56,7 @@ def bench(arguments: list[str]) -> None:
     from vdgs.bench.bench import BenchSettings, run_bench
     from vdgs.bench.plan import Choices
 
+    use_device(asked.device)
     choices = Choices(
         asked.seeds, asked.scenes, asked.methods, asked.scale_iterations, asked.iterations_total, asked.max_anchors,
         asked.validation,

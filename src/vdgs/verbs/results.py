@@ -9,7 +9,7 @@ from typing import Literal
 import tyro
 from tyro.conf import Positional
 
-from vdgs.verbs.shared import open_console, use_threads
+from vdgs.verbs.shared import open_console, use_device, use_threads
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,15 @@ class EvalArguments:
     """Number of visibility quantiles by which metrics are reported."""
     threads: int = 0
     """Threads of the kernels; 0 for all cores."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 
 
 def eval(arguments: list[str]) -> None:
     asked = tyro.cli(EvalArguments, args=arguments, prog="vdgs eval")
     from vdgs.stages.evaluate import evaluate_stage
 
+    use_device(asked.device)
     use_threads(asked.threads)
     evaluate_stage(asked.run, asked.model, asked.lpips_weights, asked.bins, open_console())
 
@@ -76,11 +79,14 @@ class RenderArguments:
     """Which model; `best` is the merged one where there is one."""
     threads: int = 0
     """Threads of the kernels; 0 for all cores."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 
 
 def render(arguments: list[str]) -> None:
     asked = tyro.cli(RenderArguments, args=arguments, prog="vdgs render")
     from vdgs.render_run import render_run
 
+    use_device(asked.device)
     use_threads(asked.threads)
     render_run(asked, open_console())

@@ -64,6 +64,15 @@ def use_threads(count: int) -> None:
     torch.set_num_threads(max(1, threads()))
 
 
+def use_device(asked: str) -> str:
+    """Decide which device computes, say so in a line, and return it. Raises VdgsError for one that cannot."""
+    from vdgs.devices import choose
+
+    choice = choose(asked)
+    open_console().print(str(choice), highlight=False)
+    return choice.device
+
+
 def open_console() -> Console:
     from rich.console import Console
 

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from vdgs.config import AssignmentConfig, BlockConfig, MergeConfig, PartitionConfig
 from vdgs.run_options import WatchOptions
-from vdgs.verbs.shared import change_settings, open_console, recorded_run, use_threads
+from vdgs.verbs.shared import change_settings, open_console, recorded_run, use_device, use_threads
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,8 @@ class TrainArguments:
     """Allow other settings to discard blocks that are trained with the old ones."""
     threads: int = 0
     """Threads of the kernels for --block; 0 for all cores. The result does not depend on it."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
     settings: Annotated[BlockConfig, arg(name="block")] = field(default_factory=BlockConfig)
     watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
 
@@ -81,6 +83,7 @@ def train(arguments: list[str]) -> None:
     run, method = recorded_run(arguments, TrainArguments, "vdgs train")
     default = TrainArguments(tyro.MISSING, settings=method.block)
     asked = tyro.cli(TrainArguments, args=arguments, prog="vdgs train", default=default)
+    device = use_device(asked.device)
     change_settings(run, replace(method, block=asked.settings), asked.redo)
     if asked.block is not None:
         from vdgs.executors.parent import stop_when_parent_dies
@@ -92,7 +95,7 @@ def train(arguments: list[str]) -> None:
     else:
         from vdgs.stages.train import train_blocks
 
-        train_blocks(asked.run, asked.watching, asked.jobs, open_console())
+        train_blocks(asked.run, asked.watching, asked.jobs, open_console(), device)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from vdgs.config import (
     TrainConfig,
 )
 from vdgs.run_options import WatchOptions
-from vdgs.verbs.shared import named_preset, open_console, use_threads
+from vdgs.verbs.shared import named_preset, open_console, use_device, use_threads
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,8 @@ class CoarseArguments:
     """`paper`: the paper's settings (100 000 iterations). `laptop`: a good result in minutes on a CPU."""
     threads: int = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
@@ -47,6 +49,7 @@ def coarse(arguments: list[str]) -> None:
     asked = tyro.cli(CoarseArguments, args=arguments, prog="vdgs coarse", default=default)
     from vdgs.stages.coarse import begin_run, train_coarse
 
+    use_device(asked.device)
     use_threads(asked.threads)
     method = replace(PRESETS[preset], training=asked.training)
     run, capture = begin_run(asked.capture, asked.output, asked.options, method)
@@ -78,6 +81,8 @@ class RunArguments:
     """Number of visibility quantiles by which metrics are reported."""
     threads: int = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
@@ -100,5 +105,6 @@ def run(arguments: list[str]) -> None:
     asked = tyro.cli(RunArguments, args=arguments, prog="vdgs run", default=default)
     from vdgs.stages.pipeline import run_all
 
+    device = use_device(asked.device)
     use_threads(asked.threads)
-    run_all(asked, open_console())
+    run_all(replace(asked, device=device), open_console())
