@@ -27,6 +27,7 @@ EXTRAS = {
     "synth": "the generated city, ray-traced (vdgs synth)",
     "lpips": "the linear heads of LPIPS",
     "tensorboard": "curves of the training in TensorBoard",
+    "gsplat": "another rasteriser on an NVIDIA GPU, to compare with",
     "test": "the test suite",
 }
 #: Imported for real, since these are the ones whose binary parts break.

@@ -1,0 +1,87 @@
+"""gsplat behind the own operation. gsplat needs a GPU: what it is asked is tried on a stand-in (gsplat_stand_in.py)."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+import torch
+
+import gsplat_stand_in
+from rasterise_scenes import make_scene
+from test_rasterise import assert_close, loss_of
+from vdgs.errors import VdgsError
+from vdgs.kernels.gsplat import rasterise
+from vdgs.kernels.gsplat.rasterise import GsplatUnavailable, reach_px
+from vdgs.kernels.reference.rasterise import rasterise as reference
+
+SCENES = {
+    "ordinary": make_scene(120, 37, 29),
+    "dense": make_scene(250, 20, 18, opacity=2.0),
+    "huge": make_scene(40, 33, 33, size=200.0, opacity=-2.0),
+    "tiny": make_scene(200, 20, 20, size=0.05),
+    "edge-on": make_scene(80, 25, 35, size=4.0, thinness=2.0),
+    "off-screen": make_scene(100, 20, 20, margin=4.0),
+    "empty": make_scene(0, 20, 10),
+    "one pixel": make_scene(10, 1, 1, size=1.0),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_it_draws_and_differentiates_what_the_reference_does(name):
+    scene = SCENES[name]
+    ours = rasterise(*scene.tensors, scene.width, scene.height, depth=True, engine=gsplat_stand_in)
+    exact_scene = scene.to(torch.float64)
+    exact = reference(*exact_scene.tensors, scene.width, scene.height, depth=True)
+    for actual, expected in zip(ours, exact, strict=True):
+        assert actual.shape == expected.shape
+        assert_close(actual, expected, 1e-4)
+    used = scene.tensors if name != "empty" else scene.tensors[5:]
+    wanted = exact_scene.tensors if name != "empty" else exact_scene.tensors[5:]
+    gradients = torch.autograd.grad(loss_of(ours), used, allow_unused=True)
+    for actual, expected in zip(gradients, torch.autograd.grad(loss_of(exact), wanted), strict=True):
+        assert_close(actual, expected, 1e-3)
+
+
+def test_without_depth_there_is_none():
+    scene = SCENES["ordinary"]
+    raster = rasterise(*scene.tensors, scene.width, scene.height, engine=gsplat_stand_in)
+    assert raster.depth is None
+    assert raster.image.shape == (29, 37, 3)
+
+
+@pytest.mark.parametrize("column", range(5))
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_rows_that_are_not_finite_are_not_drawn(column, value):
+    tensors = [tensor.detach().clone() for tensor in SCENES["ordinary"].tensors]
+    tensors[column].view(len(tensors[column]), -1)[3, 0] = value
+    reach = reach_px(*tensors[:5])
+    assert torch.all(reach[3] == 0)
+    assert torch.any(reach > 0)
+
+
+@pytest.mark.parametrize("conic", [(-1.0, 0.0, 1.0), (1.0, 2.0, 1.0), (0.0, 0.0, 0.0)])
+def test_conics_that_are_not_positive_definite_are_not_drawn(conic):
+    tensors = [tensor.detach().clone() for tensor in SCENES["ordinary"].tensors]
+    tensors[1][5] = torch.tensor(conic)
+    assert torch.all(reach_px(*tensors[:5])[5] == 0)
+
+
+def test_without_gsplat_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    scene = SCENES["ordinary"]
+    with pytest.raises(GsplatUnavailable, match=r"import of gsplat halted.*vdgs\[gsplat\]") as raised:
+        rasterise(*scene.tensors, scene.width, scene.height)
+    assert isinstance(raised.value, VdgsError)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", SCENES)
+def test_gsplat_itself_draws_what_the_reference_does(name):
+    pytest.importorskip("gsplat")
+    scene = SCENES[name]
+    there = [tensor.detach().cuda().requires_grad_() for tensor in scene.tensors]
+    ours = rasterise(*there, scene.width, scene.height, depth=True)
+    exact = reference(*scene.to(torch.float64).tensors, scene.width, scene.height, depth=True)
+    for actual, expected in zip(ours, exact, strict=True):
+        assert_close(actual.cpu(), expected, 1e-3)
