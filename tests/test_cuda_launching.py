@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -137,6 +140,15 @@ def test_no_card_and_no_driver(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(driver_module, "LIBRARY", "libcuda-that-is-not-there.so")
     with pytest.raises(CudaUnavailable, match=r"no NVIDIA driver here.*--device cpu"):
         cuda_driver.__wrapped__()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_the_benchmark_says_that_there_is_no_gpu():
+    benchmark = Path(__file__).parents[1] / "benchmarks" / "gpu.py"
+    done = subprocess.run([sys.executable, str(benchmark)], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    assert done.stderr.startswith("No GPU to measure: ")
+    assert "Traceback" not in done.stderr
 
 
 def test_arguments_are_packed_as_the_driver_reads_them():
