@@ -23,9 +23,12 @@ def host_compiler() -> str | None:
     return next(filter(None, map(shutil.which, filter(None, (os.environ.get("CXX"), "c++", "g++", "clang++")))), None)
 
 
-def build_on_host(source: str, folder: Path) -> ctypes.CDLL:
-    """A source of vdgs.kernels.cuda as a library for the processor; `host_NAME` runs one thread of a kernel."""
-    text = read_source(source)
+def build_on_host(source: str, folder: Path, text: str | None = None) -> ctypes.CDLL:
+    """A source of vdgs.kernels.cuda as a library for the processor; `host_NAME` runs one thread of a kernel.
+
+    `text` is compiled instead of the source's own.
+    """
+    text = text or read_source(source)
     kernels = re.findall(r'extern "C" __global__ void(?: __launch_bounds__\(\w+\))?\s+(\w+)\(', text)
     assert kernels, f"no kernel in {source}"
     exported = "\n".join(f"HOST_KERNEL({name})" for name in kernels)

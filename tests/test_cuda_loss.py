@@ -70,6 +70,24 @@ def test_no_barrier_is_missing(program, library):
 
 
 @needs_a_compiler
+@pytest.mark.parametrize("barrier", range(7))
+def test_a_missing_barrier_would_be_noticed(barrier, tmp_path, monkeypatch):
+    """And every barrier is needed: without any one of them the order of turns changes the result."""
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "code"))
+    before, *after = read_source("loss.cu").split("__syncthreads();")
+    assert len(after) == 7
+    parts = [before, *(f"__syncthreads();{part}" if i != barrier else part for i, part in enumerate(after))]
+    library = build_on_host("loss.cu", tmp_path, "".join(parts))
+    image, target, _ = scene(18, 17)
+    forwards, backwards = (
+        on_host(Program("loss.cu", driver=HostDriver(library, turned)), image, target) for turned in (False, True)
+    )
+    assert float(forwards[0].loss.detach()) != float(backwards[0].loss.detach()) or not torch.equal(
+        forwards[1], backwards[1]
+    )
+
+
+@needs_a_compiler
 def test_kernels_are_loaded_once_and_launched_over_every_tile(program):
     image, target, _ = scene(33, 50)
     for _ in range(2):

@@ -103,17 +103,15 @@ __device__ Similarity similarity(float a, float b, float squares, float products
   return {s, 2.0f * (b * (a2 - a1) - a * s * (b2 - b1)) * inverse, -s * b1 * inverse, 2.0f * a1 * inverse};
 }
 
-// Sum over the block, to thread 0. All threads take part.
+// Sum over the block, for thread 0; the others get zero. All threads take part.
 __device__ double add_up(double value, double (&room)[kThreads]) {
   room[thread()] = value;
   for (int half = kThreads / 2; half > 0; half /= 2) {
     __syncthreads();
     if (thread() < half) room[thread()] += room[thread() + half];
   }
-  __syncthreads();
-  const double sum = room[0];
   __syncthreads();  // before the room is used again
-  return sum;
+  return thread() == 0 ? room[0] : 0.0;
 }
 
 __device__ float weight_of_a_value(const long long* kept) {
@@ -199,7 +197,6 @@ photometric_backward(const float* image, const unsigned char* target, const unsi
       }
       gradient[at] = total;
     }
-    __syncthreads();  // before the tile is read anew
   }
 }
 
