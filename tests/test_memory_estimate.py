@@ -14,10 +14,13 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
 from captures_support import tiny_scene, write_colmap
 from vdgs.memory import available_bytes, is_out_of_memory
 from vdgs.memory_estimate import Need, advice, bytes_per_anchor, describe, estimate
+from vdgs.stages import memory_notes
+from vdgs.stages.memory_notes import announce
 
 needs = st.builds(
     Need,
@@ -71,9 +74,30 @@ def test_the_limit_of_anchors_makes_it_fit():
 
 
 def test_the_line_for_people_says_what_takes_it_and_what_there_is():
-    line = describe(estimate(Need(100_000, 200_000, 10, 0.5, 10**6, 2 * 10**8)), 3 * 10**9, "this process")
+    line = describe(estimate(Need(100_000, 200_000, 10, 0.5, 10**6, 2 * 10**8)), 3 * 10**9)
     assert line.startswith("memory by estimate: 0.87 GB at the start, 1.04 GB at most (photographs 0.20 GB")
-    assert line.endswith("this process has 3.00 GB free")
+    assert line.endswith("this process may take 3.00 GB")
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("coarse", ". --image-memory-gb may change when a run continues, other settings need a new --output."),
+        ("block", ". --jobs and --image-memory-gb may change when a run continues, other settings need --redo."),
+    ],
+)
+def test_a_warning_comes_before_training_where_it_will_not_fit(kind, said, monkeypatch, capsys):
+    need = Need(1_000_000, 0, 10, 0.4, 2 * 10**7, 10**9)
+    monkeypatch.setattr(memory_notes, "available_bytes", lambda: 5 * 10**9)
+    announce(need, kind, Console(width=2000))
+    line, warning, *_ = capsys.readouterr().out.splitlines()
+    assert line.startswith("memory by estimate")
+    assert warning.startswith("warning it may run out of memory: ")
+    assert ("--growth.max-anchors 1000000" in warning) == (kind == "coarse")
+    assert warning.endswith(said)
+    monkeypatch.setattr(memory_notes, "available_bytes", lambda: 10**11)
+    announce(need, kind, Console(width=2000))
+    assert "warning" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -148,7 +172,7 @@ def test_training_that_runs_out_of_memory_saves_says_what_helps_and_continues(tm
     assert broken.returncode == 1, broken.stdout + broken.stderr
     assert "Traceback" not in broken.stderr
     assert "out of memory with" in broken.stderr
-    assert "--downscale 2 or --images images_2 (smaller photographs) saves about 0." in broken.stderr
+    assert "photographs of half the size (--downscale or --images images_N) saves about 0." in broken.stderr
     folder = tmp_path / "run" / "coarse"
     (saved,) = (int(path.stem) for path in (folder / "checkpoints").glob("*.json"))
     assert 5 < saved < 40

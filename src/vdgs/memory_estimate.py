@@ -104,7 +104,9 @@ def advice(need: Need, kind: Kind, to_save: int) -> list[Advice]:
     found = [_fewer_anchors(need, kind, to_save)]
     if kind == "coarse":
         smaller = estimate(replace(need, pixels=need.pixels // 4, images_bytes=need.images_bytes // 4))
-        found.append(Advice("--downscale 2 or --images images_2 (smaller photographs)", whole.total - smaller.total))
+        found.append(
+            Advice("photographs of half the size (--downscale or --images images_N)", whole.total - smaller.total)
+        )
     else:
         half = estimate(replace(need, anchors=need.anchors // 2))
         found.append(Advice("vdgs partition with twice the --blocks (smaller blocks)", whole.total - half.total))
@@ -126,13 +128,13 @@ def _fewer_anchors(need: Need, kind: Kind, to_save: int) -> Advice:
     return Advice(f"{option} {limit} (less growth)", saved)
 
 
-def describe(found: Estimate, available: int, place: str) -> str:
+def describe(found: Estimate, room: int) -> str:
     """One line: what is needed, what for, and what there is."""
     grown = f", {in_gb(found.grown_anchors)} once they have grown" if found.grown_anchors > found.anchors else ""
     return (
         f"memory by estimate: {in_gb(found.start)} at the start, {in_gb(found.total)} at most (photographs "
         f"{in_gb(found.images)}, one picture {in_gb(found.picture)}, anchors {in_gb(found.anchors)}{grown}); "
-        f"{place} has {in_gb(available)} free"
+        f"this process may take {in_gb(room)}"
     )
 
 

@@ -1,7 +1,8 @@
 """The typed set of numerical operations, with interchangeable implementations.
 
 `reference` is readable torch (the oracle of the tests), `native` is C++ for the CPU. Both offer the
-functions below under the same names; "d" marks those that torch can differentiate.
+functions below under the same names; "d" marks those that torch can differentiate. `cuda` is for NVIDIA GPUs and has
+some of them so far (`operations`).
 
 Names and dimensions, fixed once for all files in this folder:
 

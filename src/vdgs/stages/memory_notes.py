@@ -49,7 +49,7 @@ def announce(need: Need, kind: Kind, console: Console) -> None:
     """Say what training will take beside what there is; where that is too little, what helps."""
     found = estimate(need)
     room = available_bytes() + psutil.Process().memory_info().rss
-    console.print(describe(found, room, "this process"), highlight=False)
+    console.print(describe(found, room), highlight=False)
     if found.total > room:
         helpful = advice(need, kind, found.total - room)
         console.print(
