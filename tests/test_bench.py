@@ -192,7 +192,7 @@ def made(gains: dict[str, tuple[float, float]], seeds: int = 3, method_failed: s
             results.append(
                 Result("toy-uneven", name, seed, "failed", "it | broke", "runs/x")
                 if failed
-                else Result("toy-uneven", name, seed, "done", "", "runs/x", figures, bounds)
+                else Result("toy-uneven", name, seed, "done", "", "runs/x", figures, bounds, "truth")
             )
     return results
 

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from vdgs.bench.grids import bounds_of
 from vdgs.bench.measure import group_names
 from vdgs.bench.plan import Plan
 from vdgs.bench.results import Result
@@ -66,7 +67,7 @@ def _panel(axes: Axes, plan: Plan, results: Sequence[Result], title: str, first:
             linewidth=2.2 if ours else 1.3, elinewidth=1.0, capsize=2.5, label=method.title, zorder=3 if ours else 2,
         )  # fmt: skip
     names = [
-        f"{name}\nV {group['lower']:.3g} to {group['upper']:.3g}"
+        f"{name}\nV {bounds_of(group)}"
         for name, group in zip(group_names(len(groups)), groups, strict=True)
     ]  # fmt: skip
     axes.set_xticks(places, [name.replace(" seen ", "\nseen ") for name in names])
