@@ -126,8 +126,13 @@ def _group_columns(results: Sequence[Result], scene: str) -> tuple[list[Column],
     ]
     if of is None:
         return columns, ()
-    bounds = "; ".join(f"{name}: V {bounds_of(group)}" for name, group in zip(names, groups, strict=True))
-    return columns, (f"V: {SEEN_BY[of.seen_by]}. Pooled over all test views: {bounds}.",)
+    return columns, (f"V: {SEEN_BY[of.seen_by]}. Pooled over all test views: {all_bounds_of(of)}.",)
+
+
+def all_bounds_of(result: Result) -> str:
+    """The V of every group of a result, least seen first."""
+    names = group_names(len(result.groups))
+    return "; ".join(f"{name}: V {bounds_of(group)}" for name, group in zip(names, result.groups, strict=True))
 
 
 def bounds_of(group: Mapping[str, Any]) -> str:

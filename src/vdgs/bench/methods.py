@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Literal
 
 from vdgs.bench.definitions import COARSE_ONLY, EXPLICIT, Budget, Change, Method
+from vdgs.comparators.gaussian_schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS
 from vdgs.config import CompensationConfig, MethodConfig, PartitionStrategy
 
 LAMBDA_VIS = (0.0, 0.5, 1.0, 1.3)
@@ -119,13 +120,14 @@ _COMMON = (
 _3DGS = "Kerbl et al., 3D Gaussian Splatting for Real-Time Radiance Field Rendering, SIGGRAPH 2023"
 #: As the docstring of `comparators.gaussians` has it.
 _3DGS_LEAVES_OUT = (
-    "pruning by footprint in the image (its section 5.2); pruning by size in the world is there",
-    "its own image formation: alpha at most 0.999, near plane at 0.01 and extent by opacity are ours, for all methods",
+    "pruning by footprint in the image (its section 5.2)",
+    "its own image formation (alpha at most 0.999, near plane at 0.01 and extent by opacity are as for all methods)",
     "exposure compensation, depth regularisation and anti-aliasing, which came later than its paper",
 )
 _3DGS_SCHEDULE = (
-    "its schedule (warm-up, degree of colour, start and interval of density control, resets of opacity) is that of its "
-    "30 000 iterations, stretched or shortened to the total here"
+    f"its schedule of {PUBLISHED_ITERATIONS:,} iterations (warm-up, degree of colour, start and interval of density "
+    "control, resets of opacity) moves in proportion to the total here, but neither decides nor resets more "
+    f"often than every {LEAST_INTERVAL} iterations"
 )
 _ABLATIONS = [
     Method("full", "VDGS (full)", full, cites="VDGS, sections III-B and III-C"),

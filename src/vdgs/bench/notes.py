@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from vdgs.bench.definitions import Method
-from vdgs.bench.grids import SEEN_BY, bounds_of
-from vdgs.bench.measure import group_names
+from vdgs.bench.grids import SEEN_BY, all_bounds_of
 from vdgs.bench.plan import Plan
 from vdgs.bench.quoted import CONTRADICTIONS, EFFICIENCY, QUOTED
 from vdgs.bench.results import Result
@@ -72,9 +71,7 @@ def _groups(plan: Plan, results: Sequence[Result]) -> list[str]:
     for scene in plan.scenes:
         of = next((each for each in results if each.scene == scene.name and each.groups), None)
         if of is not None:
-            names = group_names(len(of.groups))
-            bounds = "; ".join(f"{name} {bounds_of(g)}" for name, g in zip(names, of.groups, strict=True))
-            said.append(f"{scene.title}: {SEEN_BY[of.seen_by]}. V: {bounds}")
+            said.append(f"{scene.title}: {SEEN_BY[of.seen_by]}. {all_bounds_of(of)}")
     return said if len(said) > 1 else []
 
 

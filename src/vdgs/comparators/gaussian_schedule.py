@@ -8,9 +8,10 @@ from vdgs.comparators.gaussian_training import GaussiansConfig
 
 #: What the schedule was published for (3DGS section 7.1).
 PUBLISHED_ITERATIONS = 30_000
-#: Shorter than this no interval becomes: between two decisions about density, so that several views are counted, and
-#: between two resets, so that opacities come back (choices).
-LEAST_INTERVAL, LEAST_RESET_INTERVAL = 20, 500
+#: No interval between two decisions about density or two resets becomes shorter than the published one between
+#: decisions (choice): decisions on fewer views make several times as many Gaussians and a worse scene, and opacities
+#: must come back after a reset.
+LEAST_INTERVAL = 100
 
 
 def scheduled(iterations: int, config: GaussiansConfig | None = None, max_gaussians: int = 0) -> GaussiansConfig:
@@ -29,7 +30,7 @@ def scheduled(iterations: int, config: GaussiansConfig | None = None, max_gaussi
             density,
             start=round(scale * density.start),
             interval=max(LEAST_INTERVAL, round(scale * density.interval)),
-            reset_interval=max(LEAST_RESET_INTERVAL, round(scale * density.reset_interval)),
+            reset_interval=max(LEAST_INTERVAL, round(scale * density.reset_interval)),
             max_gaussians=max_gaussians,
         ),
     )
