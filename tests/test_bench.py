@@ -126,6 +126,15 @@ def test_the_coarse_row_trains_nothing_of_its_own():
     assert plan.answers["tiny", "baseline", 0].coarse_from is None
 
 
+def test_a_shared_coarse_stage_does_not_depend_on_the_methods_asked_for():
+    some, others = (
+        make_plan("table1", Choices(scenes=("tiny",), seeds=1, methods=methods)).coarse
+        for methods in (("no-blocking", "full"), ("dogs", "blocks-4", "3dgs"))
+    )
+    assert some == others
+    assert len(some) == 1
+
+
 def test_choices_change_the_budget_for_all_alike():
     plan = make_plan("table2", Choices(scenes=("tiny",), seeds=2, iterations_total=1200, max_anchors=1000))
     assert plan.budgets["tiny"] == Budget(600, 2, 300)

@@ -162,6 +162,8 @@ def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
     if settings.redo or not folder.config_file.exists():
         return
     wanted, held = to_dict(run.config), folder.settings()
+    if "blocks" not in run.stages:  # no other section matters to it
+        wanted = {"training": wanted["training"]}
     changed = differences({name: held[name] for name in wanted}, wanted)
     if changed:
         raise VdgsError(

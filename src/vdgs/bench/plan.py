@@ -155,7 +155,9 @@ def _share_coarse(planned: Sequence[PlannedRun]) -> tuple[list[PlannedRun], list
         digest = _coarse_digest(run)
         if "blocks" in run.stages and digest not in shared:
             folder = Path("runs", run.scene, f"shared-coarse-{digest}", str(run.seed))
-            shared[digest] = replace(run, method="coarse", folder=folder, stages=("coarse",))
+            # Nothing but what it depends on: which methods share it, and so are asked for, must not change it.
+            alone = MethodConfig(training=run.config.training)
+            shared[digest] = replace(run, method="coarse", folder=folder, stages=("coarse",), config=alone)
     taken = [
         replace(run, coarse_from=shared[_coarse_digest(run)].folder)
         if "coarse" in run.stages and _coarse_digest(run) in shared
