@@ -12,11 +12,13 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 from vdgs.cameras import Camera
+from vdgs.config import PartitionConfig
 from vdgs.partition import figures
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.fact_figures import block_facts
 from vdgs.partition.figure_words import PALETTE, block_colour
 from vdgs.partition.score_figures import order_of_cameras
+from vdgs.stages.partition import how_cut
 
 
 def grid(count: int, side: float = 100.0) -> Blocks:
@@ -150,3 +152,10 @@ def test_many_anchors_are_thinned_and_the_heading_counts_cameras_beyond_the_map(
     assigned = np.ones((4, 1), bool)
     figures.draw_blocks(tmp_path / "blocks.png", positions, views, grid(1), cameras, assigned, "m", None, "not cut")
     assert headings[0][1] == "60,001 anchors (60,000 drawn)  ·  4 training cameras (1 beyond the map)"
+
+
+def test_a_cut_is_called_by_its_strategy() -> None:
+    assert how_cut(PartitionConfig(lambda_vis=0.7)) == "λ_vis = 0.7"
+    assert how_cut(PartitionConfig(blocking=False)) == "not cut"
+    names = [how_cut(PartitionConfig(strategy=name)) for name in ("vastgaussian", "citygaussian", "dogs")]
+    assert names == ["VastGaussian partition", "CityGaussian partition", "DOGS partition"]
