@@ -29,7 +29,8 @@ class Seen:
     """V of every pixel of a capture's test views."""
 
     capture: Capture
-    #: Camera of a test view -> V [h, w] at its size, NaN where nothing is (sky) or nothing is drawn.
+    #: Camera of a test view -> V [h, w] at its size, NaN where nothing is (sky), nothing is drawn, or no training
+    #: camera looks: a method may only guess there.
     visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]]
     by: SeenBy
     #: Tells this V from any other: what was measured with another one is measured again.
@@ -47,7 +48,17 @@ def seen_truly(root: Path, options: CaptureOptions) -> Seen | None:
     if not counted or not known["views"] >= {Path(view.name).stem for view in capture.test_views}:
         return None
     parts = ", ".join(f"{name} {crc:08x}" for name, crc in fingerprint(capture).items())
-    return Seen(capture, truth.visibility_maps(capture), "truth", parts)
+    return Seen(capture, _where_seen(truth.visibility_maps(capture)), "truth", f"seen at all: {parts}")
+
+
+def _where_seen(
+    visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]],
+) -> Callable[[Camera], Float[np.ndarray, "h w"]]:
+    def seen(camera: Camera) -> Float[np.ndarray, "h w"]:
+        views = visibility_map(camera)
+        return np.where(views >= 1, views, np.nan)
+
+    return seen
 
 
 def seen_by_model(reference: Path) -> Seen:
