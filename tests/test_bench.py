@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,11 +15,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from vdgs.bench import bench
 from vdgs.bench.bench import BenchSettings, run_bench
 from vdgs.bench.definitions import Budget, Method, Scene
 from vdgs.bench.figure import draw_groups
@@ -31,11 +34,14 @@ from vdgs.bench.processes import Task, run_tasks
 from vdgs.bench.quoted import QUOTED
 from vdgs.bench.results import Result
 from vdgs.bench.scenes import PUBLISHED, SCENES
+from vdgs.bench.seen import seen_truly
 from vdgs.bench.statistics import Summary, difference, marks, summarise
 from vdgs.bench.tables import TABLES
 from vdgs.bench.verdict import verdict
 from vdgs.bench.worker import STAGES, Job
 from vdgs.bench.writing import escape_latex, escape_markdown, latex, markdown, tidy_csv
+from vdgs.cameras import Camera
+from vdgs.captures.options import CaptureOptions
 from vdgs.config_checks import validate
 from vdgs.errors import VdgsError
 
@@ -120,6 +126,15 @@ def test_the_coarse_row_trains_nothing_of_its_own():
     assert plan.answers["tiny", "baseline", 0].coarse_from is None
 
 
+def test_a_shared_coarse_stage_does_not_depend_on_the_methods_asked_for():
+    some, others = (
+        make_plan("table1", Choices(scenes=("tiny",), seeds=1, methods=methods)).coarse
+        for methods in (("no-blocking", "full"), ("dogs", "blocks-4", "3dgs"))
+    )
+    assert some == others
+    assert len(some) == 1
+
+
 def test_choices_change_the_budget_for_all_alike():
     plan = make_plan("table2", Choices(scenes=("tiny",), seeds=2, iterations_total=1200, max_anchors=1000))
     assert plan.budgets["tiny"] == Budget(600, 2, 300)
@@ -192,7 +207,7 @@ def made(gains: dict[str, tuple[float, float]], seeds: int = 3, method_failed: s
             results.append(
                 Result("toy-uneven", name, seed, "failed", "it | broke", "runs/x")
                 if failed
-                else Result("toy-uneven", name, seed, "done", "", "runs/x", figures, bounds)
+                else Result("toy-uneven", name, seed, "done", "", "runs/x", figures, bounds, "truth")
             )
     return results
 
@@ -350,6 +365,62 @@ def test_other_settings_do_not_discard_what_is_trained(benched):
     with pytest.raises(VdgsError, match=r"training\.iterations: 60 -> 180"):
         run_bench(settings(benched, scale=0.3), Console(file=io.StringIO()))
     assert models(benched) == before
+
+
+def test_generated_scenes_are_grouped_by_the_true_visibility(benched):
+    results = json.loads((benched / "results.json").read_text())["results"]
+    assert {each["seen_by"] for each in results} == {"truth"}
+    root = benched / "captures" / "tiny"
+    seen = seen_truly(root, CaptureOptions())
+    assert seen is not None
+    counted = np.concatenate([seen.visibility_map(view.camera).ravel() for view in seen.capture.test_views])
+    assert np.nanmin(counted) >= 1  # what no training camera sees is nobody's fault
+    groups = results[0]["groups"]
+    assert sum(group["pixels"] for group in groups) == np.isfinite(counted).sum() < len(counted)
+    for group in groups:
+        assert ((counted >= group["lower"]) & (counted <= group["upper"])).sum() == group["pixels"]
+    assert "truly see the surface" in (benched / "table.md").read_text()
+    assert f"(V {groups[0]['lower']:g} to {groups[0]['upper']:g})" in (benched / "verdict.txt").read_text()
+
+
+def test_the_truth_is_that_of_the_views_that_are_used(benched):
+    root = benched / "captures" / "tiny"
+    small = seen_truly(root, CaptureOptions(downscale=2.0, validation=True))
+    assert small is not None
+    assert all(view.name.startswith("validation") for view in small.capture.test_views)
+    for view in small.capture.test_views:
+        assert small.visibility_map(view.camera).shape == (36, 48) == (view.camera.height, view.camera.width)
+    assert seen_truly(root, CaptureOptions(max_images=20)) is None  # fewer train than the truth counts
+    assert seen_truly(root, CaptureOptions(split="every")) is None
+
+
+def test_sky_belongs_to_no_group(benched, tmp_path, monkeypatch):
+    seen = seen_truly(benched / "captures" / "tiny", CaptureOptions())
+    assert seen is not None
+
+    def with_sky(camera: Camera) -> np.ndarray:
+        below = seen.visibility_map(camera).copy()
+        below[:10] = np.nan
+        return below
+
+    monkeypatch.setattr(bench, "seen_truly", lambda *_: replace(seen, visibility_map=with_sky, identity="with sky"))
+    shutil.copytree(benched, tmp_path / "copy")
+    pixels = sum(int(np.isfinite(with_sky(view.camera)).sum()) for view in seen.capture.test_views)
+    for result in run_bench(settings(tmp_path / "copy"), Console(file=io.StringIO())):
+        assert sum(group["pixels"] for group in result.groups) == pixels
+        assert result.groups[0]["lower"] is not None
+
+
+def test_without_truth_pixels_are_grouped_anew_by_a_model(benched, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(benched, copy)
+    shutil.rmtree(copy / "captures" / "tiny" / "truth")
+    before, said = models(copy), io.StringIO()
+    by_model = run_bench(settings(copy), Console(file=said))
+    assert {each.seen_by for each in by_model} == {"model"}
+    assert by_model[0].groups != tuple(json.loads((benched / "results.json").read_text())["results"][0]["groups"])
+    assert models(copy) == before
+    assert "one coarse model draws" in (copy / "table.md").read_text()
 
 
 def test_one_bench_at_a_time_in_a_folder(tmp_path):

@@ -13,15 +13,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from captures_support import TinyScene, moved, tiny_scene, write_colmap, write_images, write_ply
+from layouts_support import DRB, OPENGL, halves, matrixcity_frames, write_matrixcity, write_mega_nerf
 from vdgs.captures.capture import Capture
 from vdgs.captures.loading import load_capture
 from vdgs.captures.options import CaptureOptions
 from vdgs.captures.ply import read_point_cloud
 from vdgs.errors import CaptureError
 
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-#: DRB axes (down, right, back) of a z-up world whose x is right and y is forward.
-DRB = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
@@ -220,38 +218,6 @@ def test_damaged_point_clouds_end_in_a_message_or_points(tmp_path, data, text):
 # -------------------------------------------------------------------------------------------- Mega-NeRF
 
 
-def write_mega_nerf(root: Path, scene: TinyScene, scale: float = 50.0) -> TinyScene:
-    """As Mega-NeRF's converter: DRB world, moved and scaled.
-
-    NeRF camera axes; original names in mappings.txt.
-    """
-    drb = moved(scene, 1.0, DRB, np.zeros(3))
-    origin = np.mean([camera.position for camera in drb.cameras.values()], axis=0)
-    mappings = []
-    renamed = {}
-    for index, (name, camera) in enumerate(drb.cameras.items()):
-        folder = root / ("val" if index % 5 == 0 else "train")
-        (folder / "metadata").mkdir(parents=True, exist_ok=True)
-        in_drb = (np.linalg.inv(camera.camera_from_world) @ OPENGL)[:3]
-        in_drb[:, 3] = (in_drb[:, 3] - origin) / scale
-        torch.save(
-            {
-                "H": camera.height, "W": camera.width, "c2w": torch.tensor(in_drb, dtype=torch.float32),
-                "intrinsics": torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy]),
-                "distortion": torch.tensor([0.05, 0.0, 0.0, 0.0]),
-            },
-            folder / "metadata" / f"{index:06d}.pt",
-        )  # fmt: skip
-        renamed[f"{folder.name}/{index:06d}.png"] = scene.cameras[name]
-        mappings.append(f"{name},{index:06d}.pt")
-    torch.save({"origin_drb": torch.tensor(origin), "pose_scale_factor": scale}, root / "coordinates.pt")
-    (root / "mappings.txt").write_text("\n".join(mappings))
-    for name, camera in renamed.items():
-        one = TinyScene({Path(name).name: camera}, scene.points, scene.colours)
-        write_images(root / name.split("/")[0] / "rgbs", one)
-    return TinyScene(renamed, scene.points, scene.colours)
-
-
 @pytest.mark.parametrize("points", ["ply", "colmap", "colmap of the originals"])
 def test_mega_nerf(tmp_path, scene, points):
     """The split is the shipped one, down is x, and points may come from a COLMAP model in any world."""
@@ -305,53 +271,16 @@ def test_a_foreign_colmap_model_is_refused(tmp_path, scene):
 # -------------------------------------------------------------------------------------------- MatrixCity
 
 
-KEYS = {"fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy", "w": "width", "h": "height"}
-
-
-def matrixcity_frames(scene: TinyScene, block: str, unit: float) -> list[dict]:
-    frames = []
-    for index, camera in enumerate(scene.cameras.values()):
-        pose = np.linalg.inv(camera.camera_from_world) @ OPENGL
-        pose[:3, 3] /= unit
-        frames.append(
-            {
-                "file_path": f"../../{block}/{index:04d}.png",
-                "frame_index": index,
-                "transform_matrix": pose.tolist(),
-            }
-        )
-    return frames
-
-
-def halves(scene: TinyScene) -> tuple[TinyScene, TinyScene]:
-    items = list(scene.cameras.items())
-    parts = []
-    for part in (items[:9], items[9:]):
-        cameras = {f"{index:04d}.png": camera for index, (_, camera) in enumerate(part)}
-        parts.append(TinyScene(cameras, scene.points, scene.colours))
-    return parts[0], parts[1]
-
-
 def test_matrixcity_pose_folder(tmp_path, scene):
     """pose/<block>/transforms_train.json: units of 100 m, images found above, in their blocks."""
     train, test = halves(scene)
-    first = next(iter(scene.cameras.values()))
-    intrinsics = {key: getattr(first, name) for key, name in KEYS.items()}
-    intrinsics["camera_angle_x"] = 2 * np.arctan(first.width / 2 / first.fx)
     root = tmp_path / "aerial" / "pose" / "block_A"
-    root.mkdir(parents=True)
-    for side, part, block in (("train", train, "train/block_1"), ("test", test, "test/block_1_test")):
-        content = intrinsics | {"frames": matrixcity_frames(part, block, 100.0)}
-        (root / f"transforms_{side}.json").write_text(json.dumps(content))
-        write_images(tmp_path / "aerial" / block, part)
-    write_ply(root / "points3D.ply", scene.points / 100, scene.colours)
+    both = write_matrixcity(root, train, test)
     capture = load_capture(root)
     assert capture.source == "matrixcity"
     assert capture.ground.metric
     assert (len(capture.train_views), len(capture.test_views)) == (9, 3)
-    both = {f"train/block_1/{n}": c for n, c in train.cameras.items()}
-    both |= {f"test/block_1_test/{n}": c for n, c in test.cameras.items()}
-    assert_sees_the_scene(capture, TinyScene(both, scene.points, scene.colours))
+    assert_sees_the_scene(capture, both)
     np.testing.assert_allclose(np.ptp(capture.points, axis=0), np.ptp(scene.points, axis=0), rtol=1e-9)
     (tmp_path / "aerial" / "train" / "block_1" / "0003.png").unlink()
     with pytest.raises(CaptureError, match=r"0003\.png' is not found(?s:.)*Unpack the \.tar"):

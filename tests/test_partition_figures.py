@@ -12,11 +12,13 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 from vdgs.cameras import Camera
+from vdgs.config import PartitionConfig
 from vdgs.partition import figures
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.fact_figures import block_facts
 from vdgs.partition.figure_words import PALETTE, block_colour
 from vdgs.partition.score_figures import order_of_cameras
+from vdgs.stages.partition import how_cut
 
 
 def grid(count: int, side: float = 100.0) -> Blocks:
@@ -71,7 +73,7 @@ def test_all_figures_of_all_scenes(tmp_path: Path, name: str) -> None:
     cut, assigned = grid(blocks), scores > 0.7
     compare = grid(blocks + 1) if blocks > 1 else None
     file = tmp_path / "figure.png"
-    figures.draw_blocks(file, positions, views, cut, cameras, assigned, "m", compare, 1.0)
+    figures.draw_blocks(file, positions, views, cut, cameras, assigned, "m", compare, "λ_vis = 1")
     check(file)
     figures.draw_block_facts(file, positions, views, cut, assigned, "m", compare)
     check(file)
@@ -85,10 +87,10 @@ def test_the_comparison_stands_beside_or_below(tmp_path: Path) -> None:
     positions, views, cameras, scores = scene(300, 5, 2)
     alone, both, wide = (tmp_path / f"{name}.png" for name in ("alone", "both", "wide"))
     cut, assigned = grid(2), scores > 0.5
-    figures.draw_blocks(alone, positions, views, cut, cameras, assigned, "m", None, 0.0)
-    figures.draw_blocks(both, positions, views, cut, cameras, assigned, "m", grid(2), 1.0)
+    figures.draw_blocks(alone, positions, views, cut, cameras, assigned, "m", None, "not cut")
+    figures.draw_blocks(both, positions, views, cut, cameras, assigned, "m", grid(2), "λ_vis = 1")
     stretched = positions * np.float32([10, 1, 1])
-    figures.draw_blocks(wide, stretched, views, cut, cameras, assigned, "m", grid(2), 1.0)
+    figures.draw_blocks(wide, stretched, views, cut, cameras, assigned, "m", grid(2), "λ_vis = 1")
     one, two, three = (check(file).shape for file in (alone, both, wide))
     assert two[1] > 1.5 * one[1]
     assert two[0] == one[0]
@@ -148,5 +150,12 @@ def test_many_anchors_are_thinned_and_the_heading_counts_cameras_beyond_the_map(
     far[0, 3] = -500.0
     cameras.append(Camera(far, 400, 400, 200, 150, 400, 300))
     assigned = np.ones((4, 1), bool)
-    figures.draw_blocks(tmp_path / "blocks.png", positions, views, grid(1), cameras, assigned, "m", None, 0.0)
+    figures.draw_blocks(tmp_path / "blocks.png", positions, views, grid(1), cameras, assigned, "m", None, "not cut")
     assert headings[0][1] == "60,001 anchors (60,000 drawn)  ·  4 training cameras (1 beyond the map)"
+
+
+def test_a_cut_is_called_by_its_strategy() -> None:
+    assert how_cut(PartitionConfig(lambda_vis=0.7)) == "λ_vis = 0.7"
+    assert how_cut(PartitionConfig(blocking=False)) == "not cut"
+    names = [how_cut(PartitionConfig(strategy=name)) for name in ("vastgaussian", "citygaussian", "dogs")]
+    assert names == ["VastGaussian partition", "CityGaussian partition", "DOGS partition"]

@@ -23,11 +23,12 @@ from rich.console import Console
 from vdgs.bench.definitions import Scene
 from vdgs.bench.figure import draw_groups
 from vdgs.bench.grids import grids_of
-from vdgs.bench.measure import measure_groups
+from vdgs.bench.measure import GROUPS_FILE, measure_groups
 from vdgs.bench.notes import notes_of
 from vdgs.bench.plan import Choices, Plan, PlannedRun, make_plan
 from vdgs.bench.processes import Ended, Task, run_tasks
 from vdgs.bench.results import Result, as_json, gather
+from vdgs.bench.seen import Seen, seen_by_model, seen_truly
 from vdgs.bench.verdict import verdict
 from vdgs.bench.worker import RECORD, Job
 from vdgs.bench.writing import latex, markdown, tidy_csv
@@ -113,7 +114,7 @@ def _capture(scene: Scene, settings: BenchSettings, console: Console) -> Path:
                 raise VdgsError(f"{scene.name}: this version generates no {name} {scene.synth[name]!r}")
         console.print(f"generating {scene.name}", highlight=False)
         folder.parent.mkdir(parents=True, exist_ok=True)
-        generate(folder, SynthOptions(**scene.synth))
+        generate(folder, SynthOptions(**{**scene.synth, "truth": True}))
     return folder
 
 
@@ -161,6 +162,8 @@ def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
     if settings.redo or not folder.config_file.exists():
         return
     wanted, held = to_dict(run.config), folder.settings()
+    if "blocks" not in run.stages:  # no other section matters to it
+        wanted = {"training": wanted["training"]}
     changed = differences({name: held[name] for name in wanted}, wanted)
     if changed:
         raise VdgsError(
@@ -172,7 +175,7 @@ def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
 
 def _job(run: PlannedRun, plan: Plan, capture: Path, settings: BenchSettings, threads: int) -> Job:
     scene = next(scene for scene in plan.scenes if scene.name == run.scene)
-    options = to_dict(CaptureOptions(**scene.options, validation=settings.choices.validation))
+    options = to_dict(_options(scene, settings))
     measured = {"bins": settings.bins, "lpips": str(settings.lpips_weights)}
     return Job(
         capture.resolve(), options, to_dict(run.config), run.stages, (settings.output / run.folder).resolve(),
@@ -181,6 +184,10 @@ def _job(run: PlannedRun, plan: Plan, capture: Path, settings: BenchSettings, th
         settings.lpips_weights and settings.lpips_weights.resolve(), settings.bins, threads,
         threads if settings.jobs == 1 else 1, settings.redo,
     )  # fmt: skip
+
+
+def _options(scene: Scene, settings: BenchSettings) -> CaptureOptions:
+    return CaptureOptions(**scene.options, validation=settings.choices.validation)
 
 
 def _is_done(output: Path, run: PlannedRun, key: str) -> bool:
@@ -197,24 +204,37 @@ def _measure(
 ) -> dict[str, Ended]:
     """Groups by visibility of every finished run, scene by scene; runs that cannot be measured, as failed."""
     failed = dict[str, Ended]()
-    for scene in captures:
-        reference = plan.reference(scene)
-        runs = {
-            settings.output / run.folder: read_json(settings.output / run.folder / RECORD)["key"]
-            for run in plan.runs if run.scene == scene and ended[run.name].state == "done"
-        }  # fmt: skip
-        if not runs or ended[reference.name].state != "done":
+    for scene in [scene for scene in plan.scenes if scene.name in captures]:
+        done = [run for run in plan.runs if run.scene == scene.name and ended[run.name].state == "done"]
+        if not done:
             continue
         try:
-            with console.status(f"{scene}: measuring by visibility") as status:
+            seen = _seen(plan, scene, captures[scene.name], ended, settings)
+            if seen is None:
+                for run in done:  # what an earlier table may have left there is of another V
+                    (settings.output / run.folder / GROUPS_FILE).unlink(missing_ok=True)
+                continue
+            folders = [settings.output / run.folder for run in done]
+            keys = {folder: read_json(folder / RECORD)["key"] for folder in folders}
+            with console.status(f"{scene.name}: measuring by visibility") as status:
                 measure_groups(
-                    settings.output / reference.folder, runs, settings.bins,
-                    lambda text, scene=scene, status=status: status.update(f"{scene}: {text}"),  # type: ignore[misc]
+                    seen, keys, settings.bins,
+                    lambda text, scene=scene, status=status: status.update(f"{scene.name}: {text}"),  # type: ignore[misc]
                 )  # fmt: skip
         except VdgsError as error:
-            names = [run.name for run in plan.runs if run.scene == scene and ended[run.name].state == "done"]
-            failed |= {name: Ended(name, "failed", why=str(error)) for name in names}
+            failed |= {run.name: Ended(run.name, "failed", why=str(error)) for run in done}
     return failed
+
+
+def _seen(plan: Plan, scene: Scene, capture: Path, ended: Mapping[str, Ended], settings: BenchSettings) -> Seen | None:
+    """By truth where the capture has it, else by a reference model; None without either."""
+    truly = seen_truly(capture, _options(scene, settings))
+    if truly is not None:
+        return truly
+    reference = plan.reference(scene.name)
+    if reference is None or ended[reference.name].state != "done":
+        return None
+    return seen_by_model(settings.output / reference.folder)
 
 
 def _write(plan: Plan, results: list[Result], settings: BenchSettings, console: Console) -> None:

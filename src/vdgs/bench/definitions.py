@@ -11,6 +11,7 @@ from vdgs.config import PRESETS, MethodConfig, PresetName
 #: Stages of the run of a method, by the names that `worker.STAGES` knows.
 COARSE_ONLY = ("coarse", "evaluate")
 WITH_BLOCKS = ("coarse", "partition", "blocks", "merge", "evaluate")
+EXPLICIT = ("gaussians",)
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,8 @@ class Method:
     cites: str = ""
     #: What of the published method is not here.
     leaves_out: tuple[str, ...] = ()
+    #: What is set otherwise than published, or than for the other methods.
+    differs: str = ""
     #: What it gets less than the others, where it does not spend the whole budget.
     less: str = ""
 

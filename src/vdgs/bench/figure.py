@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from vdgs.bench.grids import bounds_of
 from vdgs.bench.measure import group_names
 from vdgs.bench.plan import Plan
 from vdgs.bench.results import Result
@@ -19,6 +20,8 @@ from vdgs.figure_parts import ACCENT, DPI, FAINT, INK, plain, titles
 #: Colours and markers of the other methods, told apart without colour too.
 COLOURS = ("#1f6f8b", "#8ab17d", "#e0a030", "#7b5ea7", "#22262b", "#2a9d8f", "#b5838d", "#6c757d")
 MARKERS = ("s", "^", "v", "D", "P", "X", "<", ">")
+#: In the title of a panel.
+WHICH_V = {"truth": "true V", "model": "V by a coarse model"}
 PANEL_WIDTH, PANEL_HEIGHT = 4.4, 3.6
 
 
@@ -66,11 +69,12 @@ def _panel(axes: Axes, plan: Plan, results: Sequence[Result], title: str, first:
             linewidth=2.2 if ours else 1.3, elinewidth=1.0, capsize=2.5, label=method.title, zorder=3 if ours else 2,
         )  # fmt: skip
     names = [
-        f"{name}\nV {group['lower']:.3g} to {group['upper']:.3g}"
+        f"{name}\nV {bounds_of(group)}"
         for name, group in zip(group_names(len(groups)), groups, strict=True)
     ]  # fmt: skip
     axes.set_xticks(places, [name.replace(" seen ", "\nseen ") for name in names])
-    axes.set_title(title, fontsize=10.5, color=INK, loc="left")
+    seen_by = next(result.seen_by for result in results if result.groups)
+    axes.set_title(f"{title}, {WHICH_V[seen_by]}", fontsize=10.5, color=INK, loc="left")
     axes.grid(axis="y", color=FAINT, alpha=0.18, linewidth=0.7)
     if first:
         axes.set_ylabel("PSNR, dB")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from vdgs.bench.definitions import Group
 from vdgs.bench.measure import group_names
@@ -60,6 +61,7 @@ CORRECTED = (
 COSTS = (
     Column("iterations", "iterations", 0, 0),
     Column("anchors", "anchors", 0, 0),
+    Column("Gaussians", "gaussians", 0, 0),
     Column("blocks", "blocks", 0, 0),
     Column("cameras a block", "cameras_per_block", 0, 0),
     Column("training s", "seconds", 0, 0),
@@ -68,6 +70,16 @@ COSTS = (
     Column("model MB", "model_bytes", 1, 0, 1e-6),
     Column("frames/s", "fps", 0, 0),
 )
+#: An anchor is no Gaussian: what the two columns of sizes hold.
+SIZES = (
+    "Gaussians: of 3DGS its own; of methods with anchors at most as many as these decode to, those without opacity "
+    "included, which are not drawn. 3DGS has no anchors."
+)
+#: What V is.
+SEEN_BY = {
+    "truth": "Training cameras that truly see the surface at a pixel, with occlusion (sky, and what none sees, belongs to no group)",
+    "model": "Training cameras whose frustum holds the place that one coarse model draws at a pixel",
+}
 
 
 def grids_of(plan: Plan, results: Sequence[Result]) -> list[Grid]:
@@ -84,7 +96,8 @@ def grids_of(plan: Plan, results: Sequence[Result]) -> list[Grid]:
             title = f"{scene.title}: PSNR by visibility"
             grids.append(_measured(plan, mine, f"visibility-{scene.name}", title, columns, notes))
         columns = [Column(c.title, c.key, c.digits, c.better, c.factor, scene.name) for c in COSTS]
-        grids.append(_measured(plan, mine, f"costs-{scene.name}", f"{scene.title}: what each method got", columns))
+        title = f"{scene.title}: what each method got"
+        grids.append(_measured(plan, mine, f"costs-{scene.name}", title, columns, (SIZES,)))
     quoted = _quoted(plan)
     return grids + ([quoted] if quoted else [])
 
@@ -102,7 +115,8 @@ def _for_scenes(plan: Plan, columns: Sequence[Column]) -> list[Column]:
 
 def _group_columns(results: Sequence[Result], scene: str) -> tuple[list[Column], tuple[str, ...]]:
     """PSNR of each group, least seen first, raw and corrected for the ends; how the groups are bounded."""
-    groups = next((result.groups for result in results if result.groups), ())
+    of = next((result for result in results if result.groups), None)
+    groups = of.groups if of else ()
     names = group_names(len(groups)) if groups else []
     columns = [Column(f"{name} ↑", f"psnr@{index}", scene=scene) for index, name in enumerate(names)]
     columns += [
@@ -110,11 +124,20 @@ def _group_columns(results: Sequence[Result], scene: str) -> tuple[list[Column],
         for index in sorted({0, len(names) - 1})
         if names
     ]
-    bounds = "; ".join(
-        f"{name}: {group['lower']:.3g} to {group['upper']:.3g}" for name, group in zip(names, groups, strict=True)
-    )
-    note = f"Training cameras that see the place drawn at a pixel, pooled over all test views: {bounds}."
-    return columns, (note,) if groups else ()
+    if of is None:
+        return columns, ()
+    return columns, (f"V: {SEEN_BY[of.seen_by]}. Pooled over all test views: {all_bounds_of(of)}.",)
+
+
+def all_bounds_of(result: Result) -> str:
+    """The V of every group of a result, least seen first."""
+    names = group_names(len(result.groups))
+    return "; ".join(f"{name}: V {bounds_of(group)}" for name, group in zip(names, result.groups, strict=True))
+
+
+def bounds_of(group: Mapping[str, Any]) -> str:
+    """Least and greatest V of a group."""
+    return f"{group['lower']:.3g} to {group['upper']:.3g}"
 
 
 def _measured(

@@ -1,7 +1,7 @@
 """Every method measured on the same pixels by visibility.
 
 A run's own evaluation groups pixels by V as its own coarse model draws it; methods with other coarse models would then
-be compared on other pixels. Here one reference model of the scene says for every pixel of the test views how many
+be compared on other pixels. Here one V of the scene (`seen.py`) says for every pixel of the test views how many
 training cameras see the place, and the pictures that each run left are measured against that.
 """
 
@@ -15,17 +15,18 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from vdgs.bench.seen import Seen
+from vdgs.bench.worker import RECORD
 from vdgs.captures.images import ImageCache
 from vdgs.errors import VdgsError
 from vdgs.evaluation import metrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
 from vdgs.evaluation.colour import correct_colours
-from vdgs.evaluation.of_run import EVALUATION_IMAGES_BYTES, visibility_map
+from vdgs.evaluation.of_run import EVALUATION_IMAGES_BYTES
 from vdgs.evaluation.saving import file_stems, jsonable
 from vdgs.files import read_json, write_json
-from vdgs.stages.opening import open_run
 
-#: In a run folder: its figures by visibility, and the key of the reference and of the run that they hold for.
+#: In a run folder: its figures by visibility, and the V and the key of the run that they hold for.
 GROUPS_FILE = "by_visibility.json"
 NAMES = ("squared_error", "ssim", "squared_error_cc", "ssim_cc")
 
@@ -36,27 +37,27 @@ def evaluated(run: Path) -> Path:
     return merged if (merged / "metrics.json").exists() else run / "coarse" / "evaluation"
 
 
-def measure_groups(reference: Path, runs: Mapping[Path, str], bins: int, tell: Callable[[str], None]) -> None:
-    """Write GROUPS_FILE into every run of a scene that has none for this reference and its key.
+def measure_groups(seen: Seen, runs: Mapping[Path, str], bins: int, tell: Callable[[str], None]) -> None:
+    """Write GROUPS_FILE into every run of a scene that has none for this V and its key.
 
     `runs`: folder -> key. The test views are read once for all. Raises VdgsError where a picture is missing.
     """
-    opened = open_run(reference, "coarse")
-    wanted = {folder: {"reference": opened.status.get("key"), "run": key, "bins": bins} for folder, key in runs.items()}
+    of = {"seen_by": seen.by, "seen": seen.identity, "bins": bins}
+    wanted = {folder: of | {"run": key} for folder, key in runs.items()}
     left = [folder for folder, record in wanted.items() if not _is_measured(folder, record)]
     if not left:
         return
-    views, v_at = opened.capture.test_views, visibility_map(opened)
+    views = seen.capture.test_views
     stems = file_stems([view.name for view in views])
     histograms = {folder: VisibilityHistogram(NAMES) for folder in left}
     with ImageCache(views, EVALUATION_IMAGES_BYTES) as images:
         for index, view in enumerate(views):
             tell(f"test view {index + 1} of {len(views)}")
-            photograph, seen = images.get(index), v_at(view.camera)
+            photograph, views_of_pixels = images.get(index), seen.visibility_map(view.camera)
             mask = None if photograph.mask is None else photograph.mask.numpy() > 0
             for folder in left:
-                picture = _read_picture(evaluated(folder) / "renders" / f"{stems[index]}.png")
-                histograms[folder].add(seen, pixel_values(picture, photograph.image.numpy(), mask), mask)
+                picture = _read_picture(evaluated(folder) / "renders" / f"{stems[index]}.png", folder)
+                histograms[folder].add(views_of_pixels, pixel_values(picture, photograph.image.numpy(), mask), mask)
     for folder in left:
         write_json(folder / GROUPS_FILE, jsonable(wanted[folder] | {"groups": histograms[folder].bins(bins)}))
 
@@ -84,17 +85,18 @@ def group_names(count: int) -> list[str]:
 
 
 def _is_measured(folder: Path, record: Mapping[str, Any]) -> bool:
-    file = folder / GROUPS_FILE
-    if not file.exists():
+    try:
+        held = read_json(folder / GROUPS_FILE)
+    except (VdgsError, FileNotFoundError):
         return False
-    held = read_json(file)
     return isinstance(held, dict) and all(held.get(name) == value for name, value in record.items())
 
 
-def _read_picture(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+def _read_picture(path: Path, run: Path) -> UInt8[np.ndarray, "h w 3"]:
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if picture is None:
         raise VdgsError(
-            f"{path}: the rendered test view is missing or damaged. Measure again: vdgs eval {path.parents[2]}"
+            f"{path}: the rendered test view is missing or damaged. Delete {run / RECORD} and give the same command: "
+            "the run is then only measured again."
         )
     return np.ascontiguousarray(picture[..., ::-1])

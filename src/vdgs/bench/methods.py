@@ -1,14 +1,17 @@
 """The methods: VDGS, its ablations, its parameter sweeps and the partitions of others.
 
-All share the anchor model, the loss and the block training of this package, and spend the same total of iterations.
+All but 3DGS share the anchor model, the loss and the block training of this package; all spend the same total of
+iterations.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal
 
-from vdgs.bench.definitions import COARSE_ONLY, Budget, Change, Method
+from vdgs.bench.definitions import COARSE_ONLY, EXPLICIT, Budget, Change, Method
+from vdgs.comparators.gaussian_schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS
 from vdgs.config import CompensationConfig, MethodConfig, PartitionStrategy
 
 LAMBDA_VIS = (0.0, 0.5, 1.0, 1.3)
@@ -89,6 +92,18 @@ def partitioned_by(strategy: PartitionStrategy) -> Change:
     return change
 
 
+def explicit_gaussians(background: Literal["mean", "black"]) -> Change:
+    """3DGS, told by what it has in common with our coarse stage: iterations, seed, background and the limit of anchors
+    (`explicit.gaussians_config` makes its settings of these)."""
+
+    def change(config: MethodConfig, budget: Budget) -> MethodConfig:
+        alone = coarse_alone(config, budget)
+        loss = replace(alone.training.loss, background=background)
+        return replace(alone, training=replace(alone.training, loss=loss))
+
+    return change
+
+
 def _compensated(config: MethodConfig, **values: float | bool) -> MethodConfig:
     changed: CompensationConfig = replace(config.block.compensation, **values)  # type: ignore[arg-type]
     return replace(config, block=replace(config.block, compensation=changed))
@@ -101,6 +116,18 @@ def _sweep(prefix: str, symbol: str, values: tuple[float, ...], change: Callable
 #: What the partitions leave out beyond what `partition.strategies` says of each.
 _COMMON = (
     "training schedule and losses of their own: blocks are trained as ours, with frozen decoder and plain growth",
+)
+_3DGS = "Kerbl et al., 3D Gaussian Splatting for Real-Time Radiance Field Rendering, SIGGRAPH 2023"
+#: As the docstring of `comparators.gaussians` has it.
+_3DGS_LEAVES_OUT = (
+    "pruning by footprint in the image (its section 5.2)",
+    "its own image formation (alpha at most 0.999, near plane at 0.01 and extent by opacity are as for all methods)",
+    "exposure compensation, depth regularisation and anti-aliasing, which came later than its paper",
+)
+_3DGS_SCHEDULE = (
+    f"its schedule of {PUBLISHED_ITERATIONS:,} iterations (warm-up, degree of colour, start and interval of density "
+    "control, resets of opacity) moves in proportion to the total here, but neither decides nor resets more "
+    f"often than every {LEAST_INTERVAL} iterations"
 )
 _ABLATIONS = [
     Method("full", "VDGS (full)", full, cites="VDGS, sections III-B and III-C"),
@@ -117,6 +144,14 @@ _ABLATIONS = [
     Method("no-anchor-generation", "w/o anchor generation", without_anchor_generation, cites="VDGS, Table II (c)"),
 ]
 _OTHERS = [
+    Method(
+        "3dgs", "3DGS", explicit_gaussians("mean"), EXPLICIT, cites=_3DGS, leaves_out=_3DGS_LEAVES_OUT,
+        differs=f"background of the mean colour of the photographs, as ours; {_3DGS_SCHEDULE}",
+    ),
+    Method(
+        "3dgs-black", "3DGS, black background", explicit_gaussians("black"), EXPLICIT, cites=_3DGS,
+        leaves_out=_3DGS_LEAVES_OUT, differs=f"background black, as published; {_3DGS_SCHEDULE}",
+    ),
     Method(
         "scaffold-gs", "Scaffold-GS", coarse_alone, COARSE_ONLY,
         cites="Lu et al., Scaffold-GS: Structured 3D Gaussians for View-Adaptive Rendering, CVPR 2024",

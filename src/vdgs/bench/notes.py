@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from vdgs.bench.definitions import Method
+from vdgs.bench.grids import SEEN_BY, all_bounds_of
 from vdgs.bench.plan import Plan
 from vdgs.bench.quoted import CONTRADICTIONS, EFFICIENCY, QUOTED
 from vdgs.bench.results import Result
@@ -21,6 +22,7 @@ def notes_of(plan: Plan, results: Sequence[Result], lines: Sequence[Line], figur
     if figure:
         parts.append("![PSNR by visibility](groups.png)")
     parts.append(_fairness(plan))
+    parts.append(_list("Groups by visibility", _groups(plan, results)))
     lost = [each for each in results if each.state != "done"]
     if lost:
         said = [f"{each.method} on {each.scene}, seed {each.seed}: {each.state}. {each.why}" for each in lost]
@@ -41,8 +43,6 @@ def _fairness(plan: Plan) -> str:
         "iterations, as its row says.",
         "A coarse stage that several methods share is trained once; its time counts for each of them. Training time is "
         "the sum over all blocks, as if one after the other; it depends on how many runs went at once (--jobs).",
-        "Groups by visibility are the same pixels for all methods and seeds: V is drawn with one coarse model of the "
-        "scene.",
         "LPIPS is VGG with input in [-1, 1]; a dash means that no weights were given (--lpips-weights).",
     ]
     said += [
@@ -51,7 +51,28 @@ def _fairness(plan: Plan) -> str:
         for scene in plan.scenes
         for budget in [plan.budgets[scene.name]]
     ]
+    if plan.max_anchors:
+        said.append(_limit(plan))
     return _list("What each method got", said)
+
+
+def _limit(plan: Plan) -> str:
+    """--max-anchors, for methods with anchors and for 3DGS."""
+    per_anchor = plan.runs[0].config.training.anchors.offsets
+    return (
+        f"At most {plan.max_anchors:,} anchors for a whole scene (a block its share of them); for 3DGS {per_anchor} "
+        f"Gaussians for each of them, {plan.max_anchors * per_anchor:,}, as many as they decode to."
+    )
+
+
+def _groups(plan: Plan, results: Sequence[Result]) -> list[str]:
+    """What V of each scene is, and the V of each group."""
+    said = ["The same pixels for all methods and seeds; equal V is never split, so groups may differ in size."]
+    for scene in plan.scenes:
+        of = next((each for each in results if each.scene == scene.name and each.groups), None)
+        if of is not None:
+            said.append(f"{scene.title}: {SEEN_BY[of.seen_by]}. {all_bounds_of(of)}")
+    return said if len(said) > 1 else []
 
 
 def _method(method: Method) -> str:
@@ -60,6 +81,8 @@ def _method(method: Method) -> str:
     if strategy is not None:
         left = [*strategy.leaves_out, *left]
     text = f"{method.title} (`{method.name}`)" if not method.cites else f"{method.title} ({method.cites})"
+    if method.differs:
+        text += f": {method.differs}"
     if method.less:
         text += f". Gets less: {method.less}"
     return text + (f". Left out: {'; '.join(left)}" if left else "")

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from vdgs.bench.definitions import Budget, Method, Scene, Table
+from vdgs.bench.definitions import EXPLICIT, Budget, Method, Scene, Table
+from vdgs.bench.explicit import gaussians_config
 from vdgs.bench.methods import METHODS
 from vdgs.bench.scenes import SCENES
 from vdgs.bench.tables import TABLES
@@ -52,6 +53,8 @@ class PlannedRun:
     def key(self, capture: Mapping[str, Any], measured: Mapping[str, Any]) -> str:
         """Changes with everything that the run's result depends on."""
         content = [self.stages, to_dict(self.config), dict(capture), dict(measured)]
+        if self.stages == EXPLICIT:
+            content.append(to_dict(gaussians_config(self.config)))
         return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
@@ -69,10 +72,13 @@ class Plan:
     runs: tuple[PlannedRun, ...]
     #: (scene, method, seed) -> the run that answers for it: methods with the same settings share one.
     answers: Mapping[tuple[str, str, int], PlannedRun]
+    #: Most anchors of a scene; 0 for no limit.
+    max_anchors: int = 0
 
-    def reference(self, scene: str) -> PlannedRun:
-        """The run whose coarse model says how often each pixel of the scene is seen, for all methods and seeds."""
-        return next(run for run in self.coarse + self.runs if run.scene == scene)
+    def reference(self, scene: str) -> PlannedRun | None:
+        """The run whose coarse model says how often each pixel of the scene is seen, for all methods and seeds; None
+        where no method has one."""
+        return next((run for run in self.coarse + self.runs if run.scene == scene and "coarse" in run.stages), None)
 
 
 def make_plan(name: str, choices: Choices) -> Plan:
@@ -98,7 +104,7 @@ def make_plan(name: str, choices: Choices) -> Plan:
                 same = taken.setdefault(run.key({}, {}), run)
                 answers[scene.name, run.method, seed] = same
             runs += taken.values()
-    return Plan(table, scenes, methods, seeds, budgets, tuple(coarse), tuple(runs), answers)
+    return Plan(table, scenes, methods, seeds, budgets, tuple(coarse), tuple(runs), answers, choices.max_anchors)
 
 
 def _named(known: Mapping[str, Any], name: str, kind: str) -> Any:
@@ -149,9 +155,13 @@ def _share_coarse(planned: Sequence[PlannedRun]) -> tuple[list[PlannedRun], list
         digest = _coarse_digest(run)
         if "blocks" in run.stages and digest not in shared:
             folder = Path("runs", run.scene, f"shared-coarse-{digest}", str(run.seed))
-            shared[digest] = replace(run, method="coarse", folder=folder, stages=("coarse",))
+            # Nothing but what it depends on: which methods share it, and so are asked for, must not change it.
+            alone = MethodConfig(training=run.config.training)
+            shared[digest] = replace(run, method="coarse", folder=folder, stages=("coarse",), config=alone)
     taken = [
-        replace(run, coarse_from=shared[_coarse_digest(run)].folder) if _coarse_digest(run) in shared else run
+        replace(run, coarse_from=shared[_coarse_digest(run)].folder)
+        if "coarse" in run.stages and _coarse_digest(run) in shared
+        else run
         for run in planned
     ]
     return list(shared.values()), taken

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from vdgs.bench.definitions import EXPLICIT
+from vdgs.bench.explicit import gaussians_folder
 from vdgs.bench.measure import GROUPS_FILE, evaluated
 from vdgs.bench.plan import Plan, PlannedRun
 from vdgs.bench.processes import Ended
@@ -35,6 +37,8 @@ class Result:
     figures: Mapping[str, float | None] = field(default_factory=dict)
     #: By visibility, least seen first: lower, upper, pixels.
     groups: tuple[Mapping[str, Any], ...] = ()
+    #: What V of the groups is (`seen.SeenBy`); empty without groups.
+    seen_by: str = ""
 
 
 def gather(plan: Plan, output: Path, ended: Mapping[str, Ended]) -> list[Result]:
@@ -46,8 +50,8 @@ def gather(plan: Plan, output: Path, ended: Mapping[str, Ended]) -> list[Result]
         result = Result(scene, method, seed, state, why, str(run.folder))
         if state == "done":
             try:
-                figures, groups = _read(output, run)
-                result = Result(scene, method, seed, state, why, str(run.folder), figures, groups)
+                figures, groups, seen_by = _read(output, run)
+                result = Result(scene, method, seed, state, why, str(run.folder), figures, groups, seen_by)
             except (VdgsError, KeyError, TypeError, FileNotFoundError) as error:
                 result = Result(scene, method, seed, "failed", f"its results cannot be read: {error}", str(run.folder))
         results.append(result)
@@ -58,23 +62,35 @@ def as_json(results: list[Result]) -> list[dict[str, Any]]:
     return [asdict(result) for result in results]
 
 
-def _read(output: Path, planned: PlannedRun) -> tuple[dict[str, float | None], tuple[dict[str, Any], ...]]:
+def _read(output: Path, planned: PlannedRun) -> tuple[dict[str, float | None], tuple[dict[str, Any], ...], str]:
     run = RunFolder(output / planned.folder)
     metrics, record = read_json(evaluated(run.path) / "metrics.json"), read_json(run.path / RECORD)
     figures: dict[str, float | None] = {name: metrics.get(name) for name in QUALITY}
-    figures |= {"anchors": metrics.get("n_anchors"), "model_bytes": metrics.get("model_bytes"), "fps": metrics["fps"]}
-    figures |= _costs(run, "blocks" in planned.stages, record.get("seconds", {}))
-    # A group without bounds holds the pixels where the reference shows nothing: no claim is about them.
-    groups = [group for group in read_json(run.path / GROUPS_FILE)["groups"] if group["lower"] is not None]
+    figures |= {"model_bytes": metrics.get("model_bytes"), "fps": metrics["fps"]}
+    figures |= _sizes(metrics, planned) | _costs(run, planned.stages, record.get("seconds", {}))
+    file = run.path / GROUPS_FILE
+    measured: dict[str, Any] = read_json(file) if file.exists() else {"groups": [], "seen_by": ""}
+    # A group without bounds holds sky, or what the reference does not show: no claim is about it.
+    groups = [group for group in measured["groups"] if group["lower"] is not None]
     for index, group in enumerate(groups):
         figures |= {f"{name}@{index}": group[name] for name in ("psnr", "ssim", "psnr_cc", "ssim_cc")}
     bounds = [{name: group[name] for name in ("lower", "upper", "pixels")} for group in groups]
-    return figures, tuple(bounds)
+    return figures, tuple(bounds), measured["seen_by"] if bounds else ""
 
 
-def _costs(run: RunFolder, blocks: bool, stages: Mapping[str, float]) -> dict[str, float | None]:
-    """Iterations, seconds, memory and cameras. The shared coarse stage counts in full for each run that takes it."""
-    coarse = run.coarse.status()
+def _sizes(metrics: Mapping[str, Any], planned: PlannedRun) -> dict[str, float | None]:
+    """Anchors, where the model has them, and Gaussians: those of an explicit model, or at most as many as the anchors
+    decode to (those without opacity are not drawn)."""
+    anchors, explicit = metrics.get("n_anchors"), metrics.get("n_gaussians")
+    decoded = None if anchors is None else anchors * planned.config.training.anchors.offsets
+    return {"anchors": anchors, "gaussians": decoded if explicit is None else explicit}
+
+
+def _costs(run: RunFolder, names: Sequence[str], stages: Mapping[str, float]) -> dict[str, float | None]:
+    """Iterations, seconds, memory and cameras of a run with the stages `names`. The shared coarse stage counts in full
+    for each run that takes it."""
+    blocks = "blocks" in names
+    coarse = (gaussians_folder(run.path) if tuple(names) == EXPLICIT else run.coarse).status()
     trained = [folder.status() for folder in run.block_folders()] if blocks else []
     rows = run.partition_facts().get("blocks", []) if blocks else []
     seconds = [float(each.get("seconds") or 0) for each in trained]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from vdgs.bench.grids import bounds_of
 from vdgs.bench.plan import Plan
 from vdgs.bench.results import Result
 from vdgs.bench.statistics import Difference, difference, summarise
@@ -50,16 +51,18 @@ def _same_runs(plan: Plan, scene: str, ours: str, other: str) -> bool:
 
 
 def _uneven(scene: str, results: Sequence[Result], ours: str, other: str, titles: dict[str, str]) -> list[Line]:
-    groups = next((len(result.groups) for result in results if result.groups), 0)
+    bounds = next((result.groups for result in results if result.groups), ())
+    groups = len(bounds)
     least = _difference(results, ours, other, "psnr@0")
     best = _difference(results, ours, other, f"psnr@{groups - 1}")
     name = f"{titles[ours]} against {titles[other]}"
     if groups == 0 or least is None or best is None:
         return [Line(scene, name, None, "no common results")]
-    fine = best.mean >= -ALLOWED_DB
+    more, fine = least.beyond_spread, best.mean >= -ALLOWED_DB
+    poorly, well = (f"(V {bounds_of(bounds[end])})" for end in (0, -1))
     return [
-        Line(scene, f"{name}, better where least seen by more than the spread", least.beyond_spread, _numbers(least)),
-        Line(scene, f"{name}, at most {ALLOWED_DB} dB below where best seen", fine, _numbers(best)),
+        Line(scene, f"{name}, better where least seen {poorly} by more than the spread", more, _numbers(least)),
+        Line(scene, f"{name}, at most {ALLOWED_DB} dB below where best seen {well}", fine, _numbers(best)),
     ]
 
 

@@ -95,9 +95,16 @@ def _evaluate(at: _Working) -> None:
     evaluate_stage(at.run.path, "best", at.job.lpips_weights, at.job.bins, at.console)
 
 
+def _gaussians(at: _Working) -> None:
+    from vdgs.bench.explicit import train_explicit
+
+    train_explicit(at.run, at.capture, at.job.lpips_weights, at.console)
+
+
 #: What a method may name as its stages. Each does nothing, or the same again, where it is done.
 STAGES: dict[str, Callable[[_Working], None]] = {
     "coarse": _coarse, "partition": _partition, "blocks": _blocks, "merge": _merge, "evaluate": _evaluate,
+    "gaussians": _gaussians,
 }  # fmt: skip
 
 

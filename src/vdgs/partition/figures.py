@@ -68,11 +68,12 @@ def draw_blocks(
     assigned: Bool[np.ndarray, "c b"],
     unit: str,
     compare: Blocks | None,
-    lambda_vis: float,
+    how: str,
 ) -> None:
     """Anchors from above coloured by block, with outlines and cameras; beside it the cut `compare` (λ_vis = 0).
 
-    The map shows 99 % of the anchors in x and in y. Writes a PNG; `unit` is that of places.
+    `how` says how the scene was cut. The map shows 99 % of the anchors in x and in y. Writes a PNG; `unit` is that of
+    places.
     """
     low, high = _frame(_inner(positions[:, :2]))
     width, height = map_size(low, high)
@@ -81,7 +82,7 @@ def draw_blocks(
     figure = Figure(figsize=(max(0.85 + columns * (width + 0.75), 7.5), 1.15 + rows * (height + 1.1)), dpi=DPI)
     canvas, place = FigureCanvasAgg(figure), placer(figure)
     shown = sample_points(positions[:, :2].astype(np.float64), MOST_DRAWN)
-    cuts = [(blocks, f"λ_vis = {lambda_vis:g}")]
+    cuts = [(blocks, how)]
     if compare is not None:
         cuts.append((compare, "λ_vis = 0: cut by place alone (numbers of its own)"))
     for index, (cut, name) in enumerate(cuts):

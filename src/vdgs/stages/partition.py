@@ -108,7 +108,8 @@ def partition_run(run: RunFolder, console: Console) -> None:
         spatial = _spatial(scene, method.partition, method.training.seed, blocks)
         _draw(run.partition, scene, blocks, scores, assignment, method.partition, spatial)
         facts = {
-            "key": keys.partition, "assignment_key": keys.assignment, "lambda_vis": method.partition.lambda_vis,
+            "key": keys.partition, "assignment_key": keys.assignment, "strategy": method.partition.strategy,
+            "lambda_vis": method.partition.lambda_vis if method.partition.strategy == "visibility" else None,
             "warnings": warnings, "complaints": assignment.complaints, "blocks": rows,
             "spatial": _facts_of_cut(scene, spatial),
             "seconds": time.monotonic() - began, "peak_memory_bytes": peak_memory_bytes(),
@@ -207,6 +208,13 @@ def _save(
     )  # fmt: skip
 
 
+def how_cut(config: PartitionConfig) -> str:
+    """How a scene is cut, in a few words: λ_vis says nothing of the partitions of others, nor of one block."""
+    if config.strategy != "visibility":
+        return STRATEGIES[config.strategy].cites.split(", ")[-2] + " partition"
+    return f"λ_vis = {config.lambda_vis:g}" if config.blocking else "not cut"
+
+
 def _draw(
     folder: Path, scene: _Scene, blocks: Blocks, scores: Scores, assignment: Assignment, config: PartitionConfig,
     spatial: Blocks,
@@ -215,7 +223,7 @@ def _draw(
     compare = spatial if ours and len(blocks) > 1 else None
     figures.draw_blocks(
         folder / "blocks.png", scene.positions, scene.views, blocks, scene.cameras, assignment.cameras,
-        unit(scene.opened.capture), compare, config.lambda_vis,
+        unit(scene.opened.capture), compare, how_cut(config),
     )  # fmt: skip
     figures.draw_block_facts(
         folder / "block_facts.png", scene.positions, scene.views, blocks, assignment.cameras,

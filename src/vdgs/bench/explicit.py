@@ -1,0 +1,44 @@
+"""3DGS among the methods of a table: its settings, and its training and measuring as a stage of a run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+from rich.console import Console
+
+from vdgs.captures.capture import Capture
+from vdgs.comparators.gaussian_schedule import scheduled
+from vdgs.comparators.gaussian_training import GaussiansConfig
+from vdgs.comparators.gaussians import run_gaussians
+from vdgs.config import MethodConfig, to_dict
+from vdgs.run import RunFolder, StageFolder
+
+
+def gaussians_config(method: MethodConfig) -> GaussiansConfig:
+    """The settings of 3DGS that has the iterations, the seed and the background of a coarse stage, and as many
+    Gaussians at most as that may decode from its anchors. Everything else is as published, its schedule in proportion
+    to the iterations."""
+    training = method.training
+    most = training.growth.max_anchors * training.anchors.offsets
+    published = GaussiansConfig(seed=training.seed, background=training.loss.background)
+    return scheduled(training.iterations, published, most)
+
+
+def gaussians_folder(run: Path) -> StageFolder:
+    """Where the Gaussians of a run are."""
+    return StageFolder(run / "gaussians")
+
+
+def train_explicit(run: RunFolder, capture: Capture, lpips_weights: Path | None, console: Console) -> None:
+    """Train, or continue, 3DGS for the settings of a run and measure it. What was trained for other settings or on
+    another choice of photographs goes first (that it may go was asked before: `RunFolder.change`).
+
+    Raises what `run_gaussians` raises.
+    """
+    config = gaussians_config(run.method())
+    made_for = json.dumps([run.keys().coarse, to_dict(config)], sort_keys=True)
+    with run.locked():
+        gaussians_folder(run.path).claim(hashlib.sha256(made_for.encode()).hexdigest()[:16])
+    run_gaussians(run, capture, config, console, lpips_weights=lpips_weights)
