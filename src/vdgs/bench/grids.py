@@ -77,7 +77,8 @@ SIZES = (
 )
 #: What V is.
 SEEN_BY = {
-    "truth": "Training cameras that truly see the surface at a pixel, with occlusion (sky, and what none sees, belongs to no group)",
+    "truth": "Training cameras that truly see the surface at a pixel, with occlusion (sky, and what none sees, belongs "
+    "to no group)",
     "model": "Training cameras whose frustum holds the place that one coarse model draws at a pixel",
 }
 
