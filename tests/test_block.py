@@ -22,7 +22,7 @@ from vdgs.decoder import Decoder
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.render import visible_rows
 from vdgs.stages.block import drawn_by, holds, places, ramp, split_anchors
-from vdgs.training import Stage, TrainingState, from_saved, start_state, to_saved, train, views_in_cycle
+from vdgs.training import Stage, Surroundings, TrainingState, from_saved, start_state, to_saved, train, views_in_cycle
 
 CONFIG = TrainConfig(
     iterations=40,
@@ -60,7 +60,7 @@ def block_stage(config: BlockConfig, index: int = 0, training: TrainConfig = CON
     own, around = split_anchors(anchors, BLOCKS, index, config)
     surroundings = anchors.select(around & drawn_by(anchors, photographs.cameras))
     stage = Stage(
-        training, photographs, 8, 0.4, 5.0, frozen_decoder=True, surroundings=surroundings,
+        training, photographs, 8, 0.4, 5.0, frozen_decoder=True, surroundings=Surroundings(surroundings, decoder),
         may_hold=holds(BLOCKS, index, config), mobility=ramp(BLOCKS, index, config),
     )  # fmt: skip
     return stage, start_state(anchors.select(own), decoder, stage)
@@ -81,10 +81,10 @@ def rows_of(anchors: Anchors) -> dict[bytes, bytes]:
 
 def test_ring_context_and_decoder_keep_their_bits():
     stage, state = block_stage(BlockConfig())
-    around, decoder = rows_of(stage.surroundings), {n: t.clone() for n, t in state.decoder.tensors().items()}
+    around, decoder = rows_of(stage.surroundings.anchors), {n: t.clone() for n, t in state.decoder.tensors().items()}
     own = rows_of(state.anchors)
     finish(stage, state)
-    assert rows_of(stage.surroundings) == around
+    assert rows_of(stage.surroundings.anchors) == around
     assert all(torch.equal(tensor, decoder[name]) for name, tensor in state.decoder.tensors().items())
     after = rows_of(state.anchors)
     assert sum(after.get(position) != row for position, row in own.items()) > 0.5 * len(own)
@@ -152,7 +152,10 @@ def test_one_block_without_surroundings_is_plain_training():
     own, around = split_anchors(anchors, whole, 0, BlockConfig())
     assert own.all()
     states = []
-    for surroundings, may_hold in ((None, None), (anchors.select(around), holds(whole, 0, BlockConfig()))):
+    for surroundings, may_hold in (
+        (None, None),
+        (Surroundings(anchors.select(around), decoder), holds(whole, 0, BlockConfig())),
+    ):
         stage = Stage(
             CONFIG, Photographs(), 8, 0.4, 5.0, frozen_decoder=True, surroundings=surroundings, may_hold=may_hold
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,8 @@ from vdgs.kernels.decode_types import FEATURE_SIZE
 from vdgs.tensor_files import checksum, write_tensors
 
 FORMAT = "vdgs-anchors-1"
+#: Of a model whose blocks have decoders of their own: a reader that knows of one decoder must not take it.
+FORMAT_OF_PARTS = "vdgs-anchors-2"
 #: An outlier is known by its distance to this neighbour: small clusters of false matches are outliers too.
 OUTLIER_NEIGHBOUR = 4
 
@@ -64,10 +67,19 @@ class Anchors:
 
 
 @dataclass(frozen=True)
+class Part:
+    """So many anchors of a model, one after another, and the decoder that they share."""
+
+    count: int
+    decoder: Decoder
+
+
+@dataclass(frozen=True)
 class AnchorModel:
-    """A scene: anchors, the decoder they share, and what is needed to use them again."""
+    """A scene: anchors, what decodes them, and what is needed to use them again."""
 
     anchors: Anchors
+    #: That of all anchors, or of the coarse stage where blocks have their own (`parts`).
     decoder: Decoder
     #: Edge of the voxel grid on which the anchors started, in units of the ground frame.
     voxel: float
@@ -75,33 +87,46 @@ class AnchorModel:
     background: tuple[float, float, float]
     #: JSON-able facts that travel with the file: ground frame, capture, version.
     facts: Mapping[str, Any]
+    #: A merged scene whose blocks trained decoders of their own: all anchors, block by block. Else empty.
+    parts: tuple[Part, ...] = ()
+
+    def spans(self) -> list[tuple[int, int, Decoder]]:
+        """Which rows of the anchors each decoder decodes: first, one past the last, decoder; ascending."""
+        bounds = np.cumsum([0, *(part.count for part in self.parts)]).tolist()
+        spans = [(a, b, part.decoder) for (a, b), part in zip(pairwise(bounds), self.parts, strict=True)]
+        return spans or [(0, len(self.anchors), self.decoder)]
 
     def save(self, path: Path) -> None:
         """Write one safetensors file, atomically."""
         tensors = {f"anchors.{k}": v for k, v in self.anchors.tensors().items()}
-        tensors |= {f"decoder.{k}": v for k, v in self.decoder.tensors().items()}
-        facts = {
+        for prefix, decoder in self._decoders():
+            tensors |= {prefix + name: tensor for name, tensor in decoder.tensors().items()}
+        facts: dict[str, Any] = {
             "voxel": self.voxel, "background": self.background, "facts": dict(self.facts), "crc32": checksum(tensors),
         }  # fmt: skip
-        header = {FORMAT: json.dumps(facts)}  # a single key: several would be written in an order that varies
+        if self.parts:
+            facts["parts"] = [part.count for part in self.parts]
+        # A single key: several would be written in an order that varies.
+        header = {FORMAT_OF_PARTS if self.parts else FORMAT: json.dumps(facts)}
         write_atomically(path, lambda temporary: write_tensors(temporary, tensors, header))
 
     @staticmethod
     def load(path: Path) -> AnchorModel:
         """Read a model. Raises VdgsError if the file is missing, damaged or not an anchor model."""
         tensors, header = read_tensors(path)
-        if FORMAT not in header:
+        found = next((name for name in (FORMAT, FORMAT_OF_PARTS) if name in header), None)
+        if found is None:
             raise VdgsError(f"{path}: is not a vdgs anchor model (its header has no {FORMAT!r})")
         try:
             anchors = Anchors(**{n: tensors[f"anchors.{n}"] for n in ("positions", *TRAINED)})
-            decoder = Decoder.from_tensors(
-                {name.removeprefix("decoder."): t for name, t in tensors.items() if name.startswith("decoder.")}
-            )
-            known = json.loads(header[FORMAT])
+            known = json.loads(header[found])
+            decoder = _decoder_of(tensors, "decoder.")
+            counts = known["parts"] if found == FORMAT_OF_PARTS else []
+            parts = tuple(Part(int(n), _decoder_of(tensors, f"part.{i}.")) for i, n in enumerate(counts))
             if known["crc32"] != checksum(tensors):
                 raise ValueError("its checksum does not agree")
             red, green, blue = (float(value) for value in known["background"])
-            model = AnchorModel(anchors, decoder, float(known["voxel"]), (red, green, blue), known["facts"])
+            model = AnchorModel(anchors, decoder, float(known["voxel"]), (red, green, blue), known["facts"], parts)
             model.check()
         except (KeyError, ValueError, TypeError) as error:
             raise VdgsError(f"{path}: is damaged or incomplete ({error}). {REBUILD}") from error
@@ -122,7 +147,18 @@ class AnchorModel:
                 raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, not float32 {shape}")
             if not bool(torch.isfinite(tensor).all()):
                 raise ValueError(f"{name} holds numbers that are not finite")
-        self.decoder.check(k)
+        for _, decoder in self._decoders():
+            decoder.check(k)
+        if self.parts and sum(part.count for part in self.parts) != n:
+            raise ValueError(f"its parts hold {sum(part.count for part in self.parts)} anchors, not {n}")
+
+    def _decoders(self) -> list[tuple[str, Decoder]]:
+        """Every decoder with what the names of its tensors begin with in a file."""
+        return [("decoder.", self.decoder)] + [(f"part.{i}.", part.decoder) for i, part in enumerate(self.parts)]
+
+
+def _decoder_of(tensors: Mapping[str, Tensor], prefix: str) -> Decoder:
+    return Decoder.from_tensors({n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)})
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -132,6 +132,10 @@ class TrainConfig:
     iterations: int = 100_000
     """Number of steps, one photograph each; 0 takes sixty for each training photograph, but at least 3000 and at
     most 30 000 (choice: few photographs are soon learnt by heart, many need their time)."""
+    sampling: Literal["even", "shares"] = "even"
+    """How often each photograph is used. `even`: all alike (the paper). `shares`: every anchor has one vote, divided
+    among the cameras that see it, and a photograph is used in proportion to its votes: most where few others look
+    (choice)."""
     resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
     """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
     seed: int = 0
@@ -199,6 +203,9 @@ class BlockConfig:
     """Steps for each block; 0 takes fifteen for each of its photographs, at least 500 and at most 15 000 (choice)."""
     scale_iterations: float = 1.0
     """Factor on the steps and on the start of statistics and growth, for scenes smaller than the paper's."""
+    sampling: Literal["even", "shares"] = "even"
+    """As in the coarse stage, by the votes of the anchors that the block moves: photographs that show little of the
+    block are used little."""
     resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
     """Resolution schedule, as in the coarse stage."""
     offset_rate: float = 0.4
@@ -209,6 +216,9 @@ class BlockConfig:
     """... and those of features times this (choice; 1 is the paper's)."""
     background_noise: float = 0.0
     """As in the loss of the coarse stage, but for blocks: there the ground is opaque already (choice)."""
+    decoder: Literal["frozen", "own"] = "frozen"
+    """`frozen`: as the coarse stage left it (the paper). `own`: each block trains its copy, which its anchors keep in
+    the merged scene (choice: with a frozen decoder what few cameras see is learnt by heart sooner)."""
     ring: Literal["frozen", "ramp", "free"] = "frozen"
     """Anchors between core and widened boundary: `frozen` are drawn and never move (choice for "gradients at the
     boundary are suppressed"); `ramp` move less the farther out they are; `free` as those of the core."""
@@ -261,6 +271,7 @@ def block_training(config: MethodConfig, views: int) -> TrainConfig:
     return replace(
         config.training,
         iterations=max(1, round(scale * (block.iterations or _steps(views, *BLOCK_STEPS)))),
+        sampling=block.sampling,
         resolutions=block.resolutions,
         rates=replace(
             rates,

@@ -56,6 +56,10 @@ class Decoder:
             named |= {"appearance": self.appearance, "appearance_weight": self.appearance_weight}
         return named
 
+    def copy(self) -> Decoder:
+        """The same numbers in tensors of their own."""
+        return Decoder.from_tensors({name: tensor.detach().clone() for name, tensor in self.tensors().items()})
+
     def for_image(self, image: int | None) -> DecoderWeights:
         """The weights as one view sees them: with the embedding of training image `image`, or with the mean
         embedding for a view that was not trained on (choice)."""

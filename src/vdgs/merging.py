@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from vdgs.anchors import AnchorModel, Anchors
+from vdgs.anchors import AnchorModel, Anchors, Part
 from vdgs.cameras import Camera
 from vdgs.config import MergeConfig
 from vdgs.decoder import Decoder
@@ -54,7 +54,7 @@ def merge(
         if model is not None:
             _check_origin(index, model, coarse)
     coarse_owner = blocks.owner(_places(coarse.anchors.positions)) if missing else None
-    pieces, facts = [], []
+    selected, pieces, facts = [], [], []
     for index, model in enumerate(trained):
         if model is None:
             assert coarse_owner is not None
@@ -66,9 +66,16 @@ def merge(
             held = len(model.anchors)
             counts = {"trained": held, "kept": len(piece), "dropped": held - len(piece), "from_coarse": 0}
         unseen = int((kernels.count_views(piece.positions, cameras_of_block[index]) == 0).sum())
-        pieces.append(piece)
+        pieces.append(Part(len(piece), coarse.decoder if model is None else model.decoder))
+        selected.append(piece)
         facts.append({"block": index, **counts, "unseen": unseen})
-    return replace(coarse, anchors=_joined(pieces)), facts
+    own = any(model is not None and has_own_decoder(model) for model in trained)
+    return replace(coarse, anchors=_joined(selected), parts=tuple(pieces) if own else ()), facts
+
+
+def has_own_decoder(model: AnchorModel) -> bool:
+    """Whether a block moved the decoder too, rather than anchors alone."""
+    return model.facts.get("decoder") == "own"
 
 
 def giver_of_places(
@@ -118,8 +125,8 @@ def _joined(pieces: Sequence[Anchors]) -> Anchors:
 
 
 def _check_origin(index: int, model: AnchorModel, coarse: AnchorModel) -> None:
-    """The decoder is frozen in block training: other bits are another coarse model."""
-    same = _bits(model.decoder) == _bits(coarse.decoder)
+    """Where blocks leave the decoder as it is, other bits are another coarse model."""
+    same = has_own_decoder(model) or _bits(model.decoder) == _bits(coarse.decoder)
     if not same or model.anchors.offsets.shape[1] != coarse.anchors.offsets.shape[1] or model.voxel != coarse.voxel:
         raise VdgsError(
             f"block {index} was trained from another coarse model: its decoder or its grid differs. "

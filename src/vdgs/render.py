@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+from itertools import pairwise
+
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
@@ -23,6 +26,31 @@ def decode_rows(anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWei
 def visible_rows(anchors: Anchors, camera: Camera) -> Int64[Tensor, " v"]:
     """Rows of the anchors that may touch a view, ascending."""
     return kernels.cull(anchors.positions, anchors.log_scales, camera)
+
+
+def decode_view(model: AnchorModel, camera: Camera, image: int | None = None) -> tuple[Int64[Tensor, " v"], Splats]:
+    """The rows that may touch a view and what they look like, each anchor by its own decoder; `source` counts rows.
+
+    `image`: as in `render`.
+    """
+    rows = visible_rows(model.anchors, camera)
+    pieces, spans = [], model.spans()
+    bounds = torch.searchsorted(rows, torch.tensor([first for first, _, _ in spans] + [len(model.anchors)])).tolist()
+    for (first, last), (_, _, decoder) in zip(pairwise(bounds), spans, strict=True):
+        if first < last or len(spans) == 1:
+            pieces.append((first, decode_rows(model.anchors, rows[first:last], decoder.for_image(image), camera)))
+    return rows, _joined(pieces, model.anchors.offsets.shape[1])
+
+
+def _joined(pieces: list[tuple[int, Splats]], k: int) -> Splats:
+    """Splats of consecutive rows as one, in order; each piece with the place of its first row."""
+    if len(pieces) == 1:
+        return pieces[0][1]
+    named = {
+        field.name: torch.cat([getattr(splats, field.name) for _, splats in pieces])
+        for field in fields(Splats) if field.name != "source"
+    }  # fmt: skip
+    return Splats(**named, source=torch.cat([splats.source + first * k for first, splats in pieces]))
 
 
 def draw(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:
@@ -47,8 +75,7 @@ def render(
     `background` replaces the model's own. `image` is the index of a training image whose appearance to use;
     None takes the mean appearance.
     """
-    rows = visible_rows(model.anchors, camera)
-    splats = decode_rows(model.anchors, rows, model.decoder.for_image(image), camera)
+    _, splats = decode_view(model, camera, image)
     return draw(splats, camera, torch.tensor(background or model.background), depth)
 
 
@@ -58,8 +85,7 @@ def render_values(model: AnchorModel, values: Float[Tensor, " n"], camera: Camer
 
     Used for visibility maps (V at each pixel).
     """
-    rows = visible_rows(model.anchors, camera)
-    splats = decode_rows(model.anchors, rows, model.decoder.for_image(None), camera)
+    rows, splats = decode_view(model, camera)
     k = model.anchors.offsets.shape[1]
     scale = float(values.max().clamp(min=1)) if len(values) else 1.0
     of_splat = values[rows][splats.source.long() // k].float() / scale

@@ -45,6 +45,17 @@ def views_of(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int3
     return kernels.count_views(positions, cameras)
 
 
+def shares_of(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> tuple[float, ...]:
+    """How much of the training each camera deserves (choice): every anchor has one vote and divides it among the
+    cameras that hold it, so that w_j = sum of 1 / V_i over the anchors i that camera j holds.
+
+    The shares add up to the number of anchors that any camera holds; where that is none, all are 1.
+    """
+    votes = 1.0 / views_of(positions, cameras).double().clamp(min=1)
+    shares = tuple(float(votes[views_of(positions, [camera]) > 0].sum()) for camera in cameras)
+    return shares if any(shares) else (1.0,) * len(cameras)
+
+
 def normalised(views: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """V̂_i = (V_i - min V) / (max V - min V + 1e-8), float64 in [0, 1) (below eq. 5)."""
     count = np.asarray(views, np.float64)

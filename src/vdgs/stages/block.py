@@ -1,6 +1,6 @@
 """Block training (section III-B): one block, from the coarse anchors of its place, with its own cameras.
 
-The decoder is frozen, so that blocks stay of one scene. What lies around the block's core is drawn and never moves:
+The decoder is frozen, or each block trains a copy of its own. What lies around the block's core is drawn and never moves:
 the ring out to its widened boundary and, as context, all else that its cameras see (choice: else every pixel that no
 anchor covers would push the anchors at the boundary to fill the hole).
 """
@@ -32,9 +32,9 @@ from vdgs.partition.saving import load_scores
 from vdgs.run import RunFolder, StageFolder
 from vdgs.run_options import WatchOptions
 from vdgs.stages.anchor_watching import continue_or_start, finish, identity, train_watched
-from vdgs.stages.coarse import camera_height, image_budget, note_without_growth
+from vdgs.stages.coarse import camera_height, image_budget, note_without_growth, shares_for
 from vdgs.stages.opening import open_run
-from vdgs.training import Stage, start_state
+from vdgs.training import Stage, Surroundings, start_state
 
 #: Cells on each side of the table of the ramp.
 RAMP_CELLS = 512
@@ -97,11 +97,11 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
     with ImageCache(views, image_budget(options), downscales=factors) as images:
         stage = Stage(
             config, images, len(views), coarse.voxel, camera_height(capture), coarse.background,
-            frozen_decoder=True, surroundings=surroundings,
+            frozen_decoder=method.block.decoder == "frozen", surroundings=Surroundings(surroundings, coarse.decoder),
             may_hold=holds(blocks, index, method.block), mobility=ramp(blocks, index, method.block),
-            appearance_of=chosen,
+            appearance_of=chosen, shares=shares_for(config, anchors, views),
         )  # fmt: skip
-        state = continue_or_start(folder, stage, lambda: start_state(anchors, coarse.decoder, stage), console)
+        state = continue_or_start(folder, stage, lambda: start_state(anchors, coarse.decoder.copy(), stage), console)
         console.print(
             f"block {index}: {len(views)} of {len(capture.train_views)} training views, {int(own.sum()):,} anchors of "
             f"its own, {len(surroundings):,} around it, {config.iterations:,} iterations",
@@ -109,7 +109,11 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
         )
         train_watched(folder, state, stage, options, console)
     model = AnchorModel(
-        state.anchors, state.decoder, coarse.voxel, coarse.background, facts | {"iterations": state.iteration}
+        state.anchors,
+        state.decoder,
+        coarse.voxel,
+        coarse.background,
+        facts | {"iterations": state.iteration, "decoder": method.block.decoder},
     )
     finish(folder, state, model, console)
 

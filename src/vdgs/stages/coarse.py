@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from rich.console import Console
 
 from vdgs import __version__
 from vdgs.anchors import AnchorModel, Anchors, initial_anchors
-from vdgs.captures.capture import Capture
+from vdgs.captures.capture import Capture, View
 from vdgs.captures.checks import check_images
 from vdgs.captures.facts import capture_facts, refuse_another_capture
 from vdgs.captures.images import ImageCache
@@ -28,6 +29,7 @@ from vdgs.run import RunFolder
 from vdgs.run_options import WatchOptions
 from vdgs.stages.anchor_watching import continue_or_start, finish, train_watched
 from vdgs.training import Stage, TrainingState, mean_colour, start_state
+from vdgs.visibility import shares_of
 
 
 def begin_run(
@@ -109,6 +111,11 @@ def camera_height(capture: Capture) -> float:
     return max(height, 1e-3 * float(np.ptp(capture.points, axis=0).max()), 1e-9)
 
 
+def shares_for(config: TrainConfig, anchors: Anchors, views: Sequence[View]) -> tuple[float, ...] | None:
+    """How often each training view is used, by the settings, for the anchors that training starts with."""
+    return shares_of(anchors.positions, [view.camera for view in views]) if config.sampling == "shares" else None
+
+
 def image_budget(options: WatchOptions) -> int:
     """Bytes for decoded photographs."""
     return int(options.image_memory_gb * 1e9) or available_bytes() // 4
@@ -125,7 +132,15 @@ def _train(run: RunFolder, capture: Capture, config: TrainConfig, options: Watch
         background = (0.0, 0.0, 0.0)
         if config.loss.background != "black":
             background = mean_colour(images, len(views), factors[-1])
-        stage = Stage(config, images, len(views), voxel, camera_height(capture), background)
+        stage = Stage(
+            config,
+            images,
+            len(views),
+            voxel,
+            camera_height(capture),
+            background,
+            shares=shares_for(config, anchors, views),
+        )
         state = continue_or_start(folder, stage, lambda: _start(anchors, stage), console)
         _announce(capture, state, config, console)
         train_watched(folder, state, stage, options, console)

@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from vdgs.anchors import AnchorModel
+from vdgs.anchors import AnchorModel, Part
 from vdgs.cameras import Camera
 from vdgs.evaluation.of_run import cached_photographs, evaluate_run, evaluation_folder
 from vdgs.evaluation.saving import write_json
@@ -102,7 +102,9 @@ class _BlocksAlone:
 
     def _assemble(self, index: int) -> AnchorModel:
         own = AnchorModel.load(self._run.block(index).model)
-        return replace(own, anchors=own.anchors.extended(self._coarse.anchors.select(self._around[index])))
+        around = self._coarse.anchors.select(self._around[index])
+        parts = Part(len(own.anchors), own.decoder), Part(len(around), self._coarse.decoder)
+        return replace(own, anchors=own.anchors.extended(around), parts=parts)
 
 
 def _bytes(model: AnchorModel) -> int:

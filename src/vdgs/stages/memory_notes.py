@@ -20,7 +20,7 @@ SAVE_SHARE = 0.3
 
 
 def kind_of(stage: Stage) -> Kind:
-    return "block" if stage.frozen_decoder else "coarse"
+    return "coarse" if stage.surroundings is None else "block"
 
 
 def need_of(state: TrainingState, stage: Stage) -> Need:
@@ -41,7 +41,7 @@ def need_of(state: TrainingState, stage: Stage) -> Need:
         seen=max(seen) / max(len(anchors), 1),
         pixels=max(pixels),
         images_bytes=min(photographs, getattr(stage.images, "budget_bytes", photographs)),
-        surroundings=0 if stage.surroundings is None else len(stage.surroundings),
+        surroundings=0 if stage.surroundings is None else len(stage.surroundings.anchors),
     )
 
 

@@ -6,6 +6,7 @@ from vdgs.training.schedule import downscale_at, view_at, views_in_cycle
 from vdgs.training.state import (
     Stage,
     StepReport,
+    Surroundings,
     TrainingImages,
     TrainingState,
     from_saved,
@@ -14,6 +15,6 @@ from vdgs.training.state import (
 )
 
 __all__ = [
-    "PSNR_INTERVAL", "Stage", "StepReport", "TrainingImages", "TrainingState", "downscale_at", "from_saved",
+    "PSNR_INTERVAL", "Stage", "StepReport", "Surroundings", "TrainingImages", "TrainingState", "downscale_at", "from_saved",
     "mean_colour", "start_state", "to_saved", "train", "train_step", "view_at", "views_in_cycle",
 ]  # fmt: skip

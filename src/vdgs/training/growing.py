@@ -27,7 +27,7 @@ def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:
     decision = decide(
         state.anchors, state.statistics, stage.voxel, config.growth, generator,
         compensated=compensated,
-        surroundings=None if stage.surroundings is None else stage.surroundings.positions,
+        surroundings=None if stage.surroundings is None else stage.surroundings.anchors.positions,
         may_hold=stage.may_hold,
     )  # fmt: skip
     before, added = len(state.anchors), len(decision.added)

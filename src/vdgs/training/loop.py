@@ -40,13 +40,13 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     """
     config, iteration = stage.config, state.iteration
     downscale = downscale_at(iteration, config)
-    view = view_at(iteration, stage.image_count, config.seed)
+    view = view_at(iteration, stage.image_count, config.seed, stage.shares)
     target, mask = stage.images.get(view, downscale)
     camera = stage.images.camera(view, downscale)
 
     rows = visible_rows(state.anchors, camera)
-    weights = state.decoder.for_image(view if stage.appearance_of is None else stage.appearance_of[view])
-    around = _surroundings(stage, weights, camera)
+    weights = state.decoder.for_image(appearance_at(stage, view))
+    around = _surroundings(stage, view, camera)
     with torch.no_grad():
         drawn = draw_view(
             decode_rows(state.anchors, rows, weights, camera), camera, background_at(stage, iteration), around
@@ -81,11 +81,18 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
 
 
 @torch.no_grad()
-def _surroundings(stage: Stage, weights: DecoderWeights, camera: Camera) -> Splats | None:
+def _surroundings(stage: Stage, view: int, camera: Camera) -> Splats | None:
     """The splats of the frozen anchors around a block: drawn, but out of autograd's sight."""
-    if stage.surroundings is None or not len(stage.surroundings):
+    around = stage.surroundings
+    if around is None or not len(around.anchors):
         return None
-    return decode_rows(stage.surroundings, visible_rows(stage.surroundings, camera), weights, camera)
+    weights = around.decoder.for_image(appearance_at(stage, view))
+    return decode_rows(around.anchors, visible_rows(around.anchors, camera), weights, camera)
+
+
+def appearance_at(stage: Stage, view: int) -> int:
+    """The number of a view among all training images of the capture."""
+    return view if stage.appearance_of is None else stage.appearance_of[view]
 
 
 def _volume_weight(stage: Stage) -> float:
@@ -147,7 +154,7 @@ def train(
             return False
         ahead = range(state.iteration + 1, min(state.iteration + 1 + prefetch, config.iterations))
         for iteration in ahead:
-            view = view_at(iteration, stage.image_count, config.seed)
+            view = view_at(iteration, stage.image_count, config.seed, stage.shares)
             stage.images.prefetch([view], downscale_at(iteration, config))
         report = train_step(state, stage)
         after_step(state, report)

@@ -10,15 +10,26 @@ from vdgs.config import TrainConfig
 from vdgs.training.state import Stage
 
 
-def view_at(iteration: int, count: int, seed: int) -> int:
-    """Which training view iteration (from 0) uses: a fresh permutation of all views every `count` iterations."""
+def view_at(iteration: int, count: int, seed: int, shares: tuple[float, ...] | None = None) -> int:
+    """Which training view iteration (from 0) uses.
+
+    Without `shares` every `count` iterations are a fresh permutation of all views. With them, one number >= 0 for each
+    view and some > 0, every `count` iterations hold each view as often as its share of their sum asks for, rounded
+    down or up at random (systematic sampling), in random order.
+    """
     epoch, place = divmod(iteration, count)
-    return int(_permutation(epoch, count, seed)[place])
+    return int(_epoch(epoch, count, seed, shares)[place])
 
 
 @lru_cache(maxsize=4)
-def _permutation(epoch: int, count: int, seed: int) -> np.ndarray:
-    return np.random.default_rng((seed, epoch)).permutation(count)
+def _epoch(epoch: int, count: int, seed: int, shares: tuple[float, ...] | None) -> np.ndarray:
+    generator = np.random.default_rng((seed, epoch))
+    if shares is None:
+        return generator.permutation(count)
+    marks = np.cumsum(shares) * (count / np.sum(shares))
+    marks[-1] = count  # rounding must not lose the last one
+    drawn = np.searchsorted(marks, np.arange(count) + generator.random(), side="right")
+    return generator.permutation(drawn)
 
 
 def downscale_at(iteration: int, config: TrainConfig) -> int:
@@ -37,4 +48,4 @@ def views_in_cycle(iteration: int, stage: Stage) -> list[int]:
     if begin < growth.start:  # no decision was made before
         begin = growth.statistics_from
     used = range(max(min(begin, iteration - 1), 0), iteration)
-    return sorted({view_at(each, stage.image_count, stage.config.seed) for each in used})
+    return sorted({view_at(each, stage.image_count, stage.config.seed, stage.shares) for each in used})

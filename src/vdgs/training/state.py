@@ -54,6 +54,14 @@ class TrainingState:
 
 
 @dataclass(frozen=True)
+class Surroundings:
+    """Anchors that stay as they are, with the decoder that they were trained with."""
+
+    anchors: Anchors
+    decoder: Decoder
+
+
+@dataclass(frozen=True)
 class Stage:
     """What training works on: the same for all iterations."""
 
@@ -67,14 +75,16 @@ class Stage:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     #: A block leaves the decoder as it is.
     frozen_decoder: bool = False
-    #: Anchors that are drawn and never move: ring and context of a block.
-    surroundings: Anchors | None = None
+    #: What is drawn and never moves: ring and context of a block.
+    surroundings: Surroundings | None = None
     #: Which places [p, 3] may get new anchors; None: all.
     may_hold: Callable[[Tensor], Tensor] | None = None
     #: How far the anchors at places [p, 3] move, from 0 to 1 of a full step; None: all of it.
     mobility: Callable[[Tensor], Tensor] | None = None
     #: Which training image of the whole capture each view is (for its appearance); None: the same number.
     appearance_of: Sequence[int] | None = None
+    #: How often each view is used, in proportion; None: all alike.
+    shares: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)
