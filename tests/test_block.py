@@ -90,6 +90,19 @@ def test_ring_context_and_decoder_keep_their_bits():
     assert sum(after.get(position) != row for position, row in own.items()) > 0.5 * len(own)
 
 
+def test_a_block_with_a_decoder_of_its_own_leaves_the_surroundings_theirs():
+    stage, state = block_stage(BlockConfig())
+    shared = state.decoder
+    before = {name: tensor.clone() for name, tensor in shared.tensors().items()}
+    stage = replace(stage, frozen_decoder=False)
+    own = start_state(state.anchors, shared.copy(), stage)
+    finish(stage, own)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in shared.tensors().items())
+    assert stage.surroundings.decoder is shared
+    moved = [not torch.equal(tensor, before[name]) for name, tensor in own.decoder.tensors().items()]
+    assert all(moved)
+
+
 def test_new_anchors_stand_in_the_core():
     stage, state = block_stage(BlockConfig())
     before = len(state.anchors)

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from checkerboard import Photographs
 from vdgs.anchors import AnchorModel, initial_anchors
@@ -99,6 +101,26 @@ def test_another_seed_is_another_run(unbroken):
 def test_every_view_is_used_once_an_epoch():
     for epoch in range(3):
         assert sorted(view_at(epoch * 7 + i, 7, seed=3) for i in range(7)) == list(range(7))
+
+
+@given(
+    shares=st.lists(st.floats(0.0, 50.0), min_size=1, max_size=12).filter(lambda each: sum(each) > 1e-3),
+    seed=st.integers(0, 1000),
+)
+def test_views_come_in_proportion_to_their_shares(shares, seed):
+    count, given_shares = len(shares), tuple(shares)
+    expected = np.array(shares) * count / sum(shares)
+    for epoch in range(3):
+        drawn = [view_at(epoch * count + i, count, seed, given_shares) for i in range(count)]
+        times = np.bincount(drawn, minlength=count)
+        assert (np.abs(times - expected) < 1 + 1e-9).all()  # rounded down or up
+
+
+def test_over_many_epochs_shares_are_kept():
+    shares = (0.0, 1.0, 1.5, 4.0)
+    drawn = [view_at(i, 4, 0, shares) for i in range(4000)]
+    assert np.allclose(np.bincount(drawn, minlength=4) / 4000, np.array(shares) / sum(shares), atol=0.01)
+    assert drawn == [view_at(i, 4, 0, shares) for i in range(4000)]
 
 
 def test_the_resolution_schedule():

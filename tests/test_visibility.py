@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from captures_support import look_down
 from vdgs.cameras import NEAR, Camera, CameraModel
-from vdgs.visibility import imbalance, normalised, share_in_cycle, views_of
+from vdgs.visibility import imbalance, normalised, share_in_cycle, shares_of, views_of
 
 
 def flight(count: int, model: CameraModel = "pinhole", seed: int = 0) -> list[Camera]:
@@ -95,3 +95,23 @@ def test_imbalance_in_numbers() -> None:
     assert facts.share_below == {3: 3 / 101, 5: 5 / 101, 10: 10 / 101}
     with pytest.raises(ValueError, match="no anchors"):
         imbalance(np.array([], np.int64))
+
+
+def test_every_anchor_divides_its_vote_among_the_cameras_that_hold_it() -> None:
+    cameras, points = flight(20), torch.from_numpy(cloud(500))
+    held = np.array([views_of(points, [camera]).numpy() > 0 for camera in cameras])
+    seen = held.sum(0)
+    expected = [sum(1.0 / seen[i] for i in np.flatnonzero(row)) for row in held]
+    shares = shares_of(points, cameras)
+    assert np.allclose(shares, expected)
+    assert np.isclose(sum(shares), (seen > 0).sum())
+
+
+def test_a_camera_alone_over_a_place_has_the_votes_of_all_its_anchors() -> None:
+    def above(x: float) -> Camera:
+        return Camera(look_down(np.array([x, 0.0, 8.0]), 0.0, 0.0), 60.0, 60.0, 32.0, 24.0, 64, 48)
+
+    crowd, lonely = [above(0.0)] * 9, above(100.0)
+    points = torch.tensor([[0.0, 0.0, 0.0]] * 9 + [[100.0, 0.0, 0.0]] * 9)
+    assert np.allclose(shares_of(points, [*crowd, lonely]), [1.0] * 9 + [9.0])
+    assert shares_of(torch.zeros(0, 3), crowd) == (1.0,) * 9

@@ -34,11 +34,16 @@ def decode_view(model: AnchorModel, camera: Camera, image: int | None = None) ->
     `image`: as in `render`.
     """
     rows = visible_rows(model.anchors, camera)
-    pieces, spans = [], model.spans()
+    spans = model.spans()
     bounds = torch.searchsorted(rows, torch.tensor([first for first, _, _ in spans] + [len(model.anchors)])).tolist()
-    for (first, last), (_, _, decoder) in zip(pairwise(bounds), spans, strict=True):
-        if first < last or len(spans) == 1:
-            pieces.append((first, decode_rows(model.anchors, rows[first:last], decoder.for_image(image), camera)))
+    shown = [
+        (first, last, decoder)
+        for (first, last), (_, _, decoder) in zip(pairwise(bounds), spans, strict=True) if first < last
+    ] or [(0, 0, model.decoder)]  # fmt: skip
+    pieces = [
+        (first, decode_rows(model.anchors, rows[first:last], decoder.for_image(image), camera))
+        for first, last, decoder in shown
+    ]
     return rows, _joined(pieces, model.anchors.offsets.shape[1])
 
 

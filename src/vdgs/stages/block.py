@@ -1,8 +1,8 @@
 """Block training (section III-B): one block, from the coarse anchors of its place, with its own cameras.
 
-The decoder is frozen, or each block trains a copy of its own. What lies around the block's core is drawn and never moves:
-the ring out to its widened boundary and, as context, all else that its cameras see (choice: else every pixel that no
-anchor covers would push the anchors at the boundary to fill the hole).
+The decoder is frozen, or each block trains a copy of its own. What lies around the block's core is drawn and never
+moves: the ring out to its widened boundary and, as context, all else that its cameras see (choice: else every pixel
+that no anchor covers would push the anchors at the boundary to fill the hole).
 """
 
 from __future__ import annotations

@@ -15,6 +15,6 @@ from vdgs.training.state import (
 )
 
 __all__ = [
-    "PSNR_INTERVAL", "Stage", "StepReport", "Surroundings", "TrainingImages", "TrainingState", "downscale_at", "from_saved",
-    "mean_colour", "start_state", "to_saved", "train", "train_step", "view_at", "views_in_cycle",
+    "PSNR_INTERVAL", "Stage", "StepReport", "Surroundings", "TrainingImages", "TrainingState", "downscale_at",
+    "from_saved", "mean_colour", "start_state", "to_saved", "train", "train_step", "view_at", "views_in_cycle",
 ]  # fmt: skip
