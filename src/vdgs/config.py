@@ -302,8 +302,11 @@ PRESETS: dict[str, MethodConfig] = {
             growth=GrowthConfig(statistics_from=300, start=500, until=0.6, threshold=1e-4),
         ),
         partition=PartitionConfig(blocks="auto"),
+        assignment=AssignmentConfig(threshold=0.1),
         block=BlockConfig(
             iterations=0,
+            sampling="shares",
+            decoder="own",
             growth=GrowthConfig(statistics_from=0, start=100, threshold=1e-4),
             compensation=CompensationConfig(t_low_quantile=0.25),
         ),

@@ -58,6 +58,8 @@ class Method:
     differs: str = ""
     #: What it gets less than the others, where it does not spend the whole budget.
     less: str = ""
+    #: What it gets more than the others, to find out what holds them back.
+    more: str = ""
 
     def settings(self, base: MethodConfig, budget: Budget) -> MethodConfig:
         return self.change(base, budget)

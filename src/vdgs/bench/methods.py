@@ -50,6 +50,32 @@ def without_anchor_generation(config: MethodConfig, _budget: Budget) -> MethodCo
     return _compensated(config, enabled=False)
 
 
+def as_printed(config: MethodConfig, _budget: Budget) -> MethodConfig:
+    """The paper's blocks: frozen decoder, every photograph used alike, cameras above 0.45, a fixed T_low of 0.20."""
+    plain = MethodConfig()
+    config = _compensated(config, t_low=plain.block.compensation.t_low, t_low_quantile=0.0)
+    return replace(
+        config,
+        assignment=replace(config.assignment, threshold=plain.assignment.threshold),
+        block=replace(config.block, decoder=plain.block.decoder, sampling=plain.block.sampling),
+    )
+
+
+def with_longer_blocks(factor: int) -> Change:
+    """Blocks that train so many times as long."""
+    return lambda config, budget: replace(config, block=replace(config.block, iterations=factor * budget.per_block))
+
+
+def with_block(**values: object) -> Change:
+    """The full method with other settings of block training."""
+    return lambda config, _: replace(config, block=replace(config.block, **values))  # type: ignore[arg-type]
+
+
+def with_assignment(**values: object) -> Change:
+    """The full method with other settings of the assignment of cameras."""
+    return lambda config, _: replace(config, assignment=replace(config.assignment, **values))  # type: ignore[arg-type]
+
+
 def in_blocks(count: int) -> Change:
     """The same total of block iterations shared by `count` blocks."""
 
@@ -82,6 +108,16 @@ def with_gamma(value: float) -> Change:
     return lambda config, _: _compensated(config, gamma=value)
 
 
+def with_literal_gate(config: MethodConfig, _budget: Budget) -> MethodConfig:
+    """Offsets of low visibility are judged after as many draws as the others."""
+    return _compensated(config, gate="literal")
+
+
+def with_cap(thresholds: float) -> Change:
+    """The cache g grows to so many thresholds of growth at most."""
+    return lambda config, _: _compensated(config, cap=thresholds * config.block.growth.threshold)
+
+
 def partitioned_by(strategy: PartitionStrategy) -> Change:
     """Another partition; growth is plain, since compensation is what VDGS adds."""
 
@@ -104,7 +140,7 @@ def explicit_gaussians(background: Literal["mean", "black"]) -> Change:
     return change
 
 
-def _compensated(config: MethodConfig, **values: float | bool) -> MethodConfig:
+def _compensated(config: MethodConfig, **values: float | bool | str) -> MethodConfig:
     changed: CompensationConfig = replace(config.block.compensation, **values)  # type: ignore[arg-type]
     return replace(config, block=replace(config.block, compensation=changed))
 
@@ -140,6 +176,13 @@ _ABLATIONS = [
         COARSE_ONLY,
         less="iterations of the coarse stage and one block: as much time, if all blocks are trained at once",
     ),
+    Method(
+        "printed",
+        "VDGS as printed",
+        as_printed,
+        cites="VDGS, sections III-B and III-C",
+        differs="blocks as in the preset `paper`: frozen decoder, photographs used alike, share of 0.45, T_low = 0.20",
+    ),
     Method("no-blocking", "w/o blocking", without_blocking, cites="VDGS, Table II (b)"),
     Method("no-anchor-generation", "w/o anchor generation", without_anchor_generation, cites="VDGS, Table II (c)"),
 ]
@@ -174,6 +217,25 @@ _OTHERS = [
     ),
 ]  # fmt: skip
 _BLOCKS = [Method(f"blocks-{count}", f"{count} block{'s' * (count > 1)}", in_blocks(count)) for count in BLOCKS]
+_LONGER = [
+    Method(
+        f"longer-{factor}", f"VDGS (full), blocks {factor} times as long", with_longer_blocks(factor),
+        more=f"iterations: {factor} times as many for blocks",
+    )
+    for factor in (2, 4)
+]  # fmt: skip
+_CHOICES = [
+    Method("frozen-decoder", "frozen decoder", with_block(decoder="frozen")),
+    Method("even-sampling", "photographs used alike", with_block(sampling="even")),
+    Method("share-0.45", "cameras above a share of 0.45", with_assignment(threshold=0.45)),
+    Method("literal-assignment", "eq. 7 as printed", with_assignment(mode="literal", threshold=0.45)),
+    Method("leave-one-out", "cameras by leave-one-out", with_assignment(mode="leave_one_out")),
+    Method("frustum", "cameras by frusta", with_assignment(mode="frustum")),
+    Method("no-context", "without context", with_block(context=False)),
+    Method("free-ring", "free ring", with_block(ring="free")),
+    Method("literal-gate", "literal gate", with_literal_gate),
+    Method("cap", "g capped at 4 thresholds", with_cap(4)),
+]  # fmt: skip
 _SWEEPS = [
     *_sweep("lambda-vis", "λ_vis", LAMBDA_VIS, with_lambda_vis),
     *_sweep("t-low", "T_low", T_LOW, with_t_low),
@@ -182,4 +244,6 @@ _SWEEPS = [
 ]
 
 #: Every method by name.
-METHODS: dict[str, Method] = {method.name: method for method in _ABLATIONS + _OTHERS + _BLOCKS + _SWEEPS}
+METHODS: dict[str, Method] = {
+    method.name: method for method in _ABLATIONS + _OTHERS + _BLOCKS + _LONGER + _CHOICES + _SWEEPS
+}

@@ -39,8 +39,8 @@ def notes_of(plan: Plan, results: Sequence[Result], lines: Sequence[Line], figur
 def _fairness(plan: Plan) -> str:
     said = [
         "Same photographs, sparse points, split and total of iterations for all methods of a scene, but for rows of "
-        "which it is said below that they get less; where a cut gives fewer blocks than asked for, a method gets fewer "
-        "iterations, as its row says.",
+        "which it is said below that they get less or more; where a cut gives fewer blocks than asked for, a method "
+        "gets fewer iterations, as its row says.",
         "A coarse stage that several methods share is trained once; its time counts for each of them. Training time is "
         "the sum over all blocks, as if one after the other; it depends on how many runs went at once (--jobs).",
         "LPIPS is VGG with input in [-1, 1]; a dash means that no weights were given (--lpips-weights).",
@@ -85,6 +85,8 @@ def _method(method: Method) -> str:
         text += f": {method.differs}"
     if method.less:
         text += f". Gets less: {method.less}"
+    if method.more:
+        text += f". Gets more: {method.more}"
     return text + (f". Left out: {'; '.join(left)}" if left else "")
 
 

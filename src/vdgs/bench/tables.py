@@ -5,7 +5,7 @@ from __future__ import annotations
 from vdgs.bench.definitions import Group, Table
 from vdgs.bench.methods import BETA_G, BLOCKS, GAMMA, LAMBDA_VIS, T_LOW
 
-LAB = ("toy-uneven", "toy-distant", "toy-even")
+LAB = ("lab-uneven", "lab-distant", "lab-even")
 
 
 def _sweep(title: str, prefix: str, values: tuple[float, ...]) -> Group:
@@ -18,7 +18,13 @@ _SWEEPS = (
     _sweep("(c) compensation scale β_g", "beta-g", BETA_G),
     _sweep("(d) decay factor γ", "gamma", GAMMA),
 )
-_ABLATION = ("coarse", "coarse-as-long", "baseline", "no-blocking", "no-anchor-generation", "full")
+_ABLATION = ("coarse", "coarse-as-long", "baseline", "no-blocking", "no-anchor-generation", "printed", "full")
+
+#: Each departs from the full method in one choice.
+CHOICES = (
+    "full", "frozen-decoder", "even-sampling", "share-0.45", "literal-assignment", "leave-one-out", "frustum",
+    "no-context", "free-ring", "literal-gate", "cap",
+)  # fmt: skip
 
 #: Every table by name.
 TABLES: dict[str, Table] = {
@@ -37,7 +43,12 @@ TABLES: dict[str, Table] = {
             "table4", "Table IV: parameters", tuple(name for group in _SWEEPS for name in group.methods), LAB[:1],
             seeds=(0,), groups=_SWEEPS, ours="lambda-vis-1",
         ),
+        Table("longer", "Blocks trained longer", ("coarse", "baseline", "full", "longer-2", "longer-4"), LAB[:2]),
+        Table("choices", "Choices where the paper is silent", CHOICES, LAB[:1], seeds=(0,)),
         Table("efficiency", "Efficiency", ("baseline", "full"), LAB[:1], seeds=(0,)),
-        Table("toy", "Toy: the training strategies on a tiny town", _ABLATION[2:], ("tiny",), seeds=(0,)),
+        Table(
+            "toy", "Toy: the training strategies on a tiny town",
+            ("baseline", "no-blocking", "no-anchor-generation", "full"), ("tiny",), seeds=(0,),
+        ),
     )
 }  # fmt: skip

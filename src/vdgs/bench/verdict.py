@@ -35,7 +35,8 @@ def verdict(plan: Plan, results: Sequence[Result]) -> list[Line]:
     titles = {method.name: method.title for method in plan.methods}
     for scene in plan.scenes:
         mine = [result for result in results if result.scene == scene.name]
-        others = [name for name in titles if name != ours and not _same_runs(plan, scene.name, ours, name)]
+        fair = [method.name for method in plan.methods if method.name != ours and not method.more]
+        others = [name for name in fair if not _same_runs(plan, scene.name, ours, name)]
         if ours not in titles or not others:
             continue
         if scene.uneven:

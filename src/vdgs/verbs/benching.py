@@ -26,7 +26,7 @@ class BenchArguments:
     seeds: int | None = None
     """How many seeds (0, 1, ...); by default as many as the table has."""
     scenes: tuple[str, ...] = ()
-    """Other scenes than the table's, by name: tiny, toy-uneven, town-even, copr, residence, sci-art, ..."""
+    """Other scenes than the table's, by name: tiny, lab-uneven, town-even, copr, residence, sci-art, ..."""
     methods: tuple[str, ...] = ()
     """Other methods than the table's, by name: full, baseline, no-blocking, vastgaussian, lambda-vis-0, ..."""
     data: Path | None = None
