@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+import typing
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,6 +45,7 @@ from vdgs.cameras import Camera
 from vdgs.captures.options import CaptureOptions
 from vdgs.config_checks import validate
 from vdgs.errors import VdgsError
+from vdgs.verbs.benching import BenchArguments
 
 
 def total_iterations(method: Method, scene: Scene) -> int:
@@ -82,6 +84,10 @@ def test_tables_name_what_exists(table):
     trained = {run.folder for run in plan.coarse}
     assert all(run.coarse_from in trained for run in plan.runs if "blocks" in run.stages)
     assert len({run.folder for run in plan.runs + plan.coarse}) == len(plan.runs + plan.coarse)
+
+
+def test_the_command_line_offers_every_table():
+    assert set(typing.get_args(typing.get_type_hints(BenchArguments)["table"])) == TABLES.keys()
 
 
 def test_the_ablations_change_what_they_are_named_after():

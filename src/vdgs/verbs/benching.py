@@ -19,8 +19,9 @@ class BenchArguments:
     The same command continues what was stopped; finished runs are kept.
     """
 
-    table: Positional[Literal["table1", "table2", "table3", "table4", "efficiency", "toy"]]
-    """table1 to table4: those of the paper; efficiency: its paragraph; toy: a small one in a minute or two."""
+    table: Positional[Literal["table1", "table2", "table3", "table4", "efficiency", "longer", "choices", "toy"]]
+    """table1 to table4: those of the paper; efficiency: its paragraph; longer: blocks that train two and four times as
+    long; choices: one choice of ours changed at a time; toy: a small one in a minute or two."""
     output: Path
     """Folder for runs and results; new, or the one to continue."""
     seeds: int | None = None
