@@ -43,6 +43,7 @@ from vdgs.bench.worker import STAGES, Job
 from vdgs.bench.writing import escape_latex, escape_markdown, latex, markdown, tidy_csv
 from vdgs.cameras import Camera
 from vdgs.captures.options import CaptureOptions
+from vdgs.config import PRESETS
 from vdgs.config_checks import validate
 from vdgs.errors import VdgsError
 from vdgs.verbs.benching import BenchArguments
@@ -76,7 +77,7 @@ def test_tables_name_what_exists(table):
     assert set(table.methods) <= METHODS.keys()
     assert set(table.scenes) <= SCENES.keys()
     assert table.ours in table.methods
-    assert [name for group in table.headings() for name in group.methods] == list(table.methods)
+    assert not table.groups or [name for group in table.groups for name in group.methods] == list(table.methods)
     plan = make_plan(table.name, Choices())
     assert plan.answers.keys() == {
         (scene, method, seed) for scene in table.scenes for method in table.methods for seed in table.seeds
@@ -110,6 +111,37 @@ def test_the_ablations_change_what_they_are_named_after():
     assert {name for name in TABLES["table4"].methods if settings[name] == base} == {
         "lambda-vis-1", "t-low-0.2", "beta-g-2", "gamma-0.9"
     }  # fmt: skip
+
+
+def test_blocks_as_printed_take_back_what_the_laptop_changes():
+    scene = SCENES["lab-uneven"]
+    base = scene.base(scene.budget, 0)
+    printed, paper = METHODS["printed"].settings(base, scene.budget), PRESETS["paper"]
+    assert printed != base
+    assert (printed.block.decoder, printed.block.sampling) == ("frozen", "even")
+    assert (printed.block.decoder, printed.block.sampling) == (paper.block.decoder, paper.block.sampling)
+    assert printed.assignment.threshold == paper.assignment.threshold == 0.45
+    assert printed.block.compensation == paper.block.compensation
+    alone = {
+        name: METHODS[name].settings(base, scene.budget)
+        for name in ("frozen-decoder", "even-sampling", "share-0.45")
+    }  # fmt: skip
+    assert alone["frozen-decoder"] == replace(base, block=replace(base.block, decoder="frozen"))
+    assert alone["even-sampling"] == replace(base, block=replace(base.block, sampling="even"))
+    assert alone["share-0.45"] == replace(base, assignment=replace(base.assignment, threshold=0.45))
+
+
+def test_methods_that_get_more_are_no_rivals():
+    plan = make_plan("longer", Choices(scenes=("lab-even",)))
+    results = [
+        Result("lab-even", name, seed, "done", figures={"psnr": psnr})
+        for name, psnr in (("baseline", 20.95), ("full", 21.0), ("longer-2", 22.0))
+        for seed in range(3)
+    ]
+    (line,) = verdict(plan, results)
+    assert line.answer is True
+    assert "longer" not in str(line)
+    assert "times as long" not in str(line)
 
 
 def test_a_sweep_of_t_low_is_not_overruled_by_the_quantile_of_the_laptop():

@@ -15,9 +15,12 @@ import torch
 
 from captures_support import tiny_scene, write_colmap
 from vdgs.anchors import AnchorModel
+from vdgs.decoder import Decoder
 from vdgs.partition.blocks import load_blocks
 from vdgs.partition.saving import load_scores
+from vdgs.run import RunFolder
 from vdgs.stages.block import places
+from vdgs.stages.evaluate import BlocksAlone
 from vdgs.stages.opening import open_run
 from vdgs.visibility import views_of
 
@@ -104,8 +107,39 @@ def test_the_merged_scene_is_the_cores_of_the_blocks(unbroken):
         assert all(torch.equal(own.tensors()[name], tensor) for name, tensor in part.tensors().items())
     coarse = AnchorModel.load(unbroken / "coarse/model.safetensors")
     assert len(merged.anchors) > len(coarse.anchors)
-    for name, tensor in coarse.decoder.tensors().items():
-        assert torch.equal(tensor, merged.decoder.tensors()[name])
+    assert bits(merged.decoder) == bits(coarse.decoder)
+    blocks_own = [AnchorModel.load(unbroken / f"blocks/{index:02d}/model.safetensors").decoder for index in range(2)]
+    assert [bits(part.decoder) for part in merged.parts] == [bits(own) for own in blocks_own]
+    assert len({tuple(bits(each).values()) for each in (coarse.decoder, *blocks_own)}) == 3
+
+
+def bits(decoder: Decoder) -> dict[str, bytes]:
+    return {name: tensor.detach().numpy().tobytes() for name, tensor in decoder.tensors().items()}
+
+
+def test_blocks_as_printed_leave_one_decoder(unbroken, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(unbroken, run)
+    trained = vdgs("train", run, "--block.decoder", "frozen", "--block.sampling", "even", "--redo", "--jobs", 1)
+    assert trained.returncode == 0, trained.stderr
+    assert vdgs("merge", run).returncode == 0
+    coarse, merged = AnchorModel.load(run / "coarse/model.safetensors"), AnchorModel.load(run / MERGED)
+    assert merged.parts == ()
+    assert bits(merged.decoder) == bits(coarse.decoder)
+    for index in range(2):
+        block = AnchorModel.load(run / f"blocks/{index:02d}/model.safetensors")
+        assert bits(block.decoder) == bits(coarse.decoder)
+        other = AnchorModel.load(unbroken / f"blocks/{index:02d}/model.safetensors")
+        assert bits(other.decoder) != bits(block.decoder)
+
+
+def test_a_block_alone_stands_among_coarse_anchors_with_the_coarse_decoder(unbroken):
+    run, coarse = RunFolder(unbroken), AnchorModel.load(unbroken / "coarse/model.safetensors")
+    alone = BlocksAlone(run, coarse).assembled(1)
+    own = AnchorModel.load(unbroken / "blocks/01/model.safetensors")
+    assert [part.count for part in alone.parts] == [len(own.anchors), len(alone.anchors) - len(own.anchors)]
+    assert [bits(part.decoder) for part in alone.parts] == [bits(own.decoder), bits(coarse.decoder)]
+    assert len(alone.anchors) > len(own.anchors)
 
 
 def test_cycles_of_compensated_growth_are_logged(unbroken):

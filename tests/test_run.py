@@ -1,14 +1,24 @@
 """The run folder refuses what would lose or mix results, and says why."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
-from vdgs.config import PRESETS, MethodConfig, TrainConfig, differences, from_dict, to_dict, with_iterations
+from vdgs.config import (
+    PRESETS,
+    BlockConfig,
+    MethodConfig,
+    TrainConfig,
+    differences,
+    from_dict,
+    to_dict,
+    with_iterations,
+)
 from vdgs.config_checks import validate
 from vdgs.errors import RunError
 from vdgs.run import RunFolder, StageFolder
-from vdgs.stages.keys import stage_keys
+from vdgs.stages.keys import SINCE, stage_keys
 
 
 def settings(**changes) -> dict:
@@ -159,3 +169,23 @@ def test_automatic_iterations_follow_the_number_of_photographs():
     automatic = TrainConfig(iterations=0)
     assert [with_iterations(automatic, views).iterations for views in (5, 145, 9000)] == [3000, 8700, 30_000]
     assert with_iterations(TrainConfig(iterations=7), 9000).iterations == 7
+
+
+def test_a_newer_version_takes_older_runs_as_they_are():
+    """Keys as the first version of them made them, which knew nothing of the settings that came later."""
+    settings = {"capture": {"images": None}} | to_dict(MethodConfig())
+    older = {name: dict(section) for name, section in settings.items()}
+    for section, names in SINCE.items():
+        for name in names:
+            del older[section][name]
+    assert stage_keys(settings, "model") == stage_keys(older, "model")
+    for section, names in SINCE.items():
+        for name in names:
+            changed = {**settings, section: {**settings[section], name: "other"}}
+            assert stage_keys(changed, "model") != stage_keys(settings, "model")
+
+
+def test_a_ramp_needs_a_frozen_decoder():
+    ramp = BlockConfig(ring="ramp", decoder="own")
+    assert any("ramp needs --block.decoder frozen" in each for each in validate(MethodConfig(block=ramp)))
+    assert validate(MethodConfig(block=replace(ramp, decoder="frozen"))) == []

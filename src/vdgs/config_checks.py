@@ -30,6 +30,10 @@ def validate(config: MethodConfig) -> list[str]:
             "assignment.tau must be positive, assignment.min_cameras not negative, "
             "assignment.longest_side_px at least 16"
         )
+    if block.ring == "ramp" and block.decoder == "own":
+        problems.append(
+            "block.ring ramp needs --block.decoder frozen: a decoder that moves changes anchors that should stay"
+        )
     if config.merge.rule == "best_seen" and block.ring == "frozen":
         problems.append("merge.rule best_seen needs --block.ring ramp or free: a frozen ring has nothing to offer")
     return problems

@@ -1,4 +1,4 @@
-"""The decoder shared by all anchors: three small MLPs (Scaffold-GS eqs. 5-8), and appearance.
+"""The decoder of all anchors, or of those of a block: three small MLPs (Scaffold-GS eqs. 5-8), and appearance.
 
 Each head has one hidden layer of 32 with ReLU. Inputs: the anchor's feature [32], the unit direction from the
 camera to the anchor [3] and, on request, their distance. An appearance embedding enters the colour head only;

@@ -43,7 +43,8 @@ def merge(
     that the rule gives to it. With `allow_missing` the coarse anchors stand in at places whose owner is None.
     Memory: one copy of the merged anchors beside the trained ones.
 
-    Raises VdgsError for a missing block (unless allowed), and for a block that was not trained from `coarse`.
+    Raises VdgsError for a missing block (unless allowed), and for a block that shows that it was not trained from
+    `coarse`: by its grid, or by other bits of a frozen decoder.
     """
     if not len(trained) == len(cameras_of_block) == len(blocks):
         raise ValueError(f"{len(trained)} models and {len(cameras_of_block)} camera lists for {len(blocks)} blocks")

@@ -124,6 +124,3 @@ class Table:
     groups: tuple[Group, ...] = ()
     #: The method that the verdict is about.
     ours: str = "full"
-
-    def headings(self) -> tuple[Group, ...]:
-        return self.groups or (Group("", self.methods),)

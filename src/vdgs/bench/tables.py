@@ -20,7 +20,7 @@ _SWEEPS = (
 )
 _ABLATION = ("coarse", "coarse-as-long", "baseline", "no-blocking", "no-anchor-generation", "printed", "full")
 
-#: Each departs from the full method in one choice.
+#: Each departs from the full method in one choice, or says beside it in what else.
 CHOICES = (
     "full", "frozen-decoder", "even-sampling", "share-0.45", "literal-assignment", "leave-one-out", "frustum",
     "no-context", "free-ring", "literal-gate", "cap",

@@ -42,7 +42,7 @@ def verdict(plan: Plan, results: Sequence[Result]) -> list[Line]:
         if scene.uneven:
             lines += [line for other in others for line in _uneven(scene.title, mine, ours, other, titles)]
         else:
-            lines.append(_even(scene.title, mine, ours, titles))
+            lines.append(_even(scene.title, mine, ours, {name: titles[name] for name in (ours, *fair)}))
     return lines
 
 

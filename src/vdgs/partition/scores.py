@@ -29,7 +29,7 @@ from vdgs.kernels.decode_types import Splats
 from vdgs.kernels.native.module import threads
 from vdgs.kernels.types import Raster
 from vdgs.partition.blocks import Blocks
-from vdgs.render import decode_rows, draw, visible_rows
+from vdgs.render import decode_view, draw
 
 #: A pixel is drawn where its alpha is above this.
 DRAWN_ALPHA = 0.5
@@ -176,8 +176,7 @@ def _rendered_scores(
     model: AnchorModel, members: _Members, camera: Camera, config: AssignmentConfig
 ) -> tuple[list[float], list[float]]:
     """The scores of one camera for every block in a mode that draws, and its covered shares."""
-    rows = visible_rows(model.anchors, camera)
-    splats = decode_rows(model.anchors, rows, model.decoder.for_image(None), camera)
+    rows, splats = decode_view(model, camera)
     anchor = rows[splats.source.long() // model.anchors.offsets.shape[1]]
     full = draw(splats, camera, torch.zeros(3))
     owner, reached = members.owner[anchor], members.reached[:, anchor]

@@ -67,7 +67,7 @@ def _forget(output: Path) -> None:
 def _evaluate_blocks(opened: TrainedRun) -> dict[str, Any]:
     run = opened.folder
     coarse, blocks = AnchorModel.load(run.coarse.model), blocks_of(run)
-    alone = _BlocksAlone(run, coarse)
+    alone = BlocksAlone(run, coarse)
     with cached_photographs(opened.capture.test_views) as photographs:
         return evaluate_blocks(
             photographs,
@@ -79,7 +79,7 @@ def _evaluate_blocks(opened: TrainedRun) -> dict[str, Any]:
         )
 
 
-class _BlocksAlone:
+class BlocksAlone:
     """Blocks as they were trained, before the merge: their own anchors among frozen coarse ones."""
 
     def __init__(self, run: RunFolder, coarse: AnchorModel):
@@ -94,13 +94,14 @@ class _BlocksAlone:
         if not self._done[index]:
             return None
         if index not in self._held:
-            self._held[index] = self._assemble(index)
+            self._held[index] = self.assembled(index)
             while len(self._held) > 1 and sum(_bytes(model) for model in self._held.values()) > HELD_BYTES:
                 self._held.popitem(last=False)
         self._held.move_to_end(index)
         return render(self._held[index], camera)
 
-    def _assemble(self, index: int) -> AnchorModel:
+    def assembled(self, index: int) -> AnchorModel:
+        """A block's own anchors and what stood around them in its training, each with its decoder."""
         own = AnchorModel.load(self._run.block(index).model)
         around = self._coarse.anchors.select(self._around[index])
         parts = Part(len(own.anchors), own.decoder), Part(len(around), self._coarse.decoder)

@@ -22,6 +22,14 @@ DEPENDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
+#: Settings that came after runs had been made without them, with the value that leaves those runs as they are: where a
+#: setting has it, keys do not mention it, so that a newer version takes older runs for finished, as they are.
+SINCE: dict[str, dict[str, Any]] = {
+    "training": {"sampling": "even"},
+    "block": {"sampling": "even", "decoder": "frozen"},
+}
+
+
 @dataclass(frozen=True)
 class StageKeys:
     """The key of every stage of a run."""
@@ -40,7 +48,16 @@ def stage_keys(settings: dict[str, Any], coarse_model: str | None = None) -> Sta
     keys: dict[str, str] = {}
     for stage, (sections, before) in DEPENDS.items():
         # Where the capture lies is not what it is: a capture that moved keeps its results.
-        own = {name: {k: v for k, v in settings[name].items() if (name, k) != ("capture", "path")} for name in sections}
+        own = {name: _counted(name, settings[name]) for name in sections}
         content = [own, *(keys[name] for name in before), *([coarse_model] if before == ("coarse",) else [])]
         keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
     return StageKeys(**keys)
+
+
+def _counted(section: str, settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings of a section that its key is made of."""
+    since = SINCE.get(section, {})
+    return {
+        name: value for name, value in settings.items()
+        if (section, name) != ("capture", "path") and not (name in since and value == since[name])
+    }  # fmt: skip

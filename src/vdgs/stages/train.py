@@ -15,15 +15,14 @@ from vdgs.errors import RunError, VdgsError
 from vdgs.executors.local import Job, default_jobs, run_jobs
 from vdgs.kernels.native.module import threads as threads_available
 from vdgs.memory import available_bytes
+from vdgs.memory_estimate import Need, estimate, in_gb
 from vdgs.run import RunFolder, StageFolder
 from vdgs.run_options import WatchOptions
 from vdgs.stages.block import blocks_of
 from vdgs.stages.watching import Stopped
 
-#: Rough memory of a process that trains a block: what is imported, and each anchor that it may hold once it has grown.
-PROCESS_BYTES, ANCHOR_BYTES, GROWTH = 400_000_000, 2_500, 2.0
-#: A frozen anchor around the block: its parameters alone.
-FROZEN_BYTES = 300
+#: Share of a block's anchors that one photograph may see, for the estimate before a block is opened (choice).
+SEEN = 0.5
 
 
 def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console, device: str = "cpu") -> None:
@@ -44,14 +43,22 @@ def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console,
             console.print(f"{path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
             return
         free = available_bytes()
-        at_once, threads = default_jobs(len(left), threads_available(), free, _block_bytes(run))
+        each = _block_bytes(run)
+        at_once, threads = default_jobs(len(left), threads_available(), free, each)
         if jobs:
             at_once, threads = min(jobs, len(left)), max(1, threads_available() // min(jobs, len(left)))
         budget = options.image_memory_gb or free / 4e9
         console.print(
-            f"{len(left)} of {len(blocks)} blocks to train, {at_once} at once with {threads} thread(s) each",
+            f"{len(left)} of {len(blocks)} blocks to train, {at_once} at once with {threads} thread(s) each; by estimate "
+            f"a block takes at most {in_gb(each)} beside its photographs, of {in_gb(free)} free",
             highlight=False,
         )
+        if at_once * each > free:
+            console.print(
+                f"[yellow]warning[/] {at_once} at once may run out of memory. What helps: less --jobs, more --blocks, "
+                "--block.growth.max-anchors",
+                highlight=False,
+            )
         began = time.monotonic()
         for index in left:
             _queue(run.block(index), key)
@@ -96,6 +103,11 @@ def _remove_beyond(run: RunFolder, count: int, console: Console) -> None:
 
 
 def _block_bytes(run: RunFolder) -> int:
-    """Memory that the largest block may need for its own anchors, once they have grown, and for those around it."""
-    anchors = [each["anchors_core"] for each in run.partition_facts()["blocks"]]
-    return int(PROCESS_BYTES + ANCHOR_BYTES * GROWTH * max(anchors) + FROZEN_BYTES * sum(anchors))
+    """Memory by estimate that the largest block needs for the program, its anchors once they have grown, and those
+    around it. Photographs have a budget of their own."""
+    method, anchors = run.method(), [each["anchors_core"] for each in run.partition_facts()["blocks"]]
+    need = Need(
+        anchors=max(anchors), max_anchors=method.block.growth.max_anchors, offsets=method.training.anchors.offsets,
+        seen=SEEN, pixels=0, images_bytes=0, surroundings=sum(anchors) - max(anchors),
+    )  # fmt: skip
+    return estimate(need).total

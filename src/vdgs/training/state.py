@@ -73,7 +73,7 @@ class Stage:
     camera_height: float
     #: Colour behind the scene.
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    #: A block leaves the decoder as it is.
+    #: A block may leave the decoder as it is.
     frozen_decoder: bool = False
     #: What is drawn and never moves: ring and context of a block.
     surroundings: Surroundings | None = None
@@ -105,8 +105,10 @@ class StepReport:
 def start_state(anchors: Anchors, decoder: Decoder, stage: Stage) -> TrainingState:
     """A state before the first step. The anchors' tensors are moved in place: give copies of what must stay."""
     n, k = len(anchors), anchors.offsets.shape[1]
-    for tensor in decoder.tensors().values():
-        tensor.requires_grad_(not stage.frozen_decoder)
+    for name, tensor in decoder.tensors().items():
+        # A block sees some of the photographs: the mean appearance, in which others are drawn, must not drift apart.
+        shared = stage.surroundings is not None and name.startswith("appearance")
+        tensor.requires_grad_(not stage.frozen_decoder and not shared)
     compensation = Compensation.zeros(n, k) if stage.config.compensation.enabled else None
     optimiser = Optimiser.start(anchors, decoder)
     return TrainingState(0, anchors, decoder, Statistics.zeros(n, k), optimiser, compensation)
