@@ -49,8 +49,8 @@ def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console,
             at_once, threads = min(jobs, len(left)), max(1, threads_available() // min(jobs, len(left)))
         budget = options.image_memory_gb or free / 4e9
         console.print(
-            f"{len(left)} of {len(blocks)} blocks to train, {at_once} at once with {threads} thread(s) each; by estimate "
-            f"a block takes at most {in_gb(each)} beside its photographs, of {in_gb(free)} free",
+            f"{len(left)} of {len(blocks)} blocks to train, {at_once} at once with {threads} thread(s) each; by "
+            f"estimate a block takes at most {in_gb(each)} beside its photographs, of {in_gb(free)} free",
             highlight=False,
         )
         if at_once * each > free:
