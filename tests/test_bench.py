@@ -372,7 +372,7 @@ def models(output: Path) -> dict[Path, int]:
 
 
 def test_a_bench_that_was_killed_continues_to_its_tables(benched):
-    results = json.loads((benched / "results.json").read_text())
+    results = json.loads((benched / "toy" / "results.json").read_text())
     assert [(each["method"], each["state"]) for each in results["results"]] == [("baseline", "done"), ("full", "done")]
     assert {each["figures"]["iterations"] for each in results["results"]} == {60}
     for each in results["results"]:
@@ -381,8 +381,9 @@ def test_a_bench_that_was_killed_continues_to_its_tables(benched):
         assert each["figures"]["seconds"] > 0
     groups = [each["groups"] for each in results["results"]]
     assert groups[0] == groups[1]  # the same pixels
-    assert "**" in (benched / "table.md").read_text()
-    assert all((benched / name).stat().st_size for name in ("table.tex", "table.csv", "verdict.txt", "groups.png"))
+    assert "**" in (benched / "toy" / "table.md").read_text()
+    for name in ("table.tex", "table.csv", "verdict.txt", "groups.png"):
+        assert (benched / "toy" / name).stat().st_size
     assert len(results["verdict"]) == 2
 
 
@@ -409,7 +410,7 @@ def test_other_settings_do_not_discard_what_is_trained(benched):
 
 
 def test_generated_scenes_are_grouped_by_the_true_visibility(benched):
-    results = json.loads((benched / "results.json").read_text())["results"]
+    results = json.loads((benched / "toy" / "results.json").read_text())["results"]
     assert {each["seen_by"] for each in results} == {"truth"}
     root = benched / "captures" / "tiny"
     seen = seen_truly(root, CaptureOptions())
@@ -420,8 +421,8 @@ def test_generated_scenes_are_grouped_by_the_true_visibility(benched):
     assert sum(group["pixels"] for group in groups) == np.isfinite(counted).sum() < len(counted)
     for group in groups:
         assert ((counted >= group["lower"]) & (counted <= group["upper"])).sum() == group["pixels"]
-    assert "truly see the surface" in (benched / "table.md").read_text()
-    assert f"(V {groups[0]['lower']:g} to {groups[0]['upper']:g})" in (benched / "verdict.txt").read_text()
+    assert "truly see the surface" in (benched / "toy" / "table.md").read_text()
+    assert f"(V {groups[0]['lower']:g} to {groups[0]['upper']:g})" in (benched / "toy" / "verdict.txt").read_text()
 
 
 def test_the_truth_is_that_of_the_views_that_are_used(benched):
@@ -459,9 +460,10 @@ def test_without_truth_pixels_are_grouped_anew_by_a_model(benched, tmp_path):
     before, said = models(copy), io.StringIO()
     by_model = run_bench(settings(copy), Console(file=said))
     assert {each.seen_by for each in by_model} == {"model"}
-    assert by_model[0].groups != tuple(json.loads((benched / "results.json").read_text())["results"][0]["groups"])
+    by_truth = json.loads((benched / "toy" / "results.json").read_text())["results"][0]
+    assert by_model[0].groups != tuple(by_truth["groups"])
     assert models(copy) == before
-    assert "one coarse model draws" in (copy / "table.md").read_text()
+    assert "one coarse model draws" in (copy / "toy" / "table.md").read_text()
 
 
 def test_one_bench_at_a_time_in_a_folder(tmp_path):

@@ -106,7 +106,7 @@ def test_it_stands_beside_methods_with_anchors(data, tmp_path, monkeypatch):
         assert explicit[name] is not None, name
     assert both["3dgs"].groups == both["scaffold-gs"].groups  # the same pixels
     assert both["3dgs"].seen_by == "model"
-    text = (tmp_path / "table.md").read_text()
+    text = (tmp_path / "table1" / "table.md").read_text()
     assert "3DGS has no anchors" in text
     assert "3,000, as many as they decode to" in text
 

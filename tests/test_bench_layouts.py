@@ -69,7 +69,7 @@ def test_the_published_data_sets_are_benched(data, tmp_path, monkeypatch):
     with pytest.raises(SystemExit) as ended:
         main(["bench", "table1", "--output", str(tmp_path), "--data", str(data), *asked, "--seeds", "1"])
     assert ended.value.code == 0
-    results = json.loads((tmp_path / "results.json").read_text())["results"]
+    results = json.loads((tmp_path / "table1" / "results.json").read_text())["results"]
     assert [(each["scene"], each["method"], each["state"]) for each in results] == [
         (scene, method, "done") for scene in ("residence", "block-all") for method in ("3dgs", "blocks-2")
     ]

@@ -4,7 +4,7 @@ OUTPUT/
   captures/SCENE/             what was generated
   runs/SCENE/METHOD/SEED/     ordinary run folders; shared-coarse-…: coarse stages of several runs
   jobs/                       what each process was told, and what it said
-  results.json table.md table.tex table.csv verdict.txt groups.png
+  TABLE/                      results.json table.md table.tex table.csv verdict.txt groups.png
 """
 
 from __future__ import annotations
@@ -238,7 +238,8 @@ def _seen(plan: Plan, scene: Scene, capture: Path, ended: Mapping[str, Ended], s
 
 
 def _write(plan: Plan, results: list[Result], settings: BenchSettings, console: Console) -> None:
-    output, grids, lines = settings.output, grids_of(plan, results), verdict(plan, results)
+    output, grids, lines = settings.output / plan.table.name, grids_of(plan, results), verdict(plan, results)
+    output.mkdir(exist_ok=True)
     write_json(
         output / "results.json",
         {
