@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import psutil
 import pytest
 import torch
 from hypothesis import given
