@@ -131,6 +131,15 @@ def test_blocks_as_printed_take_back_what_the_laptop_changes():
     assert alone["share-0.45"] == replace(base, assignment=replace(base.assignment, threshold=0.45))
 
 
+@pytest.mark.parametrize(("validation", "views"), [(False, "Test views"), (True, "Validation views")])
+def test_a_table_says_which_views_it_is_measured_on(validation, views):
+    results = made({}, seeds=1)
+    plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full"), validation=validation))
+    titles = [grid.title for grid in grids_of(plan, results)]
+    assert titles[0].startswith(f"{views}, raw")
+    assert titles[1].startswith(f"{views}, colour-corrected")
+
+
 def test_methods_that_get_more_are_no_rivals():
     plan = make_plan("longer", Choices(scenes=("lab-even",)))
     results = [

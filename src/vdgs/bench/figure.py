@@ -46,7 +46,7 @@ def draw_groups(file: Path, plan: Plan, results: Sequence[Result]) -> bool:
                   frameon=False, fontsize=9)  # fmt: skip
     bars = "bars: standard deviation over seeds" if len(plan.seeds) > 1 else "one seed"
     titles(figure, plan.table.title, "PSNR by how many training cameras see the place (raw, dB)",
-           f"the same pixels of all test views for every method; {bars}")  # fmt: skip
+           f"the same pixels for every method; {bars}")  # fmt: skip
     canvas.print_png(file)  # type: ignore[arg-type]
     return True
 

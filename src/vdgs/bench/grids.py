@@ -86,9 +86,10 @@ SEEN_BY = {
 def grids_of(plan: Plan, results: Sequence[Result]) -> list[Grid]:
     """Quality raw and corrected over all scenes; by visibility and cost for each scene; the paper's own numbers."""
     across = "mean ± standard deviation over seeds" if len(plan.seeds) > 1 else "one seed"
+    views = "Validation views" if plan.validation else "Test views"
     grids = [
-        _measured(plan, results, "raw", f"Test views, raw ({across})", _for_scenes(plan, QUALITY)),
-        _measured(plan, results, "corrected", f"Test views, colour-corrected ({across})", _for_scenes(plan, CORRECTED)),
+        _measured(plan, results, "raw", f"{views}, raw ({across})", _for_scenes(plan, QUALITY)),
+        _measured(plan, results, "corrected", f"{views}, colour-corrected ({across})", _for_scenes(plan, CORRECTED)),
     ]
     for scene in plan.scenes:
         mine = [result for result in results if result.scene == scene.name]
@@ -127,7 +128,7 @@ def _group_columns(results: Sequence[Result], scene: str) -> tuple[list[Column],
     ]
     if of is None:
         return columns, ()
-    return columns, (f"V: {SEEN_BY[of.seen_by]}. Pooled over all test views: {all_bounds_of(of)}.",)
+    return columns, (f"V: {SEEN_BY[of.seen_by]}. Pooled over all these views: {all_bounds_of(of)}.",)
 
 
 def all_bounds_of(result: Result) -> str:

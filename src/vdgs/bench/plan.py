@@ -74,6 +74,8 @@ class Plan:
     answers: Mapping[tuple[str, str, int], PlannedRun]
     #: Most anchors of a scene; 0 for no limit.
     max_anchors: int = 0
+    #: Measured on held-out training views instead of on the test views.
+    validation: bool = False
 
     def reference(self, scene: str) -> PlannedRun | None:
         """The run whose coarse model says how often each pixel of the scene is seen, for all methods and seeds; None
@@ -104,7 +106,10 @@ def make_plan(name: str, choices: Choices) -> Plan:
                 same = taken.setdefault(run.key({}, {}), run)
                 answers[scene.name, run.method, seed] = same
             runs += taken.values()
-    return Plan(table, scenes, methods, seeds, budgets, tuple(coarse), tuple(runs), answers, choices.max_anchors)
+    return Plan(
+        table, scenes, methods, seeds, budgets, tuple(coarse), tuple(runs), answers, choices.max_anchors,
+        choices.validation,
+    )  # fmt: skip
 
 
 def _named(known: Mapping[str, Any], name: str, kind: str) -> Any:
