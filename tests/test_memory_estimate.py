@@ -32,6 +32,7 @@ needs = st.builds(
     pixels=st.integers(1, 10**8),
     images_bytes=st.integers(0, 10**11),
     surroundings=st.integers(0, 10**7),
+    averaged=st.booleans(),
 )
 
 
@@ -50,6 +51,14 @@ def test_what_is_more_takes_more(need):
     assert estimate(replace(need, max_anchors=need.anchors)).total == estimate(replace(need, max_anchors=1)).total
 
 
+@given(needs)
+def test_a_mean_of_models_takes_one_more_model(need):
+    plain, averaged = (estimate(replace(need, averaged=each)) for each in (False, True))
+    assert averaged.start == plain.start
+    more = averaged.total - plain.total
+    assert more == pytest.approx(4 * (3 + 32 + 6 + 3 * need.offsets) * need.grown, abs=1, rel=1e-9)
+
+
 @pytest.mark.parametrize("kind", ["coarse", "block"])
 @given(need=needs, share=st.floats(0.01, 0.9))
 def test_advice_is_worth_its_words(kind, need, share):
@@ -61,8 +70,9 @@ def test_advice_is_worth_its_words(kind, need, share):
         assert "--" in each.setting
 
 
-def test_the_limit_of_anchors_makes_it_fit():
-    need = Need(1_000_000, 0, 10, 0.4, 10**6, 10**8)
+@pytest.mark.parametrize("averaged", [False, True])
+def test_the_limit_of_anchors_makes_it_fit(averaged):
+    need = Need(1_000_000, 0, 10, 0.4, 10**6, 10**8, averaged=averaged)
     missing = 10**9
     (limit,) = [each for each in advice(need, "coarse", missing) if "max-anchors" in each.setting]
     given = int(limit.setting.split()[1])

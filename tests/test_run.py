@@ -8,6 +8,7 @@ import pytest
 from vdgs.config import (
     PRESETS,
     BlockConfig,
+    GrowthConfig,
     MethodConfig,
     TrainConfig,
     differences,
@@ -189,3 +190,14 @@ def test_a_ramp_needs_a_frozen_decoder():
     ramp = BlockConfig(ring="ramp", decoder="own")
     assert any("ramp needs --block.decoder frozen" in each for each in validate(MethodConfig(block=ramp)))
     assert validate(MethodConfig(block=replace(ramp, decoder="frozen"))) == []
+
+
+@pytest.mark.parametrize(
+    ("average", "until", "problems"), [(0.0, 1.0, 0), (0.3, 0.99, 0), (0.3, 1.0, 1), (1.0, 0.5, 1), (-0.1, 0.5, 1)]
+)
+def test_a_mean_needs_an_end_of_growth(average, until, problems):
+    growth = GrowthConfig(until=until)
+    coarse = MethodConfig(training=TrainConfig(average=average, growth=growth))
+    block = MethodConfig(block=BlockConfig(average=average, growth=growth))
+    assert [len(validate(each)) for each in (coarse, block)] == [problems, problems]
+    assert all("growth.until" in each or "average is" in each for each in validate(coarse) + validate(block))

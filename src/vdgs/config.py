@@ -138,6 +138,9 @@ class TrainConfig:
     (choice)."""
     resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
     """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
+    average: float = 0.0
+    """The stage ends with the mean of the models of this last share of its iterations, after growth; 0 for the very
+    last model (choice)."""
     seed: int = 0
     """Everything random follows from it: on the CPU the same seed gives the same bits."""
     anchors: AnchorConfig = field(default_factory=AnchorConfig)
@@ -208,6 +211,8 @@ class BlockConfig:
     block are used little."""
     resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
     """Resolution schedule, as in the coarse stage."""
+    average: float = 0.0
+    """As in the coarse stage."""
     offset_rate: float = 0.4
     """The rates of the coarse stage start again, those of offsets times this."""
     scale_rate: float = 0.8
@@ -272,6 +277,7 @@ def block_training(config: MethodConfig, views: int) -> TrainConfig:
         config.training,
         iterations=max(1, round(scale * (block.iterations or _steps(views, *BLOCK_STEPS)))),
         sampling=block.sampling,
+        average=block.average,
         resolutions=block.resolutions,
         rates=replace(
             rates,

@@ -39,6 +39,8 @@ class Need:
     images_bytes: int
     #: Anchors that are drawn but never move.
     surroundings: int = 0
+    #: Whether training ends with a mean of models, which is kept beside the grown anchors.
+    averaged: bool = False
 
     @property
     def grown(self) -> int:
@@ -80,18 +82,28 @@ class Advice:
 
 def bytes_per_anchor(offsets: int, seen: float) -> float:
     """Parameters, two moments and statistics of an anchor, and what steps make of the share that is in view."""
-    kept = 4 * (3 * (PLAIN_FLOATS + 3 * offsets) + 2 * offsets + 2)
+    kept = 3 * bytes_of_model(offsets) + 4 * (2 * offsets + 2)
     return kept + seen * STEP_BYTES_PER_OFFSET * offsets
+
+
+def bytes_of_model(offsets: int) -> int:
+    """Parameters of an anchor alone."""
+    return 4 * (PLAIN_FLOATS + 3 * offsets)
+
+
+def _per_grown_anchor(need: Need) -> float:
+    mean = bytes_of_model(need.offsets) if need.averaged else 0
+    return bytes_per_anchor(need.offsets, need.seen) + mean
 
 
 def estimate(need: Need) -> Estimate:
     """What training takes, at its start and once its anchors have grown."""
-    each = bytes_per_anchor(need.offsets, need.seen)
     in_view = need.seen * STEP_BYTES_PER_OFFSET * need.offsets
-    frozen = need.surroundings * (4 * (PLAIN_FLOATS + 3 * need.offsets) + in_view)
+    frozen = need.surroundings * (bytes_of_model(need.offsets) + in_view)
+    start = bytes_per_anchor(need.offsets, need.seen) * need.anchors
     return Estimate(
         PROGRAM_BYTES, need.images_bytes, BYTES_PER_PIXEL * need.pixels,
-        round(each * need.anchors + frozen), round(each * need.grown + frozen),
+        round(start + frozen), round(_per_grown_anchor(need) * need.grown + frozen),
     )  # fmt: skip
 
 
@@ -122,7 +134,7 @@ def advice(need: Need, kind: Kind, to_save: int) -> list[Advice]:
 def _fewer_anchors(need: Need, kind: Kind, to_save: int) -> Advice:
     """A limit of anchors that saves `to_save` bytes, if one does: growth can be forbidden, but no anchor removed."""
     option = "--growth.max-anchors" if kind == "coarse" else "--block.growth.max-anchors"
-    too_many = to_save / bytes_per_anchor(need.offsets, need.seen)
+    too_many = to_save / _per_grown_anchor(need)
     limit = max(need.anchors, int(need.grown - too_many) // 1000 * 1000, 1)
     saved = estimate(need).total - estimate(replace(need, max_anchors=limit)).total
     return Advice(f"{option} {limit} (less growth)", saved)

@@ -109,8 +109,7 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
         )
         train_watched(folder, state, stage, options, console)
     model = AnchorModel(
-        state.anchors,
-        state.decoder,
+        *state.result(),
         coarse.voxel,
         coarse.background,
         facts | {"iterations": state.iteration, "decoder": method.block.decoder},

@@ -145,7 +145,7 @@ def _train(run: RunFolder, capture: Capture, config: TrainConfig, options: Watch
         _announce(capture, state, config, console)
         train_watched(folder, state, stage, options, console)
     facts = {"capture": capture_facts(capture), "version": __version__, "iterations": state.iteration}
-    finish(folder, state, AnchorModel(state.anchors, state.decoder, voxel, background, facts), console)
+    finish(folder, state, AnchorModel(*state.result(), voxel, background, facts), console)
 
 
 def _start(anchors: Anchors, stage: Stage) -> TrainingState:

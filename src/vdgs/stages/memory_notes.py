@@ -42,6 +42,7 @@ def need_of(state: TrainingState, stage: Stage) -> Need:
         pixels=max(pixels),
         images_bytes=min(photographs, getattr(stage.images, "budget_bytes", photographs)),
         surroundings=0 if stage.surroundings is None else len(stage.surroundings.anchors),
+        averaged=config.average > 0,
     )
 
 

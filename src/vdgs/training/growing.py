@@ -59,6 +59,8 @@ def reorder(state: TrainingState) -> None:
     order = kernels.morton_order(state.anchors.positions)
     if state.compensation is not None:
         state.compensation = state.compensation.select(order)
+    if state.average is not None:
+        state.average.reorder(order)
     _rebuild(state, state.anchors.select(order[:0]), order)
 
 

@@ -20,6 +20,7 @@ from vdgs.kernels.decode_types import DecoderWeights, SplatGradients, Splats
 from vdgs.optimiser import rates_at
 from vdgs.render import decode_rows, visible_rows
 from vdgs.step import draw_view, move_anchors
+from vdgs.training.averaging import Average, counts_in_mean
 from vdgs.training.background import background_at
 from vdgs.training.growing import grow, reorder
 from vdgs.training.schedule import downscale_at, view_at
@@ -75,6 +76,8 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
         report = replace(report, **grow(state, stage))
     if state.iteration % REORDER_INTERVAL == 0:
         reorder(state)
+    if counts_in_mean(state.iteration, config):
+        _average(state)
     _smooth(state, value, psnr)
     state.whole = True
     return report
@@ -110,6 +113,14 @@ def _move(
     finite &= state.optimiser.update_decoder(state.decoder, rates, step)
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")
+
+
+def _average(state: TrainingState) -> None:
+    """Count the model in the mean that the stage ends with."""
+    if state.average is None:
+        state.average = Average.of(state.anchors, state.decoder)
+    else:
+        state.average.add(state.anchors, state.decoder)
 
 
 def _psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float | None:

@@ -20,6 +20,7 @@ from vdgs.config import TrainConfig
 from vdgs.decoder import Decoder
 from vdgs.growth import Statistics
 from vdgs.optimiser import Moments, Optimiser
+from vdgs.training.averaging import Average
 
 
 @runtime_checkable
@@ -42,6 +43,8 @@ class TrainingState:
     optimiser: Optimiser
     #: Remembered gradients of compensated growth; None where growth is plain.
     compensation: Compensation | None = None
+    #: Mean of the last models, once it has begun (`averaging.counts_in_mean`).
+    average: Average | None = None
     #: Smoothed loss, the smallest it has been, smoothed PSNR of training views.
     loss: float = math.nan
     best_loss: float = math.inf
@@ -51,6 +54,15 @@ class TrainingState:
     peak_memory_bytes: int = 0
     #: False while a step changes tensors: one that is broken off there leaves no state that may be saved.
     whole: bool = True
+
+    def result(self) -> tuple[Anchors, Decoder]:
+        """What training has arrived at: the mean of the last models where there is one, else the last one."""
+        if self.average is None:
+            return self.anchors, self.decoder
+        return (
+            Anchors(self.anchors.positions, **self.average.anchors),
+            Decoder.from_tensors(self.average.decoder),
+        )
 
 
 @dataclass(frozen=True)
@@ -124,8 +136,12 @@ def to_saved(state: TrainingState) -> SavedState:
         tensors |= {f"second.{group}.{k}": v for k, v in moments.second.items()}
     if state.compensation is not None:
         tensors |= {f"compensation.{k}": v for k, v in state.compensation.tensors().items()}
+    if state.average is not None:
+        tensors |= {f"average.anchors.{k}": v for k, v in state.average.anchors.items()}
+        tensors |= {f"average.decoder.{k}": v for k, v in state.average.decoder.items()}
     facts = {"loss": repr(state.loss), "best_loss": repr(state.best_loss), "psnr": repr(state.psnr),
-             "seconds": state.seconds, "peak_memory_bytes": state.peak_memory_bytes}  # fmt: skip
+             "seconds": state.seconds, "peak_memory_bytes": state.peak_memory_bytes,
+             "averaged": 0 if state.average is None else state.average.count}  # fmt: skip
     return SavedState(state.iteration, facts, tensors)
 
 
@@ -145,6 +161,8 @@ def from_saved(saved: SavedState, stage: Stage) -> TrainingState:
     )
     if state.compensation is not None:
         state.compensation = Compensation(**part("compensation."))
+    if averaged := saved.facts.get("averaged", 0):
+        state.average = Average(averaged, part("average.anchors."), part("average.decoder."))
     state.iteration = saved.iteration
     state.loss, state.best_loss = float(saved.facts["loss"]), float(saved.facts["best_loss"])
     state.psnr, state.seconds = float(saved.facts["psnr"]), float(saved.facts["seconds"])
