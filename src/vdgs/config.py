@@ -99,7 +99,8 @@ class CompensationConfig:
     """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on
     a large scene nearly every anchor is below a fixed share)."""
     beta_g: float = 2.0
-    """beta_g: weight of a cycle's mean gradient in the cache g."""
+    """beta_g: weight of a cycle's mean gradient in the cache g (choice: with 1 - gamma g is a mean over cycles; the
+    paper's 2 makes it a sum that grows to twenty times the gradients it is made of)."""
     gamma: float = 0.9
     """gamma: decay of the cache g from cycle to cycle."""
     gate: Literal["scaled", "literal"] = "scaled"
@@ -304,6 +305,7 @@ PRESETS: dict[str, MethodConfig] = {
     "laptop": MethodConfig(
         training=TrainConfig(
             iterations=0,
+            average=0.4,
             resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
             growth=GrowthConfig(statistics_from=300, start=500, until=0.6, threshold=1e-4),
         ),
@@ -312,9 +314,14 @@ PRESETS: dict[str, MethodConfig] = {
         block=BlockConfig(
             iterations=0,
             sampling="shares",
+            resolutions=((0.0, 2), (0.3, 1)),
+            average=0.5,
+            offset_rate=2.0,
+            scale_rate=2.0,
+            feature_rate=2.0,
             decoder="own",
             growth=GrowthConfig(statistics_from=0, start=100, threshold=1e-4),
-            compensation=CompensationConfig(t_low_quantile=0.25),
+            compensation=CompensationConfig(t_low_quantile=0.25, beta_g=0.1),
         ),
     ),
 }

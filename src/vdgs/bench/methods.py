@@ -16,7 +16,8 @@ from vdgs.config import CompensationConfig, MethodConfig, PartitionStrategy
 
 LAMBDA_VIS = (0.0, 0.5, 1.0, 1.3)
 T_LOW = (0.05, 0.15, 0.20, 0.30)
-BETA_G = (0.5, 1.5, 2.0, 3.0)
+#: The paper's, and 1 - gamma, with which the cache is a mean over cycles and no sum.
+BETA_G = (0.1, 0.5, 1.5, 2.0, 3.0)
 GAMMA = (0.80, 0.90, 0.95)
 BLOCKS = (1, 2, 4, 8, 16)
 
@@ -51,15 +52,22 @@ def without_anchor_generation(config: MethodConfig, _budget: Budget) -> MethodCo
 
 
 def as_printed(config: MethodConfig, _budget: Budget) -> MethodConfig:
-    """What the paper says of blocks, in place of the preset's own choices: frozen decoder, every photograph used alike,
-    cameras above a share of 0.45, a fixed T_low of 0.20."""
-    plain = MethodConfig()
-    config = _compensated(config, t_low=plain.block.compensation.t_low, t_low_quantile=0.0)
+    """What the paper says of blocks, in place of the preset's own choices: frozen decoder, every photograph used alike
+    and at its full size, damped rates, the last model and no mean, cameras above a share of 0.45, its compensation."""
+    plain, scene = MethodConfig(), config.block
     return replace(
         config,
         assignment=replace(config.assignment, threshold=plain.assignment.threshold),
-        block=replace(config.block, decoder=plain.block.decoder, sampling=plain.block.sampling),
+        block=replace(
+            plain.block, iterations=scene.iterations, scale_iterations=scene.scale_iterations, growth=scene.growth
+        ),
     )
+
+
+def with_printed_compensation(config: MethodConfig, **values: float) -> MethodConfig:
+    """The paper's compensation, with other values where they are given."""
+    printed = replace(CompensationConfig(), **values)  # type: ignore[arg-type]
+    return replace(config, block=replace(config.block, compensation=printed))
 
 
 def with_longer_blocks(factor: int) -> Change:
@@ -98,15 +106,15 @@ def with_lambda_vis(value: float) -> Change:
 
 def with_t_low(value: float) -> Change:
     """A fixed T_low, as in the paper: never the quantile that the preset `laptop` takes instead."""
-    return lambda config, _: _compensated(config, t_low=value, t_low_quantile=0.0)
+    return lambda config, _: with_printed_compensation(config, t_low=value)
 
 
 def with_beta_g(value: float) -> Change:
-    return lambda config, _: _compensated(config, beta_g=value)
+    return lambda config, _: with_printed_compensation(config, beta_g=value)
 
 
 def with_gamma(value: float) -> Change:
-    return lambda config, _: _compensated(config, gamma=value)
+    return lambda config, _: with_printed_compensation(config, gamma=value)
 
 
 def with_literal_gate(config: MethodConfig, _budget: Budget) -> MethodConfig:
@@ -146,8 +154,10 @@ def _compensated(config: MethodConfig, **values: float | bool | str) -> MethodCo
     return replace(config, block=replace(config.block, compensation=changed))
 
 
-def _sweep(prefix: str, symbol: str, values: tuple[float, ...], change: Callable[[float], Change]) -> list[Method]:
-    return [Method(f"{prefix}-{value:g}", f"{symbol} = {value:g}", change(value)) for value in values]
+def _sweep(
+    prefix: str, symbol: str, values: tuple[float, ...], change: Callable[[float], Change], differs: str = ""
+) -> list[Method]:
+    return [Method(f"{prefix}-{value:g}", f"{symbol} = {value:g}", change(value), differs=differs) for value in values]
 
 
 #: What the partitions leave out beyond what `partition.strategies` says of each.
@@ -180,7 +190,8 @@ _ABLATIONS = [
         "VDGS, blocks as printed",
         as_printed,
         cites="VDGS, sections III-B and III-C",
-        differs="the paper's frozen decoder, even use of photographs, share of 0.45, T_low = 0.20; all else as `full`",
+        differs="blocks of the paper: frozen decoder, even use of photographs, damped rates, full size, no mean of "
+        "models, share of 0.45, its compensation; coarse stage and cut as `full`",
     ),
     Method("no-blocking", "w/o blocking", without_blocking, cites="VDGS, Table II (b)"),
     Method("no-anchor-generation", "w/o anchor generation", without_anchor_generation, cites="VDGS, Table II (c)"),
@@ -236,16 +247,26 @@ _CHOICES = [
         "frustum", "cameras by frusta", with_assignment(mode="frustum"),
         differs="the share is one of the block's anchors, not of pixels",
     ),
+    Method(
+        "printed-rates", "damped rates, as printed", with_block(offset_rate=0.4, scale_rate=0.8, feature_rate=1.0)
+    ),
+    Method("full-size", "full size throughout", with_block(resolutions=((0.0, 1),))),
+    Method("last-model", "the last model, no mean", with_block(average=0.0)),
+    Method(
+        "printed-compensation", "compensation as printed", lambda config, _: with_printed_compensation(config),
+        differs="T_low = 0.20, β_g = 2, γ = 0.9",
+    ),
     Method("no-context", "without context", with_block(context=False)),
     Method("free-ring", "free ring", with_block(ring="free")),
     Method("literal-gate", "literal gate", with_literal_gate),
     Method("cap", "g capped at 4 thresholds", with_cap(4)),
 ]  # fmt: skip
+_AS_PRINTED = "all other settings of compensation are the paper's"
 _SWEEPS = [
     *_sweep("lambda-vis", "λ_vis", LAMBDA_VIS, with_lambda_vis),
-    *_sweep("t-low", "T_low", T_LOW, with_t_low),
-    *_sweep("beta-g", "β_g", BETA_G, with_beta_g),
-    *_sweep("gamma", "γ", GAMMA, with_gamma),
+    *_sweep("t-low", "T_low", T_LOW, with_t_low, _AS_PRINTED),
+    *_sweep("beta-g", "β_g", BETA_G, with_beta_g, _AS_PRINTED),
+    *_sweep("gamma", "γ", GAMMA, with_gamma, _AS_PRINTED),
 ]
 
 #: Every method by name.

@@ -22,7 +22,8 @@ _ABLATION = ("coarse", "coarse-as-long", "baseline", "no-blocking", "no-anchor-g
 
 #: Each departs from the full method in one choice, or says beside it in what else.
 CHOICES = (
-    "full", "frozen-decoder", "even-sampling", "share-0.45", "literal-assignment", "leave-one-out", "frustum",
+    "full", "frozen-decoder", "even-sampling", "printed-rates", "full-size", "last-model", "no-anchor-generation",
+    "printed-compensation", "share-0.45", "literal-assignment", "leave-one-out", "frustum",
     "no-context", "free-ring", "literal-gate", "cap",
 )  # fmt: skip
 
