@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 
 from vdgs.config import PartitionConfig
 from vdgs.errors import VdgsError
+from vdgs.memory_estimate import BYTES_PER_PIXEL, GROWTH, STEP_BYTES_PER_OFFSET, bytes_of_model, bytes_per_anchor
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.boundary import cores_of, widen
 from vdgs.partition.cluster import cluster, features_of, refuse_too_many
@@ -17,11 +18,11 @@ from vdgs.partition.plane import principal_plane
 LEAST_SHARE = 0.05
 
 #: What `--blocks auto` reckons with (choices): the paper's number of blocks, photographs that an average block needs,
-#: bytes in training per anchor of the block and of the scene about it, per pixel, and growth of a block in training.
+#: Gaussians of an anchor, and the share of the scene about a block that one photograph sees.
 USUAL_BLOCKS = 8
 CAMERAS_PER_BLOCK = 50
-BYTES_PER_ANCHOR, BYTES_PER_CONTEXT_ANCHOR, BYTES_PER_PIXEL = 4_000, 1_000, 200
-ANCHOR_GROWTH = 3
+OFFSETS = 10
+CONTEXT_SEEN = 0.5
 
 
 def cut_scene(
@@ -66,17 +67,17 @@ def cut_scene(
 def choose_block_count(n_anchors: int, n_cameras: int, image_pixels: int, config: PartitionConfig) -> int:
     """The number of blocks that `config` asks for; for "auto" it follows from the scene and the memory.
 
-    Choice: the paper's eight blocks, or as many as keep a block within `block_memory_gb` in training, where a block's
-    anchors grow threefold and the rest of the scene stands about it; but never fewer than 50 photographs for an average
-    block (33 photographs make 1 block, 145 make 2, 400 and more make 8).
+    Choice: the paper's eight blocks, or as many as keep a block within `block_memory_gb` in training by
+    `memory_estimate`, with the rest of the scene about it and all of its own anchors in view; but never fewer than 50
+    photographs for an average block (33 photographs make 1 block, 145 make 2, 400 and more make 8).
     """
     if not config.blocking:
         return 1
     if config.blocks != "auto":
         return config.blocks
-    fixed = BYTES_PER_CONTEXT_ANCHOR * n_anchors + BYTES_PER_PIXEL * image_pixels
-    free = config.block_memory_gb * 1e9 - fixed
-    grown = ANCHOR_GROWTH * BYTES_PER_ANCHOR * n_anchors
+    context = bytes_of_model(OFFSETS) + CONTEXT_SEEN * STEP_BYTES_PER_OFFSET * OFFSETS
+    free = config.block_memory_gb * 1e9 - context * n_anchors - BYTES_PER_PIXEL * image_pixels
+    grown = GROWTH * (bytes_per_anchor(OFFSETS, 1.0) + bytes_of_model(OFFSETS)) * n_anchors
     most = max(1, n_cameras // CAMERAS_PER_BLOCK)
     # Where even the scene about a block does not fit, smaller blocks help as far as the photographs allow.
     wanted = most if free <= 0 else max(USUAL_BLOCKS, int(np.ceil(grown / free)))
