@@ -266,6 +266,13 @@ def test_evaluation_and_renders_of_a_run(unbroken, tmp_path):
     assert metrics["lpips_vgg"] is None
     assert metrics["n_anchors"] > 100
     assert sum(bin["pixels"] for bin in metrics["by_visibility"]) == 2 * 64 * 48
+    test_files = {path: path.read_bytes() for path in (run / "coarse/evaluation").rglob("*.png")}
+    learnt = [*vdgs, "eval", str(run), "--views", "training"]
+    assert subprocess.run(learnt, capture_output=True, timeout=120, cwd=tmp_path).returncode == 0
+    training = json.loads((run / "coarse/evaluation_training/metrics.json").read_text())
+    assert (metrics["test_views"], training["training_views"]) == (2, 10)
+    assert training["psnr"] > metrics["psnr"]
+    assert {path: path.read_bytes() for path in test_files} == test_files
     for kind in ("image", "depth", "visibility"):
         shown = [*vdgs, "render", str(run), "--output", str(tmp_path / kind), "--kind", kind]
         assert subprocess.run(shown, capture_output=True, timeout=120).returncode == 0

@@ -77,6 +77,8 @@ class EvaluationSettings:
     visibility_bins: int = QUANTILE_BINS
     #: Write photograph | render | error for every test view.
     comparisons: bool = True
+    #: What the contact sheet calls the views, and, with _ between its words, metrics.json their number.
+    title: str = "test views"
     #: Views on the contact sheet at most, chosen evenly.
     contact_views: int = 40
     #: Error at the bright end of the colour map, where white is 1.
@@ -146,7 +148,7 @@ def evaluate(
     for index, view in enumerate(views):
         _evaluate_view(view, stems[index], index in on_sheet, inputs, gathered)
     result = _summary(gathered, model.facts, lpips_note, settings)
-    _write(output, result, gathered, len(views))
+    _write(output, result, gathered, settings.title)
     if console is not None:
         console.print(metrics_table(result))
     return result
@@ -299,18 +301,19 @@ def _summary(gathered: _Gathered, facts: ModelFacts, lpips_note: str, settings: 
         "views_by_visibility": view_bins(visible, figures, settings.visibility_bins) if pixel_bins else None,
         **asdict(facts),
         "fps": 1.0 / max(statistics.median(gathered.seconds), 1e-9),
-        "test_views": len(rows),
+        settings.title.replace(" ", "_"): len(rows),
         "notes": notes,
     }
     return saving.jsonable(result)
 
 
-def _write(output: Path, result: Mapping[str, Any], gathered: _Gathered, n_views: int) -> None:
+def _write(output: Path, result: Mapping[str, Any], gathered: _Gathered, title: str) -> None:
     if gathered.cells:
-        shown = f"{len(gathered.cells)} of {n_views}" if len(gathered.cells) < n_views else f"{n_views}"
+        count = len(gathered.rows)
+        shown = f"{len(gathered.cells)} of {count}" if len(gathered.cells) < count else f"{count}"
         psnr = "PSNR –" if result["psnr"] is None else f"PSNR {result['psnr']:.2f} dB"
         ssim = "SSIM –" if result["ssim"] is None else f"SSIM {result['ssim']:.3f}"
-        sheet = pictures.contact_sheet(gathered.cells, f"{shown} test views · {psnr} · {ssim}")
+        sheet = pictures.contact_sheet(gathered.cells, f"{shown} {title} · {psnr} · {ssim}")
         saving.write_png(output / "contact_sheet.png", np.asarray(sheet))
     saving.write_json(output / "per_view.json", gathered.rows)
     saving.write_json(output / "metrics.json", result)  # last: where it stands, the rest is complete

@@ -1,10 +1,11 @@
-"""`vdgs eval`: a run's test views rendered, measured and shown."""
+"""`vdgs eval`: a run's test views, or its training views, rendered, measured and shown."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from rich.console import Console
@@ -25,15 +26,17 @@ from vdgs.visibility import views_of
 #: Photographs kept decoded during an evaluation, which needs one at a time.
 EVALUATION_IMAGES_BYTES = 256_000_000
 
+#: What to measure on. Training views say what a model has learnt by heart: good there and not on the test views.
+Views = Literal["test", "training"]
 
-def evaluate_run(run: TrainedRun, lpips_weights: Path | None, bins: int, console: Console) -> None:
-    """Measure a model of a run on the test views and print a table.
 
-    Writes RUN/evaluation for the merged model, RUN/coarse/evaluation for the coarse one.
-    """
+def evaluate_run(
+    run: TrainedRun, lpips_weights: Path | None, bins: int, console: Console, views: Views = "test"
+) -> None:
+    """Measure a model of a run and print a table. Writes `evaluation_folder`."""
     if bins < 1:
         raise RunError(f"--bins is {bins}; it must be at least 1")
-    output = evaluation_folder(run.folder, run.name)
+    output = evaluation_folder(run.folder, run.name, views)
     lpips, note = load_lpips(lpips_weights)
     facts = ModelFacts(
         model=run.name,
@@ -43,10 +46,12 @@ def evaluate_run(run: TrainedRun, lpips_weights: Path | None, bins: int, console
         peak_memory_bytes=run.status.get("peak_memory_bytes"),
     )
     model = MeasuredModel(lambda camera: render(run.model, camera), visibility_map(run), facts)
-    with cached_photographs(run.capture.test_views) as photographs:
+    chosen = run.capture.test_views if views == "test" else run.capture.train_views
+    with cached_photographs(chosen) as photographs:
         evaluate(
             photographs, model, output,
-            lpips=lpips, lpips_note=note, settings=EvaluationSettings(visibility_bins=bins), console=console,
+            lpips=lpips, lpips_note=note, console=console,
+            settings=EvaluationSettings(visibility_bins=bins, title=f"{views} views"),
         )  # fmt: skip
     console.print(f"pictures and figures: {output}", highlight=False)
 
@@ -64,9 +69,11 @@ def cached_photographs(views: Sequence[View]) -> Iterator[Photographs]:
         yield Photographs(views, lambda view: images.get(index[view.name]).image.numpy(), load_mask)
 
 
-def evaluation_folder(run: RunFolder, name: str) -> Path:
-    """Where the figures of a model ("coarse" or "merged") are."""
-    return run.evaluation if name == "merged" else run.coarse.path / "evaluation"
+def evaluation_folder(run: RunFolder, name: str, views: Views = "test") -> Path:
+    """Where the figures of a model ("coarse" or "merged") are: RUN/evaluation, RUN/coarse/evaluation; of training views
+    beside them, in `evaluation_training`."""
+    folder = run.evaluation if name == "merged" else run.coarse.path / "evaluation"
+    return folder if views == "test" else folder.with_name(f"{folder.name}_training")
 
 
 def visibility_map(run: TrainedRun) -> Callable[[Camera], np.ndarray]:

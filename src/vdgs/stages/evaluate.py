@@ -13,7 +13,7 @@ from rich.console import Console
 
 from vdgs.anchors import AnchorModel, Part
 from vdgs.cameras import Camera
-from vdgs.evaluation.of_run import cached_photographs, evaluate_run, evaluation_folder
+from vdgs.evaluation.of_run import Views, cached_photographs, evaluate_run, evaluation_folder
 from vdgs.evaluation.saving import write_json
 from vdgs.evaluation.seams import block_table, evaluate_blocks
 from vdgs.files import read_record
@@ -28,9 +28,14 @@ from vdgs.stages.opening import ModelName, TrainedRun, open_run
 HELD_BYTES = 2_000_000_000
 
 
-def evaluate_stage(path: Path, which: ModelName, lpips_weights: Path | None, bins: int, console: Console) -> None:
-    """Measure a model of a run; of the merged one also block by block and at the seams."""
+def evaluate_stage(
+    path: Path, which: ModelName, lpips_weights: Path | None, bins: int, console: Console, views: Views = "test"
+) -> None:
+    """Measure a model of a run; of the merged one, on test views, also block by block and at the seams."""
     opened = open_run(path, which)
+    if views == "training":
+        evaluate_run(opened, lpips_weights, bins, console, views)
+        return
     output = evaluation_folder(opened.folder, opened.name)
     _forget(output)
     forget_peak()

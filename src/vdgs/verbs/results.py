@@ -14,12 +14,16 @@ from vdgs.verbs.shared import open_console, use_device, use_threads
 
 @dataclass(frozen=True)
 class EvalArguments:
-    """Render the test views of a run and measure them: metrics.json, per_view.json, pictures, a table."""
+    """Render the test views of a run, or its training views, and measure them: metrics.json, per_view.json, pictures, a
+    table."""
 
     run: Positional[Path]
     """Run folder."""
     model: Literal["best", "coarse", "merged"] = "best"
     """Which model; `best` is the merged one where there is one."""
+    views: Literal["test", "training"] = "test"
+    """Which views. `training` goes into evaluation_training: what is much better there than on test views was learnt by
+    heart."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     bins: int = 4
@@ -36,7 +40,7 @@ def eval(arguments: list[str]) -> None:
 
     use_device(asked.device)
     use_threads(asked.threads)
-    evaluate_stage(asked.run, asked.model, asked.lpips_weights, asked.bins, open_console())
+    evaluate_stage(asked.run, asked.model, asked.lpips_weights, asked.bins, open_console(), asked.views)
 
 
 @dataclass(frozen=True)
