@@ -305,7 +305,6 @@ PRESETS: dict[str, MethodConfig] = {
     "laptop": MethodConfig(
         training=TrainConfig(
             iterations=0,
-            average=0.4,
             resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
             growth=GrowthConfig(statistics_from=300, start=500, until=0.6, threshold=1e-4),
         ),

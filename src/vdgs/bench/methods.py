@@ -31,6 +31,12 @@ def coarse_alone(config: MethodConfig, budget: Budget) -> MethodConfig:
     return replace(config, training=replace(config.training, iterations=budget.total))
 
 
+def coarse_alone_averaged(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """All iterations in the coarse stage, which ends with a mean of models as blocks do."""
+    alone = coarse_alone(config, budget)
+    return replace(alone, training=replace(alone.training, average=config.block.average))
+
+
 def coarse_as_long(config: MethodConfig, budget: Budget) -> MethodConfig:
     """The coarse stage as long as one process takes when every block has its own: coarse + one block's iterations."""
     return replace(config, training=replace(config.training, iterations=budget.coarse + budget.per_block))
@@ -177,6 +183,13 @@ _3DGS_SCHEDULE = (
 _ABLATIONS = [
     Method("full", "VDGS (full)", full, cites="VDGS, sections III-B and III-C"),
     Method("baseline", "baseline: coarse alone", coarse_alone, COARSE_ONLY, cites="VDGS, Table II (a)"),
+    Method(
+        "baseline-mean",
+        "baseline with a mean of models",
+        coarse_alone_averaged,
+        COARSE_ONLY,
+        differs="ends with a mean of models, as the blocks of `full` do",
+    ),
     Method("coarse", "coarse stage, as blocks begin", full, COARSE_ONLY, less="iterations of the coarse stage only"),
     Method(
         "coarse-as-long",

@@ -18,7 +18,16 @@ _SWEEPS = (
     _sweep("(c) compensation scale β_g", "beta-g", BETA_G),
     _sweep("(d) decay factor γ", "gamma", GAMMA),
 )
-_ABLATION = ("coarse", "coarse-as-long", "baseline", "no-blocking", "no-anchor-generation", "printed", "full")
+_ABLATION = (
+    "coarse",
+    "coarse-as-long",
+    "baseline",
+    "baseline-mean",
+    "no-blocking",
+    "no-anchor-generation",
+    "printed",
+    "full",
+)
 
 #: Each departs from the full method in one choice, or says beside it in what else.
 CHOICES = (
