@@ -43,7 +43,7 @@ from vdgs.bench.worker import STAGES, Job
 from vdgs.bench.writing import escape_latex, escape_markdown, latex, markdown, tidy_csv
 from vdgs.cameras import Camera
 from vdgs.captures.options import CaptureOptions
-from vdgs.config import PRESETS
+from vdgs.config import PRESETS, to_dict
 from vdgs.config_checks import validate
 from vdgs.errors import VdgsError
 from vdgs.verbs.benching import BenchArguments
@@ -179,6 +179,23 @@ def test_runs_with_the_same_settings_are_one_run():
     assert len({run.folder for run in defaults}) == 1
     assert len(plan.runs) == 16 - 3
     assert len(plan.coarse) == 1
+
+
+def test_a_setting_that_came_later_leaves_older_runs_finished(monkeypatch):
+    def keys() -> list[str]:
+        made = make_plan("table2", Choices(scenes=("residence",), seeds=1))
+        return [f"{run.folder} {run.key({}, {})}" for run in made.coarse + made.runs]
+
+    def of_then(config) -> dict:
+        settings = to_dict(config)  # of everything, or of the coarse stage alone
+        for part in (settings, settings.get("training", {}), settings.get("block", {})):
+            part.pop("average", None)
+        return settings
+
+    now = keys()
+    assert len(now) > 3
+    monkeypatch.setattr("vdgs.bench.plan.to_dict", of_then)
+    assert keys() == now
 
 
 def test_the_coarse_row_trains_nothing_of_its_own():

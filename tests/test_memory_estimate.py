@@ -56,7 +56,15 @@ def test_a_mean_of_models_takes_one_more_model(need):
     plain, averaged = (estimate(replace(need, averaged=each)) for each in (False, True))
     assert averaged.start == plain.start
     more = averaged.total - plain.total
-    assert more == pytest.approx(4 * (3 + 32 + 6 + 3 * need.offsets) * need.grown, abs=1, rel=1e-9)
+    assert more == pytest.approx(4 * (32 + 6 + 3 * need.offsets) * need.grown, abs=1, rel=1e-9)
+
+
+@pytest.mark.parametrize(("kind", "option"), [("coarse", "--average 0"), ("block", "--block.average 0")])
+def test_the_mean_may_be_given_up(kind, option):
+    need = Need(1_000_000, 0, 10, 0.4, 10**6, 10**8, averaged=True)
+    (found,) = [each for each in advice(need, kind, 10**9) if option in each.setting]
+    assert found.saves == estimate(need).total - estimate(replace(need, averaged=False)).total
+    assert not [each for each in advice(replace(need, averaged=False), kind, 10**9) if option in each.setting]
 
 
 @pytest.mark.parametrize("kind", ["coarse", "block"])

@@ -15,6 +15,7 @@ from vdgs.captures.capture import GroundFrame
 from vdgs.captures.geodesy import enu_from_geodetic
 from vdgs.config import PartitionConfig
 from vdgs.errors import RunError, VdgsError
+from vdgs.memory_estimate import Need, estimate
 from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks, save_blocks_wgs84
 from vdgs.partition.boundary import alpha_shape, widen
 from vdgs.partition.cut import choose_block_count, cut_scene
@@ -220,6 +221,22 @@ def test_the_number_of_blocks() -> None:
     ]
     assert by_memory == sorted(by_memory, reverse=True)
     assert by_memory[0] > by_memory[-1] == 8
+
+
+@pytest.mark.parametrize("offsets", [10, 32])
+@pytest.mark.parametrize("anchors", [10**6, 2 * 10**6, 25 * 10**5])
+def test_a_block_by_memory_fits_into_it(anchors: int, offsets: int) -> None:
+    gb = 3e-6 * anchors * (1 if offsets == 10 else 2.2)
+    auto = PartitionConfig(blocks="auto", block_memory_gb=gb)
+    count = choose_block_count(anchors, 50_000, 10**6, auto, offsets)
+    assert 8 <= count < 1000
+
+    def taken(blocks: int) -> int:
+        need = Need(-(-anchors // blocks), 0, offsets, 0.5, 10**6, 0, surroundings=anchors, averaged=True)
+        return estimate(need).total
+
+    assert taken(count) <= 1.001e9 * gb
+    assert count == 8 or taken(count - 1) > 0.999e9 * gb
 
 
 # ----------------------------------------------------------------------------------------------- shapes

@@ -201,3 +201,10 @@ def test_a_mean_needs_an_end_of_growth(average, until, problems):
     block = MethodConfig(block=BlockConfig(average=average, growth=growth))
     assert [len(validate(each)) for each in (coarse, block)] == [problems, problems]
     assert all("growth.until" in each or "average is" in each for each in validate(coarse) + validate(block))
+
+
+@pytest.mark.parametrize(("begins", "problems"), [(0.5, 0), (0.51, 1)])
+def test_a_mean_is_of_models_of_one_image_size(begins, problems):
+    settings = {"average": 0.5, "growth": GrowthConfig(until=0.4), "resolutions": ((0.0, 2), (begins, 1))}
+    assert len(validate(MethodConfig(training=TrainConfig(**settings)))) == problems
+    assert len(validate(MethodConfig(block=BlockConfig(**settings)))) == problems

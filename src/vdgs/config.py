@@ -99,15 +99,16 @@ class CompensationConfig:
     """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on
     a large scene nearly every anchor is below a fixed share)."""
     beta_g: float = 2.0
-    """beta_g: weight of a cycle's mean gradient in the cache g (choice: with 1 - gamma g is a mean over cycles; the
-    paper's 2 makes it a sum that grows to twenty times the gradients it is made of)."""
+    """beta_g: weight of a cycle's mean gradient in the cache g. With the paper's 2, g is a sum that grows to twenty
+    times the gradients it is made of; with 1 - gamma (the preset `laptop`) it is a mean over cycles."""
     gamma: float = 0.9
     """gamma: decay of the cache g from cycle to cycle."""
     gate: Literal["scaled", "literal"] = "scaled"
     """Above how many draws an offset of low visibility is judged: `scaled` takes T_low times the gate of the others, at
     least 2 (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
     cap: float = 0.0
-    """Greatest value of g; 0 for none. Without it a statistic that is fed steadily grows to 21 times its size."""
+    """Greatest value of g; 0 for none. Without it, and with beta_g = 2, a statistic that is fed steadily grows to 21
+    times its size."""
 
 
 @dataclass(frozen=True)
@@ -140,8 +141,8 @@ class TrainConfig:
     resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
     """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
     average: float = 0.0
-    """The stage ends with the mean of the models of this last share of its iterations, after growth; 0 for the very
-    last model (choice)."""
+    """The stage ends with the mean of the models of this last share of its iterations, after growth and at full size; 0
+    for the very last model (choice)."""
     seed: int = 0
     """Everything random follows from it: on the CPU the same seed gives the same bits."""
     anchors: AnchorConfig = field(default_factory=AnchorConfig)

@@ -18,7 +18,7 @@ def validate(config: MethodConfig) -> list[str]:
         problems.append("block.iterations must not be negative and block.scale_iterations must be positive")
     if min(block.offset_rate, block.scale_rate, block.feature_rate) <= 0:
         problems.append("block.offset_rate, block.scale_rate and block.feature_rate must be positive")
-    problems += [f"block.{each}" for each in _validate_average(block.average, block.growth)]
+    problems += [f"block.{each}" for each in _validate_average(block.average, block.growth, block.resolutions)]
     if config.partition.blocks != "auto" and config.partition.blocks < 1:
         problems.append(f"blocks is {config.partition.blocks}; it must be at least 1, or auto")
     if min(config.partition.lambda_vis, config.partition.expansion) < 0 or config.partition.block_memory_gb <= 0:
@@ -68,17 +68,21 @@ def _validate_resolutions(resolutions: tuple[tuple[float, int], ...]) -> list[st
     return problems
 
 
-def _validate_average(average: float, growth: GrowthConfig) -> list[str]:
+def _validate_average(average: float, growth: GrowthConfig, resolutions: tuple[tuple[float, int], ...]) -> list[str]:
     if not 0 <= average < 1:
         return [f"average is {average}; it is a share, 0 or more and below 1"]
     if average and growth.until >= 1:
-        return ["average needs growth to end: growth.until must be below 1"]
+        return ["average needs growth and pruning to end: growth.until must be below 1"]
+    if average and resolutions and resolutions[-1][0] > max(1 - average, growth.until):
+        return ["average would mix models of several image sizes: let the last of resolutions begin before it"]
     return []
 
 
 def _validate_training(config: TrainConfig) -> list[str]:
     problems = _validate_growth(config.growth) + _validate_resolutions(config.resolutions)
-    problems += _validate_compensation(config.compensation) + _validate_average(config.average, config.growth)
+    problems += _validate_compensation(config.compensation) + _validate_average(
+        config.average, config.growth, config.resolutions
+    )
     if config.seed < 0 or config.anchors.appearance < 0 or config.anchors.voxel < 0:
         problems.append("seed, anchors.appearance and anchors.voxel must not be negative")
     if 0 < config.anchors.outlier_distance < 2:

@@ -20,6 +20,8 @@ STEP_BYTES_PER_OFFSET = 155
 GROWTH = 3.0
 #: Numbers of an anchor apart from its offsets: place, feature, log-scales.
 PLAIN_FLOATS = 3 + 32 + 6
+#: ... of which a mean of models holds all but the place, which never moves.
+PLACE_FLOATS = 3
 
 
 @dataclass(frozen=True)
@@ -91,8 +93,13 @@ def bytes_of_model(offsets: int) -> int:
     return 4 * (PLAIN_FLOATS + 3 * offsets)
 
 
+def bytes_of_mean(offsets: int) -> int:
+    """What a mean of models holds of an anchor."""
+    return bytes_of_model(offsets) - 4 * PLACE_FLOATS
+
+
 def _per_grown_anchor(need: Need) -> float:
-    mean = bytes_of_model(need.offsets) if need.averaged else 0
+    mean = bytes_of_mean(need.offsets) if need.averaged else 0
     return bytes_per_anchor(need.offsets, need.seen) + mean
 
 
@@ -123,6 +130,10 @@ def advice(need: Need, kind: Kind, to_save: int) -> list[Advice]:
         half = estimate(replace(need, anchors=need.anchors // 2))
         found.append(Advice("vdgs partition with twice the --blocks (smaller blocks)", whole.total - half.total))
         found.append(Advice("one less of --jobs (blocks at once)", whole.total))
+    if need.averaged:
+        option = "--average 0" if kind == "coarse" else "--block.average 0"
+        last = estimate(replace(need, averaged=False))
+        found.append(Advice(f"{option} (the last model instead of a mean)", whole.total - last.total))
     kept = min(need.images_bytes, 50_000_000)
     found.append(
         Advice(f"--image-memory-gb {kept / 1e9:.2f} (fewer photographs kept in memory)", need.images_bytes - kept)

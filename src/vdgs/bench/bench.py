@@ -38,6 +38,7 @@ from vdgs.errors import VdgsError
 from vdgs.evaluation.saving import write_json
 from vdgs.files import read_json, write_text
 from vdgs.run import RunFolder
+from vdgs.stages.keys import counted
 from vdgs.stages.watching import Stopped
 from vdgs.synth import SynthOptions, generate
 
@@ -164,7 +165,8 @@ def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
     wanted, held = to_dict(run.config), folder.settings()
     if "blocks" not in run.stages:  # no other section matters to it
         wanted = {"training": wanted["training"]}
-    changed = differences({name: held[name] for name in wanted}, wanted)
+    before, after = ({name: counted(name, each[name]) for name in wanted} for each in (held, wanted))
+    changed = differences(before, after)
     if changed:
         raise VdgsError(
             f"{folder.path}: was trained with other settings:\n  "

@@ -188,7 +188,7 @@ _ABLATIONS = [
         "baseline with a mean of models",
         coarse_alone_averaged,
         COARSE_ONLY,
-        differs="ends with a mean of models, as the blocks of `full` do",
+        differs="ends as the blocks of `full` do: with a mean of models, where they have one",
     ),
     Method("coarse", "coarse stage, as blocks begin", full, COARSE_ONLY, less="iterations of the coarse stage only"),
     Method(
@@ -196,6 +196,7 @@ _ABLATIONS = [
         "coarse alone, as long as one block",
         coarse_as_long,
         COARSE_ONLY,
+        differs="ends with its last model; the blocks of `full` with a mean of models, where the preset says so",
         less="iterations of the coarse stage and one block: as much time, if all blocks are trained at once",
     ),
     Method(
@@ -204,7 +205,7 @@ _ABLATIONS = [
         as_printed,
         cites="VDGS, sections III-B and III-C",
         differs="blocks of the paper: frozen decoder, even use of photographs, damped rates, full size, no mean of "
-        "models, share of 0.45, its compensation; coarse stage and cut as `full`",
+        "models, share of 0.45, its compensation; growth, coarse stage and cut as `full`",
     ),
     Method("no-blocking", "w/o blocking", without_blocking, cites="VDGS, Table II (b)"),
     Method("no-anchor-generation", "w/o anchor generation", without_anchor_generation, cites="VDGS, Table II (c)"),

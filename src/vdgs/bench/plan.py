@@ -17,6 +17,7 @@ from vdgs.bench.tables import TABLES
 from vdgs.config import MethodConfig, to_dict
 from vdgs.config_checks import validate
 from vdgs.errors import VdgsError
+from vdgs.stages.keys import counted
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,8 @@ class PlannedRun:
 
     def key(self, capture: Mapping[str, Any], measured: Mapping[str, Any]) -> str:
         """Changes with everything that the run's result depends on."""
-        content = [self.stages, to_dict(self.config), dict(capture), dict(measured)]
+        settings = {section: counted(section, values) for section, values in to_dict(self.config).items()}
+        content = [self.stages, settings, dict(capture), dict(measured)]
         if self.stages == EXPLICIT:
             content.append(to_dict(gaussians_config(self.config)))
         return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
@@ -173,4 +175,5 @@ def _share_coarse(planned: Sequence[PlannedRun]) -> tuple[list[PlannedRun], list
 
 
 def _coarse_digest(run: PlannedRun) -> str:
-    return hashlib.sha256(json.dumps(to_dict(run.config.training), sort_keys=True).encode()).hexdigest()[:8]
+    settings = counted("training", to_dict(run.config.training))
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]

@@ -1,12 +1,12 @@
-"""Evaluate a model on its test views: every figure that papers report, raw and colour-corrected, and by
+"""Evaluate a model on views, mostly its test views: every figure that papers report, raw and colour-corrected, and by
 visibility, with the pictures behind them. One view is in memory at a time.
 
     OUTPUT/
-      metrics.json        means over the test views, bins by visibility, size and speed of the model
+      metrics.json        means over the views, bins by visibility, size and speed of the model
       per_view.json       the same figures for each view
       renders/NAME.png    what the model shows, 8 bits: the images that are measured
       comparisons/        photograph | render | error
-      contact_sheet.png   all test views (or an even choice of them) at a glance
+      contact_sheet.png   all views (or an even choice of them) at a glance
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class EvaluationSettings:
     colour_correction: bool = True
     #: Bins by visibility, of about equal size.
     visibility_bins: int = QUANTILE_BINS
-    #: Write photograph | render | error for every test view.
+    #: Write photograph | render | error for every view.
     comparisons: bool = True
     #: What the contact sheet calls the views, and, with _ between its words, metrics.json their number.
     title: str = "test views"
@@ -150,7 +150,7 @@ def evaluate(
     result = _summary(gathered, model.facts, lpips_note, settings)
     _write(output, result, gathered, settings.title)
     if console is not None:
-        console.print(metrics_table(result))
+        console.print(metrics_table(result, f"{len(views)} {settings.title}"))
     return result
 
 

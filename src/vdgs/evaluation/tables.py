@@ -19,9 +19,9 @@ FIGURES = (
 )
 
 
-def metrics_table(result: Mapping[str, Any]) -> RenderableType:
+def metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
     """What `metrics.json` holds: quality raw and corrected, quality by visibility, size and speed."""
-    quality = Table(box=box.SIMPLE_HEAD, title=f"{result['test_views']} test views", title_justify="left")
+    quality = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     for column in ("", "raw", "colour-corrected"):
         quality.add_column(column, justify="left" if not column else "right")
     for key, label, form in FIGURES:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import shapely
 from jaxtyping import Float, Int
 
 from vdgs.config import PartitionConfig
 from vdgs.errors import VdgsError
-from vdgs.memory_estimate import BYTES_PER_PIXEL, GROWTH, STEP_BYTES_PER_OFFSET, bytes_of_model, bytes_per_anchor
+from vdgs.memory_estimate import Need, estimate
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.boundary import cores_of, widen
 from vdgs.partition.cluster import cluster, features_of, refuse_too_many
@@ -18,11 +20,10 @@ from vdgs.partition.plane import principal_plane
 LEAST_SHARE = 0.05
 
 #: What `--blocks auto` reckons with (choices): the paper's number of blocks, photographs that an average block needs,
-#: Gaussians of an anchor, and the share of the scene about a block that one photograph sees.
+#: and the share of the anchors that one photograph sees.
 USUAL_BLOCKS = 8
 CAMERAS_PER_BLOCK = 50
-OFFSETS = 10
-CONTEXT_SEEN = 0.5
+SEEN = 0.5
 
 
 def cut_scene(
@@ -64,20 +65,23 @@ def cut_scene(
     return Blocks(tuple(Block(core, widen(core, config.expansion)) for core in grounded)), warnings
 
 
-def choose_block_count(n_anchors: int, n_cameras: int, image_pixels: int, config: PartitionConfig) -> int:
+def choose_block_count(
+    n_anchors: int, n_cameras: int, image_pixels: int, config: PartitionConfig, offsets: int = 10
+) -> int:
     """The number of blocks that `config` asks for; for "auto" it follows from the scene and the memory.
 
     Choice: the paper's eight blocks, or as many as keep a block within `block_memory_gb` in training by
-    `memory_estimate`, with the rest of the scene about it and all of its own anchors in view; but never fewer than 50
-    photographs for an average block (33 photographs make 1 block, 145 make 2, 400 and more make 8).
+    `memory_estimate`, with the rest of the scene about it and half of all anchors in view, photographs aside; but never
+    fewer than 50 photographs for an average block (33 make 1 block, 145 make 2, 400 and more make 8).
     """
     if not config.blocking:
         return 1
     if config.blocks != "auto":
         return config.blocks
-    context = bytes_of_model(OFFSETS) + CONTEXT_SEEN * STEP_BYTES_PER_OFFSET * OFFSETS
-    free = config.block_memory_gb * 1e9 - context * n_anchors - BYTES_PER_PIXEL * image_pixels
-    grown = GROWTH * (bytes_per_anchor(OFFSETS, 1.0) + bytes_of_model(OFFSETS)) * n_anchors
+    whole = Need(n_anchors, 0, offsets, SEEN, image_pixels, 0, surroundings=n_anchors, averaged=True)
+    fixed = estimate(replace(whole, anchors=0)).total
+    free = config.block_memory_gb * 1e9 - fixed
+    grown = estimate(whole).total - fixed
     most = max(1, n_cameras // CAMERAS_PER_BLOCK)
     # Where even the scene about a block does not fit, smaller blocks help as far as the photographs allow.
     wanted = most if free <= 0 else max(USUAL_BLOCKS, int(np.ceil(grown / free)))

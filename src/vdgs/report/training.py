@@ -95,7 +95,7 @@ def _states(statuses: list[tuple[str, Record]]) -> Html:
             [name, f"{count(done)} / {count(wanted)}", count(status.number("anchors")),
              decibels(status.number("psnr_training")), state]
         )  # fmt: skip
-    return table(["", "iterations", "anchors", "training PSNR (dB)", "state"], rows, wordy=True)
+    return table(["", "iterations", "anchors", "PSNR while training (dB)", "state"], rows, wordy=True)
 
 
 def _growth(logs: list[Log]) -> list[Html]:

@@ -24,7 +24,8 @@ from vdgs.training import Stage, StepReport, TrainingState, from_saved, to_saved
 AFTER_DIVERGENCE = {
     "coarse": "Lower --rates.* or raise --growth.threshold in a new --output, and look at the photographs with "
     "`vdgs inspect`.",
-    "block": "Lower --block.offset-rate and --block.feature-rate or raise --block.growth.threshold (with --redo).",
+    "block": "Lower --block.offset-rate, --block.scale-rate and --block.feature-rate or raise "
+    "--block.growth.threshold (with --redo).",
 }
 
 
@@ -86,7 +87,7 @@ def finish(folder: StageFolder, state: TrainingState, model: AnchorModel, consol
     minutes, seconds = divmod(round(state.seconds), 60)
     console.print(
         f"trained {state.iteration} iterations in {minutes} min {seconds} s: {len(state.anchors):,} anchors, "
-        f"PSNR of training views {state.psnr:.2f} dB, peak memory {state.peak_memory_bytes / 1e9:.1f} GB\n"
+        f"PSNR while training {state.psnr:.2f} dB, peak memory {state.peak_memory_bytes / 1e9:.1f} GB\n"
         f"model: {folder.model}",
         highlight=False,
     )

@@ -33,15 +33,12 @@ def evaluate_stage(
 ) -> None:
     """Measure a model of a run; of the merged one, on test views, also block by block and at the seams."""
     opened = open_run(path, which)
-    if views == "training":
-        evaluate_run(opened, lpips_weights, bins, console, views)
-        return
-    output = evaluation_folder(opened.folder, opened.name)
+    output = evaluation_folder(opened.folder, opened.name, views)
     _forget(output)
     forget_peak()
     began = time.monotonic()
-    evaluate_run(opened, lpips_weights, bins, console)
-    if opened.name == "merged" and len(blocks_of(opened.folder)) > 1:
+    evaluate_run(opened, lpips_weights, bins, console, views)
+    if views == "test" and opened.name == "merged" and len(blocks_of(opened.folder)) > 1:
         console.print(block_table(_evaluate_blocks(opened)))
     record = _record_of(opened.folder, opened.name, lpips_weights, bins)
     write_json(
@@ -64,7 +61,7 @@ def _record_of(run: RunFolder, name: str, lpips_weights: Path | None, bins: int)
 
 def _forget(output: Path) -> None:
     """Delete what vouches for figures that are about to change, and what another cut may have left."""
-    for stale in ("status.json", "by_block.json"):
+    for stale in ("status.json", "metrics.json", "by_block.json"):
         (output / stale).unlink(missing_ok=True)
     shutil.rmtree(output / "seams", ignore_errors=True)
 

@@ -48,14 +48,14 @@ def stage_keys(settings: dict[str, Any], coarse_model: str | None = None) -> Sta
     keys: dict[str, str] = {}
     for stage, (sections, before) in DEPENDS.items():
         # Where the capture lies is not what it is: a capture that moved keeps its results.
-        own = {name: _counted(name, settings[name]) for name in sections}
+        own = {name: counted(name, settings[name]) for name in sections}
         content = [own, *(keys[name] for name in before), *([coarse_model] if before == ("coarse",) else [])]
         keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
     return StageKeys(**keys)
 
 
-def _counted(section: str, settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings of a section that its key is made of."""
+def counted(section: str, settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings of a section that keys are made of: a setting that came later counts only where it changes a run."""
     since = SINCE.get(section, {})
     return {
         name: value for name, value in settings.items()

@@ -63,7 +63,10 @@ def announce(need: Need, kind: Kind, console: Console) -> None:
 def after_failure(need: Need, state: TrainingState, stage: Stage) -> str:
     """What to change after training ran out of memory, with what each change saves by estimate."""
     kind, kept = kind_of(stage), getattr(stage.images, "nbytes", need.images_bytes)
-    now = replace(need, anchors=len(state.anchors), max_anchors=len(state.anchors), images_bytes=kept)
+    now = replace(
+        need, anchors=len(state.anchors), max_anchors=len(state.anchors), images_bytes=kept,
+        averaged=state.average is not None,
+    )  # fmt: skip
     # Growth cannot be undone where it led, so a limit is one for training that begins anew.
     before = replace(now, anchors=min(need.anchors, len(state.anchors)))
     whole = estimate(now).total

@@ -137,7 +137,10 @@ def unit(capture: Capture) -> str:
 
 def _cut(scene: _Scene, config: PartitionConfig, seed: int) -> tuple[Blocks, list[str]]:
     camera = scene.cameras[0]
-    count = choose_block_count(len(scene.views), len(scene.cameras), camera.width * camera.height, config)
+    count = choose_block_count(
+        len(scene.views), len(scene.cameras), camera.width * camera.height, config,
+        offsets=scene.opened.model.anchors.offsets.shape[1],
+    )  # fmt: skip
     if config.strategy != "visibility":
         return STRATEGIES[config.strategy].cut(scene.positions, scene.cameras, count)
     return cut_scene(scene.positions, scene.views, replace(config, blocks=count), seed)
