@@ -165,7 +165,8 @@ class PartitionConfig:
     """`visibility`: by place and visibility (the paper). The others are the partitions of published methods, to compare
     with; each cuts and chooses cameras in its own way, whatever the settings of the assignment say."""
     blocks: int | Literal["auto"] = 8
-    """K, the number of blocks; `auto` follows from anchors, cameras and --block-memory-gb."""
+    """K, the number of blocks; `auto` takes as few as --block-memory-gb allows: give more to train them at once on
+    several machines."""
     blocking: bool = True
     """Off: one block that holds the whole scene (the paper's "w/o Blocking")."""
     lambda_vis: float = 1.0
@@ -175,7 +176,7 @@ class PartitionConfig:
     expansion: float = 0.4
     """A block is widened by this share of the radius of a disc of its area."""
     block_memory_gb: float = 4.0
-    """Memory that one block may take in training; only `--blocks auto` looks at it."""
+    """Memory that one block may take in training, by estimate; only `--blocks auto` looks at it."""
 
 
 @dataclass(frozen=True)

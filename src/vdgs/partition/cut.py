@@ -19,9 +19,8 @@ from vdgs.partition.plane import principal_plane
 #: A block that would own less than this share of the anchors of an average block is not worth training.
 LEAST_SHARE = 0.05
 
-#: What `--blocks auto` reckons with (choices): the paper's number of blocks, photographs that an average block needs,
-#: and the share of the anchors that one photograph sees.
-USUAL_BLOCKS = 8
+#: What `--blocks auto` reckons with (choices): photographs that an average block needs, and the share of the anchors
+#: that one photograph sees.
 CAMERAS_PER_BLOCK = 50
 SEEN = 0.5
 
@@ -70,9 +69,9 @@ def choose_block_count(
 ) -> int:
     """The number of blocks that `config` asks for; for "auto" it follows from the scene and the memory.
 
-    Choice: the paper's eight blocks, or as many as keep a block within `block_memory_gb` in training by
-    `memory_estimate`, with the rest of the scene about it and half of all anchors in view, photographs aside; but never
-    fewer than 50 photographs for an average block (33 make 1 block, 145 make 2, 400 and more make 8).
+    Choice: as few as keep a block within `block_memory_gb` in training by `memory_estimate`, with the rest of the scene
+    about it and half of all anchors in view, photographs aside; but never fewer than 50 photographs for an average
+    block. Few, because blocks cost steps: of one total, each place gets fewer the more there are (docs/findings.md).
     """
     if not config.blocking:
         return 1
@@ -84,7 +83,7 @@ def choose_block_count(
     grown = estimate(whole).total - fixed
     most = max(1, n_cameras // CAMERAS_PER_BLOCK)
     # Where even the scene about a block does not fit, smaller blocks help as far as the photographs allow.
-    wanted = most if free <= 0 else max(USUAL_BLOCKS, int(np.ceil(grown / free)))
+    wanted = most if free <= 0 else int(np.ceil(grown / free))
     return max(1, min(most, wanted, n_anchors))
 
 
