@@ -1,0 +1,187 @@
+"""Plans of the bench: what tables, methods and scenes are made of, and which runs they need."""
+
+import typing
+from dataclasses import replace
+
+import pytest
+
+from vdgs.bench.definitions import Budget, Method, Scene
+from vdgs.bench.methods import METHODS
+from vdgs.bench.plan import Choices, make_plan
+from vdgs.bench.quoted import QUOTED
+from vdgs.bench.scenes import PUBLISHED, SCENES
+from vdgs.bench.tables import TABLES
+from vdgs.bench.worker import STAGES
+from vdgs.config import PRESETS, to_dict
+from vdgs.config_checks import validate
+from vdgs.errors import VdgsError
+from vdgs.verbs.benching import BenchArguments
+
+
+def total_iterations(method: Method, scene: Scene) -> int:
+    config = method.settings(scene.base(scene.budget, 0), scene.budget)
+    if "blocks" not in method.stages:
+        return config.training.iterations
+    return config.training.iterations + config.partition.blocks * config.block.iterations
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=lambda scene: scene.name)
+def test_every_method_works_on_every_scene_and_gets_the_same_iterations(scene):
+    for method in METHODS.values():
+        config = method.settings(scene.base(scene.budget, 7), scene.budget)
+        assert validate(config) == []
+        assert config.training.seed == 7
+        assert set(method.stages) <= set(STAGES)
+        if method.less:
+            assert total_iterations(method, scene) < scene.budget.total
+            continue
+        if method.more:
+            assert total_iterations(method, scene) > scene.budget.total
+            continue
+        assert total_iterations(method, scene) == pytest.approx(scene.budget.total, abs=16), method.name
+
+
+@pytest.mark.parametrize("table", TABLES.values(), ids=lambda table: table.name)
+def test_tables_name_what_exists(table):
+    assert set(table.methods) <= METHODS.keys()
+    assert set(table.scenes) <= SCENES.keys()
+    assert table.ours in table.methods
+    assert not table.groups or [name for group in table.groups for name in group.methods] == list(table.methods)
+    plan = make_plan(table.name, Choices())
+    assert plan.answers.keys() == {
+        (scene, method, seed) for scene in table.scenes for method in table.methods for seed in table.seeds
+    }
+    trained = {run.folder for run in plan.coarse}
+    assert all(run.coarse_from in trained for run in plan.runs if "blocks" in run.stages)
+    assert len({run.folder for run in plan.runs + plan.coarse}) == len(plan.runs + plan.coarse)
+
+
+def test_the_command_line_offers_every_table():
+    assert set(typing.get_args(typing.get_type_hints(BenchArguments)["table"])) == TABLES.keys()
+
+
+def test_the_ablations_change_what_they_are_named_after():
+    scene = SCENES["residence"]
+    base = scene.base(scene.budget, 0)
+    settings = {name: method.settings(base, scene.budget) for name, method in METHODS.items()}
+    assert settings["full"] == base
+    assert (base.training.iterations, base.partition.blocks, base.block.iterations) == (100_000, 8, 50_000)
+    assert settings["baseline"].training.iterations == 500_000
+    assert not settings["no-blocking"].partition.blocking
+    assert settings["no-blocking"].block.compensation.enabled
+    off = replace(base.block.compensation, enabled=False)
+    assert settings["no-anchor-generation"] == replace(base, block=replace(base.block, compensation=off))
+    assert settings["lambda-vis-0"].partition.lambda_vis == 0
+    assert settings["t-low-0.3"].block.compensation.t_low == 0.3
+    assert settings["beta-g-0.5"].block.compensation.beta_g == 0.5
+    assert settings["gamma-0.95"].block.compensation.gamma == 0.95
+    assert settings["blocks-16"].block.iterations == 25_000
+    # The paper's defaults are the middle of each sweep.
+    assert {name for name in TABLES["table4"].methods if settings[name] == base} == {
+        "lambda-vis-1", "t-low-0.2", "beta-g-2", "gamma-0.9"
+    }  # fmt: skip
+
+
+def test_blocks_as_printed_take_back_what_the_laptop_changes():
+    scene = SCENES["lab-uneven"]
+    base = scene.base(scene.budget, 0)
+    printed, paper = METHODS["printed"].settings(base, scene.budget), PRESETS["paper"]
+    assert printed != base
+    assert (printed.block.decoder, printed.block.sampling) == ("frozen", "even")
+    assert (printed.block.decoder, printed.block.sampling) == (paper.block.decoder, paper.block.sampling)
+    assert printed.assignment.threshold == paper.assignment.threshold == 0.45
+    # But for what belongs to the scene.
+    block = replace(paper.block, iterations=base.block.iterations, growth=base.block.growth)
+    assert printed.block == block
+    assert printed.training == base.training
+    alone = {
+        name: METHODS[name].settings(base, scene.budget)
+        for name in (
+            "frozen-decoder", "even-sampling", "share-0.45", "printed-rates", "full-size", "last-model",
+            "printed-compensation",
+        )
+    }  # fmt: skip
+    assert alone["frozen-decoder"] == replace(base, block=replace(base.block, decoder="frozen"))
+    assert alone["even-sampling"] == replace(base, block=replace(base.block, sampling="even"))
+    damped = {name: getattr(paper.block, name) for name in ("offset_rate", "scale_rate", "feature_rate")}
+    assert alone["printed-rates"] == replace(base, block=replace(base.block, **damped))
+    assert alone["full-size"] == replace(base, block=replace(base.block, resolutions=paper.block.resolutions))
+    assert alone["last-model"] == replace(base, block=replace(base.block, average=paper.block.average))
+    compensation = paper.block.compensation
+    assert alone["printed-compensation"] == replace(base, block=replace(base.block, compensation=compensation))
+    assert all(each != base for each in alone.values())
+    assert alone["share-0.45"] == replace(base, assignment=replace(base.assignment, threshold=0.45))
+
+
+def test_a_sweep_of_t_low_is_not_overruled_by_the_quantile_of_the_laptop():
+    scene = SCENES["lab-uneven"]
+    assert scene.base(scene.budget, 0).block.compensation.t_low_quantile > 0
+    config = METHODS["t-low-0.05"].settings(scene.base(scene.budget, 0), scene.budget)
+    assert (config.block.compensation.t_low, config.block.compensation.t_low_quantile) == (0.05, 0.0)
+
+
+def test_runs_with_the_same_settings_are_one_run():
+    plan = make_plan("table4", Choices(scenes=("residence",)))
+    defaults = [plan.answers["residence", name, 0] for name in ("lambda-vis-1", "t-low-0.2", "beta-g-2", "gamma-0.9")]
+    assert len({run.folder for run in defaults}) == 1
+    assert len(plan.runs) == 16 - 3
+    assert len(plan.coarse) == 1
+
+
+def test_a_setting_that_came_later_leaves_older_runs_finished(monkeypatch):
+    def keys() -> list[str]:
+        made = make_plan("table2", Choices(scenes=("residence",), seeds=1))
+        return [f"{run.folder} {run.key({}, {})}" for run in made.coarse + made.runs]
+
+    def of_then(config) -> dict:
+        settings = to_dict(config)  # of everything, or of the coarse stage alone
+        for part in (settings, settings.get("training", {}), settings.get("block", {})):
+            part.pop("average", None)
+        return settings
+
+    now = keys()
+    assert len(now) > 3
+    monkeypatch.setattr("vdgs.bench.plan.to_dict", of_then)
+    assert keys() == now
+
+
+def test_the_coarse_row_trains_nothing_of_its_own():
+    plan = make_plan("table2", Choices(scenes=("tiny",), seeds=1))
+    (shared,) = plan.coarse
+    assert plan.answers["tiny", "coarse", 0].coarse_from == shared.folder
+    assert plan.answers["tiny", "coarse-as-long", 0].coarse_from is None
+    assert plan.answers["tiny", "baseline", 0].coarse_from is None
+
+
+def test_a_shared_coarse_stage_does_not_depend_on_the_methods_asked_for():
+    some, others = (
+        make_plan("table1", Choices(scenes=("tiny",), seeds=1, methods=methods)).coarse
+        for methods in (("no-blocking", "full"), ("dogs", "blocks-4", "3dgs"))
+    )
+    assert some == others
+    assert len(some) == 1
+
+
+def test_choices_change_the_budget_for_all_alike():
+    plan = make_plan("table2", Choices(scenes=("tiny",), seeds=2, iterations_total=1200, max_anchors=1000))
+    assert plan.budgets["tiny"] == Budget(600, 2, 300)
+    assert plan.seeds == (0, 1)
+    full = plan.answers["tiny", "full", 1].config
+    # Growth starts later in proportion, as block.scale_iterations does it.
+    assert (full.training.growth.start, full.block.growth.start) == (200, 100)
+    assert (full.training.growth.max_anchors, full.block.growth.max_anchors) == (1000, 500)
+    assert plan.answers["tiny", "no-blocking", 1].config.block.growth.max_anchors == 1000
+    for wrong in (Choices(scenes=("nowhere",)), Choices(methods=("magic",)), Choices(seeds=0),
+                  Choices(scale_iterations=0.0)):  # fmt: skip
+        with pytest.raises(VdgsError):
+            make_plan("table2", wrong)
+
+
+def test_the_paper_is_quoted_as_printed():
+    table = QUOTED["table1"]
+    assert table["VDGS"]["residence"] == (24.03, 0.845, 0.188)
+    assert table["Momentum-GS"]["block-all"] == (29.11, 0.881, 0.180)
+    assert QUOTED["table2"]["(d) Full"]["residence"] == QUOTED["table3"]["4 blocks"]["residence"]
+    assert {scene for row in table.values() for scene in row} == set(PUBLISHED)
+    titles = {METHODS[name].title for name in TABLES["table4"].methods}
+    assert QUOTED["table4"].keys() == titles - {"β_g = 0.1"}  # ours, not in the paper

@@ -1,0 +1,167 @@
+"""From results to tables: statistics, marks, the verdict, and what is written."""
+
+import csv
+import io
+import math
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vdgs.bench.figure import draw_groups
+from vdgs.bench.grids import Cell, Grid, Row, grids_of
+from vdgs.bench.measure import group_names
+from vdgs.bench.notes import notes_of
+from vdgs.bench.plan import Choices, make_plan
+from vdgs.bench.results import Result
+from vdgs.bench.statistics import Summary, difference, marks, summarise
+from vdgs.bench.verdict import verdict
+from vdgs.bench.writing import escape_latex, escape_markdown, latex, markdown, tidy_csv
+
+
+def test_mean_and_spread():
+    assert summarise([1.0, 2.0, 3.0]) == Summary(2.0, 1.0, 3)
+    assert summarise([2.5, None, math.nan]) == Summary(2.5, None, 1)
+    assert summarise([None]) is None
+    both = difference({0: 2.0, 1: 3.0, 2: None}, {0: 1.0, 1: 1.0, 3: 9.0})
+    assert both is not None
+    assert (both.mean, both.seeds) == (1.5, 2)
+    assert both.spread == pytest.approx(math.sqrt(0.5))
+    assert both.beyond_spread
+    one = difference({0: 2.0}, {0: 1.0})
+    assert one is not None
+    assert one.beyond_spread is None
+    assert difference({0: 1.0}, {1: 1.0}) is None
+
+
+def test_marks():
+    assert marks([1.0, 3.0, 2.0, None], 2) == ["", "best", "second", ""]
+    assert marks([1.0, 3.0, 2.0], 2, higher_is_better=False) == ["best", "", "second"]
+    assert marks([1.001, 1.004, 0.5], 2) == ["best", "best", "second"]  # equal as shown
+    assert marks([1.0, None], 2) == ["", ""]
+
+
+@given(st.lists(st.none() | st.floats(-50, 50), max_size=12), st.integers(0, 3))
+def test_no_value_without_mark_is_above_one_with_it(values, digits):
+    given_marks = marks(values, digits)
+    shown = [None if value is None else round(value, digits) for value in values]
+    best = [value for value, mark in zip(shown, given_marks, strict=True) if mark == "best"]
+    second = [value for value, mark in zip(shown, given_marks, strict=True) if mark == "second"]
+    rest = [value for value, mark in zip(shown, given_marks, strict=True) if not mark and value is not None]
+    assert all(a > b for a in best for b in second + rest)
+    assert all(a > b for a in second for b in rest)
+
+
+def made(gains: dict[str, tuple[float, float]], seeds: int = 3, method_failed: str = "") -> list[Result]:
+    """Results on `lab-uneven` with PSNR 20 in all four groups, plus `gains` in the least and the best seen."""
+    bounds = tuple({"lower": float(i), "upper": float(i + 1), "pixels": 10} for i in range(4))
+    results = []
+    for name, (least, best) in gains.items():
+        for seed in range(seeds):
+            figures = {f"psnr@{i}": 20.0 + 0.1 * seed for i in range(4)} | {"psnr": 20.0, "ssim": 0.5}
+            figures["psnr@0"] += least
+            figures["psnr@3"] += best
+            figures |= {f"psnr_cc@{i}": figures[f"psnr@{i}"] for i in range(4)}
+            failed = name == method_failed
+            results.append(
+                Result("lab-uneven", name, seed, "failed", "it | broke", "runs/x")
+                if failed
+                else Result("lab-uneven", name, seed, "done", "", "runs/x", figures, bounds, "truth")
+            )
+    return results
+
+
+def answers(results: list[Result], **choices) -> list[bool | None]:
+    plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full"), **choices))
+    return [line.answer for line in verdict(plan, results)]
+
+
+def test_the_verdict_asks_for_more_than_the_spread_and_allows_a_tenth():
+    nothing = {"baseline": (0.0, 0.0)}
+    assert answers(made(nothing | {"full": (0.5, -0.05)})) == [True, True]
+    assert answers(made(nothing | {"full": (0.09, -0.11)})) == [False, False]  # the spread of seeds is 0.1
+    assert answers(made(nothing | {"full": (0.5, 0.0)}, seeds=1), seeds=1) == [None, True]
+    assert answers(made(nothing | {"full": (0.5, 0.0)}, method_failed="full")) == [None]
+
+
+def test_rows_that_are_the_same_run_are_not_compared():
+    plan = make_plan("table4", Choices(scenes=("residence",)))
+    assert len(verdict(plan, [])) == 16 - 4  # lambda-vis-1 is what the three other defaults are, too
+
+
+def test_an_even_scene_is_judged_against_the_best():
+    plan = make_plan("table2", Choices(scenes=("lab-even",)))
+    results = [
+        Result("lab-even", name, seed, "done", figures={"psnr": psnr})
+        for name, psnr in (("baseline", 21.0), ("full", 20.85), ("no-blocking", 20.0))
+        for seed in plan.seeds
+    ]
+    (line,) = verdict(plan, results)
+    assert line.answer is False
+    assert "21.00" in str(line)
+
+
+@given(st.text(alphabet="a|_*`<>[]{}#\\\n&%$~^ λ±↑", max_size=20))
+def test_escaped_text_has_no_markup(text):
+    plain = re.sub(r"\\([\\`*_{}\[\]<>|#])", "", escape_markdown(text))
+    assert not set(plain) & set("\\`*_{}[]<>|#\n")
+    bare = re.sub(r"\\text\w+\{\}|\$\\\w+\$|\\[{}_%&#$]", "", escape_latex(text))
+    assert not set(bare) & set("\\{}_%&#$~^<>\n")
+
+
+def test_escapes_read_well():
+    assert escape_latex("λ_vis = 0.5 & T_low_x") == r"$\lambda_{\mathrm{vis}}$ = 0.5 \& $T_{\mathrm{low}}$\_x"
+    assert escape_markdown("a|b_c") == r"a\|b\_c"
+
+
+def test_grids_are_written_in_every_form():
+    cells = (Cell(Summary(24.034, 0.051, 3), 2, "best"), Cell(Summary(23.0, None, 1), 2, "second"), Cell(None, 2))
+    grid = Grid("g", "Title_1", ("a", "b|c", "d"), (Row("head"), Row("x_y", cells)), ("a note",))
+    text = markdown([grid], "H", [])
+    assert r"| x\_y | **24.03 ± 0.05** | <u>23.00</u> | – |" in text
+    assert r"\textbf{24.03 $\pm$ 0.05} & \underline{23.00} & --" in latex([grid])
+    rows = list(csv.DictReader(io.StringIO(tidy_csv([grid]))))
+    assert [(row["group"], row["column"], row["mark"]) for row in rows] == [
+        ("head", "a", "best"),
+        ("head", "b|c", "second"),
+    ]
+    assert float(rows[0]["mean"]) == 24.034
+
+
+def test_failures_are_shown_and_leave_a_gap(tmp_path):
+    plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full")))
+    results = made({"baseline": (0, 0), "full": (1, 0)}, method_failed="full")
+    text = markdown(grids_of(plan, results), "T", notes_of(plan, results, verdict(plan, results), False))
+    assert "full on lab-uneven, seed 2: failed. it \\| broke" in text
+    assert re.search(r"\| VDGS \(full\) \| – \|", text)
+    assert draw_groups(tmp_path / "groups.png", plan, results)
+    assert not draw_groups(tmp_path / "none.png", plan, [])
+    assert not (tmp_path / "none.png").exists()
+
+
+def test_groups_have_names():
+    assert group_names(4) == ["least seen quarter", "quarter 2", "quarter 3", "best seen quarter"]
+    assert group_names(1) == ["all pixels"]
+
+
+@pytest.mark.parametrize(("validation", "views"), [(False, "Test views"), (True, "Validation views")])
+def test_a_table_says_which_views_it_is_measured_on(validation, views):
+    results = made({}, seeds=1)
+    plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full"), validation=validation))
+    titles = [grid.title for grid in grids_of(plan, results)]
+    assert titles[0].startswith(f"{views}, raw")
+    assert titles[1].startswith(f"{views}, colour-corrected")
+
+
+def test_methods_that_get_more_are_no_rivals():
+    plan = make_plan("longer", Choices(scenes=("lab-even",)))
+    results = [
+        Result("lab-even", name, seed, "done", figures={"psnr": psnr})
+        for name, psnr in (("baseline", 20.95), ("full", 21.0), ("longer-2", 22.0))
+        for seed in range(3)
+    ]
+    (line,) = verdict(plan, results)
+    assert line.answer is True
+    assert "longer" not in str(line)
+    assert "times as long" not in str(line)
