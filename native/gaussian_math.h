@@ -98,7 +98,8 @@ struct Camera {
 };
 
 // From vdgs.cameras.Camera.packed: rotation (9), translation (3), fx, fy, cx, cy, width, height,
-// orthographic, near.
+// orthographic, near, width and height of the whole picture. A part of a picture has the limits of the whole one:
+// else it would not show what that does.
 VDGS_FN Camera unpack_camera(const float* p) {
   Camera camera;
   camera.right = {p[0], p[1], p[2]};
@@ -114,8 +115,8 @@ VDGS_FN Camera unpack_camera(const float* p) {
   camera.width = p[16], camera.height = p[17];
   camera.orthographic = p[18] != 0.0f;
   camera.near = p[19];
-  camera.limit_x = kFrustumMargin * 0.5f * camera.width / camera.fx;
-  camera.limit_y = kFrustumMargin * 0.5f * camera.height / camera.fy;
+  camera.limit_x = kFrustumMargin * 0.5f * p[20] / camera.fx;
+  camera.limit_y = kFrustumMargin * 0.5f * p[21] / camera.fy;
   return camera;
 }
 

@@ -14,7 +14,7 @@ from vdgs.kernels.native import module
 from vdgs.kernels.native.decode import decode as native_decode
 from vdgs.kernels.reference.decode import decode as twin_decode
 
-CAMERAS = [looking_down(), looking_down("orthographic"), turned()]
+CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
 EVERY_ISA = pytest.mark.parametrize("isa", module.supported())
 BOTH = pytest.mark.parametrize("decode", [twin_decode, native_decode])
 NUMBERS = ("means_px", "conics", "depths", "colours", "opacities", "volumes")

@@ -17,7 +17,7 @@ from vdgs.kernels.native.project import project as native_project
 from vdgs.kernels.reference.project import project as twin_project
 from vdgs.kernels.reference.project import rotation_matrices
 
-CAMERAS = [looking_down(), looking_down("orthographic"), turned()]
+CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
 
 
 def gaussians(m: int, seed: int = 0, log_sigma: float = -2.0) -> tuple[torch.Tensor, ...]:

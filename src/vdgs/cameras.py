@@ -34,6 +34,8 @@ class Camera:
     width: int
     height: int
     model: CameraModel = "pinhole"
+    #: Width and height of the picture that this one is a part of (`cropped`); None: it is whole.
+    whole: tuple[int, int] | None = None
 
     @cached_property
     def position(self) -> np.ndarray:
@@ -48,15 +50,34 @@ class Camera:
 
     @cached_property
     def packed(self) -> np.ndarray:
-        """What the kernels read, [20] float32: rotation (9, row-major), translation (3),
-        fx, fy, cx, cy, width, height, orthographic (0 or 1), near."""
+        """What the kernels read, [22] float32: rotation (9, row-major), translation (3),
+        fx, fy, cx, cy, width, height, orthographic (0 or 1), near, width and height of the whole picture."""
         rigid = self.camera_from_world
         tail = [self.fx, self.fy, self.cx, self.cy, self.width, self.height,
-                float(self.model == "orthographic"), NEAR]  # fmt: skip
+                float(self.model == "orthographic"), NEAR, *self.whole_size]  # fmt: skip
         return np.concatenate([rigid[:3, :3].ravel(), rigid[:3, 3], tail]).astype(np.float32)
 
+    @property
+    def whole_size(self) -> tuple[int, int]:
+        """Width and height of the whole picture."""
+        return self.whole or (self.width, self.height)
+
+    def cropped(self, left: int, top: int, right: int, bottom: int) -> Camera:
+        """The part of this picture with columns `left` to `right` and rows `top` to `bottom`, both without the last:
+        what it draws is what the whole picture shows there. Raises ValueError where that is no part of it."""
+        if not (0 <= left < right <= self.width and 0 <= top < bottom <= self.height):
+            raise ValueError(
+                f"columns {left} to {right} and rows {top} to {bottom} are no part of a picture of "
+                f"{self.width}x{self.height}"
+            )
+        return replace(
+            self, cx=self.cx - left, cy=self.cy - top, width=right - left, height=bottom - top, whole=self.whole_size
+        )
+
     def resized(self, width: int, height: int) -> Camera:
-        """The same view on an image of another size."""
+        """The same view on an image of another size. Raises ValueError for a part of a picture."""
+        if self.whole is not None:
+            raise ValueError("resize the whole picture, then take a part of it")
         sx, sy = width / self.width, height / self.height
         return replace(
             self,

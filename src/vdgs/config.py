@@ -216,6 +216,9 @@ class BlockConfig:
     """Resolution schedule, as in the coarse stage."""
     average: float = 0.0
     """As in the coarse stage."""
+    crop: Literal["off", "steps", "pixels"] = "off"
+    """Draw only the part of each photograph in which the block has a share. `steps`: each step costs less; `pixels`: as
+    many pixels are drawn as without, in more steps, so that each place of the scene is drawn more often (choice)."""
     offset_rate: float = 0.4
     """The rates of the coarse stage start again, those of offsets times this."""
     scale_rate: float = 0.8
@@ -317,6 +320,7 @@ PRESETS: dict[str, MethodConfig] = {
             sampling="shares",
             resolutions=((0.0, 2), (0.3, 1)),
             average=0.5,
+            crop="pixels",
             offset_rate=2.0,
             scale_rate=2.0,
             feature_rate=2.0,

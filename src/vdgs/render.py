@@ -85,18 +85,25 @@ def render(
 
 
 @torch.no_grad()
+def paint(model: AnchorModel, values: Float[Tensor, " n"], camera: Camera) -> tuple[Tensor, Tensor]:
+    """A value per anchor in place of its colour, on black: the sum of the values that a pixel shows, each by its part
+    of the pixel, [h, w], and alpha, the sum of the parts, [h, w]."""
+    rows, splats = decode_view(model, camera)
+    k = model.anchors.offsets.shape[1]
+    of_splat = values[rows][splats.source.long() // k].float()
+    painted = kernels.rasterise(
+        splats.means_px, splats.conics, of_splat[:, None].expand(-1, 3).contiguous(), splats.opacities,
+        splats.depths, torch.zeros(3), camera.width, camera.height,
+    )  # fmt: skip
+    return painted.image[..., 0], painted.alpha
+
+
 def render_values(model: AnchorModel, values: Float[Tensor, " n"], camera: Camera) -> Float[Tensor, "h w"]:
     """A value per anchor drawn as a map: the alpha-weighted mean at each pixel, NaN where nothing is drawn.
 
     Used for visibility maps (V at each pixel).
     """
-    rows, splats = decode_view(model, camera)
-    k = model.anchors.offsets.shape[1]
     scale = float(values.max().clamp(min=1)) if len(values) else 1.0
-    of_splat = values[rows][splats.source.long() // k].float() / scale
-    painted = kernels.rasterise(
-        splats.means_px, splats.conics, of_splat[:, None].expand(-1, 3).contiguous(), splats.opacities,
-        splats.depths, torch.zeros(3), camera.width, camera.height,
-    )  # fmt: skip
-    value = painted.image[..., 0] / painted.alpha.clamp(min=1e-6) * scale
-    return torch.where(painted.alpha > 0.5, value, torch.full_like(value, float("nan")))
+    painted, alpha = paint(model, values / scale, camera)
+    value = painted / alpha.clamp(min=1e-6) * scale
+    return torch.where(alpha > 0.5, value, torch.full_like(value, float("nan")))

@@ -265,6 +265,10 @@ _CHOICES = [
         "printed-rates", "damped rates, as printed", with_block(offset_rate=0.4, scale_rate=0.8, feature_rate=1.0)
     ),
     Method("full-size", "full size throughout", with_block(resolutions=((0.0, 1),))),
+    Method("whole-photographs", "whole photographs", with_block(crop="off")),
+    Method(
+        "crop-steps", "parts of photographs, as many steps", with_block(crop="steps"), less="pixels in blocks",
+    ),
     Method("last-model", "the last model, no mean", with_block(average=0.0)),
     Method(
         "printed-compensation", "compensation as printed", lambda config, _: with_printed_compensation(config),

@@ -53,7 +53,10 @@ class PlannedRun:
 
     def key(self, capture: Mapping[str, Any], measured: Mapping[str, Any]) -> str:
         """Changes with everything that the run's result depends on."""
-        settings = {section: counted(section, values) for section, values in to_dict(self.config).items()}
+        plain = to_dict(self.config)
+        # A method without blocks does not depend on their settings.
+        sections = list(plain) if "blocks" in self.stages else ["training"]
+        settings = {section: counted(section, plain[section]) for section in sections}
         content = [self.stages, settings, dict(capture), dict(measured)]
         if self.stages == EXPLICIT:
             content.append(to_dict(gaussians_config(self.config)))

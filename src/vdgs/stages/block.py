@@ -24,7 +24,7 @@ from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import capture_facts
 from vdgs.captures.images import ImageCache
-from vdgs.config import BlockConfig, block_training
+from vdgs.config import BlockConfig, TrainConfig, block_training
 from vdgs.errors import RunError
 from vdgs.kernels import native as kernels
 from vdgs.partition.blocks import Blocks, load_blocks
@@ -35,6 +35,7 @@ from vdgs.stages.anchor_watching import continue_or_start, finish, identity, tra
 from vdgs.stages.coarse import camera_height, image_budget, note_without_growth, shares_for
 from vdgs.stages.opening import open_run
 from vdgs.training import Stage, Surroundings, start_state
+from vdgs.training.crops import Crop, crops_of, mean_area
 
 #: Cells on each side of the table of the ramp.
 RAMP_CELLS = 512
@@ -92,6 +93,11 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
         _keep_coarse(folder, replace(coarse, anchors=anchors, facts=facts), len(views), console)
         return
     config = block_training(method, len(views))
+    shares = shares_for(config, anchors, views)
+    crops = None
+    if method.block.crop != "off":
+        crops = crops_of(coarse, own, [view.camera for view in views])
+        config = with_crops(config, method.block, crops, shares)
     note_without_growth(config, console, "--block.")
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
     with ImageCache(views, image_budget(options), downscales=factors) as images:
@@ -99,7 +105,7 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
             config, images, len(views), coarse.voxel, camera_height(capture), coarse.background,
             frozen_decoder=method.block.decoder == "frozen", surroundings=Surroundings(surroundings, coarse.decoder),
             may_hold=holds(blocks, index, method.block), mobility=ramp(blocks, index, method.block),
-            appearance_of=chosen, shares=shares_for(config, anchors, views),
+            appearance_of=chosen, shares=shares, crops=crops,
         )  # fmt: skip
         state = continue_or_start(folder, stage, lambda: start_state(anchors, coarse.decoder.copy(), stage), console)
         console.print(
@@ -115,6 +121,16 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
         facts | {"iterations": state.iteration, "decoder": method.block.decoder},
     )
     finish(folder, state, model, console)
+
+
+def with_crops(
+    config: TrainConfig, block: BlockConfig, crops: Sequence[Crop], shares: Sequence[float] | None
+) -> TrainConfig:
+    """The settings of a block that draws parts of photographs: where pixels count, as many more steps as these are
+    smaller."""
+    if block.crop != "pixels":
+        return config
+    return replace(config, iterations=max(1, round(config.iterations / mean_area(crops, shares))))
 
 
 def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: Console) -> None:

@@ -22,6 +22,7 @@ from vdgs.render import decode_rows, visible_rows
 from vdgs.step import draw_view, move_anchors
 from vdgs.training.averaging import Average, counts_in_mean
 from vdgs.training.background import background_at
+from vdgs.training.crops import WHOLE
 from vdgs.training.growing import grow, reorder
 from vdgs.training.schedule import downscale_at, view_at
 from vdgs.training.state import Stage, StepReport, TrainingState
@@ -42,8 +43,7 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     config, iteration = stage.config, state.iteration
     downscale = downscale_at(iteration, config)
     view = view_at(iteration, stage.image_count, config.seed, stage.shares)
-    target, mask = stage.images.get(view, downscale)
-    camera = stage.images.camera(view, downscale)
+    target, mask, camera, share = _photograph(stage, view, downscale)
 
     rows = visible_rows(state.anchors, camera)
     weights = state.decoder.for_image(appearance_at(stage, view))
@@ -62,14 +62,14 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
     (image_gradient,) = torch.autograd.grad(photometric.loss, image)
-    gradients = drawn.backward(image_gradient, volume_weight)
+    gradients = drawn.backward(share * image_gradient, volume_weight)
     psnr = _psnr(image.detach(), target, mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
     state.whole = False
     _move(state, stage, rows, gradients, weights, camera)
 
     growing = iteration + 1 <= config.growth.until * config.iterations
     if growing and iteration + 1 > config.growth.statistics_from:
-        state.statistics.add_view(rows, drawn.source, drawn.opacities, gradients.means_px, camera.width, camera.height)
+        state.statistics.add_view(rows, drawn.source, drawn.opacities, gradients.means_px, *camera.whole_size)
     state.iteration += 1
     report = StepReport(value, float(photometric.l1), float(photometric.ssim), len(rows), len(drawn.source))
     if growing and state.iteration >= config.growth.start and state.iteration % config.growth.interval == 0:
@@ -81,6 +81,24 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     _smooth(state, value, psnr)
     state.whole = True
     return report
+
+
+def _photograph(stage: Stage, view: int, downscale: int) -> tuple[Tensor, Tensor | None, Camera, float]:
+    """What a step is to draw: the photograph, its mask, its camera, or those of the part that the stage wants of it.
+
+    Last the share of the photograph's pixels that count in that part. Gradients are multiplied by it: those of a mean
+    over the part become those of a mean over the whole picture, in which thresholds of growth are given.
+    """
+    target, mask = stage.images.get(view, downscale)
+    camera = stage.images.camera(view, downscale)
+    if stage.crops is None or stage.crops[view] == WHOLE:
+        return target, mask, camera, 1.0
+    left, top, right, bottom = stage.crops[view].pixels(camera.width, camera.height)
+    part = camera.cropped(left, top, right, bottom)
+    if mask is None:
+        return target[top:bottom, left:right], None, part, (right - left) * (bottom - top) / (camera.width * camera.height)
+    kept = mask[top:bottom, left:right]
+    return target[top:bottom, left:right], kept, part, int(kept.count_nonzero()) / max(int(mask.count_nonzero()), 1)
 
 
 @torch.no_grad()

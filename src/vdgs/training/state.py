@@ -21,6 +21,7 @@ from vdgs.decoder import Decoder
 from vdgs.growth import Statistics
 from vdgs.optimiser import Moments, Optimiser
 from vdgs.training.averaging import Average
+from vdgs.training.crops import Crop
 
 
 @runtime_checkable
@@ -97,6 +98,8 @@ class Stage:
     appearance_of: Sequence[int] | None = None
     #: How often each view is used, in proportion; None: all alike.
     shares: tuple[float, ...] | None = None
+    #: The part of each view that is drawn; None: all of all.
+    crops: tuple[Crop, ...] | None = None
 
 
 @dataclass(frozen=True)

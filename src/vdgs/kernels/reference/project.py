@@ -89,8 +89,8 @@ def _axes_px(
         along_y = (camera.fy * rotation[1]).expand_as(local)
     else:
         z = local[:, 2:3]
-        limit_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
-        limit_y = FRUSTUM_MARGIN * 0.5 * camera.height / camera.fy
+        limit_x = FRUSTUM_MARGIN * 0.5 * camera.whole_size[0] / camera.fx
+        limit_y = FRUSTUM_MARGIN * 0.5 * camera.whole_size[1] / camera.fy
         u = (local[:, 0:1] / z).clamp(-limit_x, limit_x)
         v = (local[:, 1:2] / z).clamp(-limit_y, limit_y)
         along_x = camera.fx / z * (rotation[0] - u * rotation[2])

@@ -1,0 +1,98 @@
+"""The part of each photograph that shows a block: what lies outside teaches the block nothing, so it is not drawn.
+
+A block's anchors are painted white, all others black; where the picture is not black they have a share in its pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from vdgs.anchors import AnchorModel
+from vdgs.cameras import Camera
+from vdgs.render import paint
+
+#: Longest side in pixels at which the parts are looked for.
+LONGEST_SIDE_PX = 320
+#: A pixel shows a block where the block's anchors have at least this share in it (choice).
+LEAST_SHARE = 0.1
+#: So much of what a photograph shows of a block may lie outside of each side of its part: single pixels seen through
+#: gaps would else open it wide (choice).
+CUT_OFF = 0.005
+#: The part is widened by this share of the photograph's longest side, on each side (choice).
+MARGIN = 0.04
+#: A part as large as this is the whole photograph: nothing would be saved.
+NEARLY_ALL = 0.9
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A rectangle in a photograph, its sides as shares of the width and height."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+    @property
+    def area(self) -> float:
+        """Share of the photograph's pixels."""
+        return (self.right - self.left) * (self.bottom - self.top)
+
+    def pixels(self, width: int, height: int) -> tuple[int, int, int, int]:
+        """Left, top, right, bottom in a photograph of that size, at least one pixel wide and high: [left, right)."""
+        left, top = (math.floor(share * size) for share, size in ((self.left, width), (self.top, height)))
+        left, top = min(left, width - 1), min(top, height - 1)
+        return left, top, max(math.ceil(self.right * width), left + 1), max(math.ceil(self.bottom * height), top + 1)
+
+
+#: The whole photograph.
+WHOLE = Crop(0.0, 0.0, 1.0, 1.0)
+
+
+def crops_of(model: AnchorModel, own: Bool[Tensor, " n"], cameras: Sequence[Camera]) -> tuple[Crop, ...]:
+    """For each camera the part of its picture in which anchors `own` of the model have a share.
+
+    The whole picture where that is nearly all of it, and where it is nothing: what a camera was given for is then not
+    on the coarse model's surface.
+    """
+    return tuple(_crop(_own_share(model, own, camera)) for camera in cameras)
+
+
+def _own_share(model: AnchorModel, own: Bool[Tensor, " n"], camera: Camera) -> Float[np.ndarray, "h w"]:
+    """What share the anchors have in each pixel of a small picture."""
+    factor = min(1.0, LONGEST_SIDE_PX / max(camera.width, camera.height))
+    small = camera.resized(max(1, round(factor * camera.width)), max(1, round(factor * camera.height)))
+    return paint(model, own.float(), small)[0].numpy()
+
+
+def _crop(share: Float[np.ndarray, "h w"]) -> Crop:
+    shown = share >= LEAST_SHARE
+    if not shown.any():
+        return WHOLE
+    height, width = shown.shape
+    margin = MARGIN * max(width, height)
+    left, right = _span(shown.sum(0), margin)
+    top, bottom = _span(shown.sum(1), margin)
+    crop = Crop(left, top, right, bottom)
+    return WHOLE if crop.area >= NEARLY_ALL else crop
+
+
+def _span(counts: Int[np.ndarray, " s"], margin: float) -> tuple[float, float]:
+    """First and last place of a row of pixels, as shares of its length, between which all but `CUT_OFF` on each side
+    of the counts lie, widened by `margin` pixels."""
+    reached = np.cumsum(counts) / counts.sum()
+    first = int(np.searchsorted(reached, CUT_OFF, side="right"))
+    last = int(np.searchsorted(reached, 1 - CUT_OFF)) + 1
+    size = len(counts)
+    return max(first - margin, 0) / size, min(last + margin, size) / size
+
+
+def mean_area(crops: Sequence[Crop], shares: Sequence[float] | None) -> float:
+    """Share of a photograph that a step draws on average, photographs being used in proportion to `shares`."""
+    return float(np.average([crop.area for crop in crops], weights=shares))
