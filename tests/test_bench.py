@@ -75,7 +75,10 @@ def models(output: Path) -> dict[Path, int]:
 def test_a_bench_that_was_killed_continues_to_its_tables(benched):
     results = json.loads((benched / "toy" / "results.json").read_text())
     assert [(each["method"], each["state"]) for each in results["results"]] == [("baseline", "done"), ("full", "done")]
-    assert {each["figures"]["iterations"] for each in results["results"]} == {60}
+    assert results["results"][0]["figures"]["iterations"] == 60
+    for each in results["results"]:  # blocks may draw smaller pictures in more iterations
+        assert each["figures"]["iterations"] >= 60
+        assert each["figures"]["photographs"] == pytest.approx(60, abs=2)
     for each in results["results"]:
         assert 5 < each["figures"]["psnr"] < 40
         assert each["figures"]["psnr@0"] is not None

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from decode_scenes import Scene, looking_down, turned
 from test_block import block_stage, coarse
 from vdgs.anchors import AnchorModel
-from vdgs.config import BlockConfig, MethodConfig, block_training
+from vdgs.config import BlockConfig, MethodConfig
 from vdgs.kernels import native, reference
 from vdgs.render import paint
-from vdgs.stages.block import split_anchors, with_crops
+from vdgs.stages.block import split_anchors
 from vdgs.training import from_saved, to_saved, train, train_step
 from vdgs.training.crops import CUT_OFF, LEAST_SHARE, MARGIN, NEARLY_ALL, WHOLE, Crop, crops_of, mean_area
 
@@ -29,9 +29,7 @@ def drawn(scene: Scene, camera, part, kernels) -> torch.Tensor:
     """What the part of the camera's picture draws of the anchors that the whole picture draws."""
     rows = kernels.cull(scene.positions, scene.log_scales, camera)
     part = camera.cropped(*part)
-    splats = kernels.decode(
-        scene.positions, scene.features, scene.offsets, scene.log_scales, scene.weights, part, rows
-    )
+    splats = kernels.decode(scene.positions, scene.features, scene.offsets, scene.log_scales, scene.weights, part, rows)
     raster = kernels.rasterise(
         splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths, torch.tensor([0.1, 0.5, 0.9]),
         part.width, part.height,
@@ -83,7 +81,9 @@ def test_a_part_keeps_the_size_of_the_whole_and_must_lie_in_it():
 
 @settings(deadline=None)
 @given(
-    sides=st.tuples(*[st.floats(0, 1)] * 4), width=st.integers(1, 300), height=st.integers(1, 300),
+    sides=st.tuples(*[st.floats(0, 1)] * 4),
+    width=st.integers(1, 300),
+    height=st.integers(1, 300),
 )
 def test_pixels_of_a_part_cover_it_and_lie_in_the_photograph(sides, width, height):
     (left, right), (top, bottom) = sorted(sides[:2]), sorted(sides[2:])
@@ -134,13 +134,6 @@ def test_the_mean_area_is_that_of_the_photographs_as_they_are_used():
     crops = [WHOLE, Crop(0, 0, 0.5, 0.5)]
     assert mean_area(crops, None) == pytest.approx(0.625)
     assert mean_area(crops, (1.0, 3.0)) == pytest.approx((1 + 3 * 0.25) / 4)
-
-
-def test_pixels_become_steps_only_where_they_are_counted():
-    crops = [Crop(0, 0, 0.5, 1)] * 3
-    config = block_training(MethodConfig(), 3)
-    assert with_crops(config, BlockConfig(crop="pixels"), crops, None).iterations == 2 * config.iterations
-    assert with_crops(config, BlockConfig(crop="steps"), crops, None) == config
 
 
 def in_parts(stage, crop: Crop):

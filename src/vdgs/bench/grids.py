@@ -60,6 +60,7 @@ CORRECTED = (
 )  # fmt: skip
 COSTS = (
     Column("iterations", "iterations", 0, 0),
+    Column("photographs drawn", "photographs", 0, 0),
     Column("anchors", "anchors", 0, 0),
     Column("Gaussians", "gaussians", 0, 0),
     Column("blocks", "blocks", 0, 0),

@@ -52,6 +52,12 @@ def without_blocking(config: MethodConfig, budget: Budget) -> MethodConfig:
     )
 
 
+def without_blocking_as_long(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """One block of the whole scene, trained as long as one of several: as much time, if those are trained at once."""
+    one = without_blocking(config, budget)
+    return replace(one, block=replace(one.block, iterations=budget.per_block))
+
+
 def without_anchor_generation(config: MethodConfig, _budget: Budget) -> MethodConfig:
     """Blocks grow anchors as the coarse stage does."""
     return _compensated(config, enabled=False)
@@ -205,9 +211,16 @@ _ABLATIONS = [
         as_printed,
         cites="VDGS, sections III-B and III-C",
         differs="blocks of the paper: frozen decoder, even use of photographs, damped rates, full size, no mean of "
-        "models, share of 0.45, its compensation; growth, coarse stage and cut as `full`",
+        "models, whole photographs, share of 0.45, its compensation; growth, coarse stage and cut as `full`",
     ),
+    Method("whole-photographs", "VDGS (full), whole photographs", with_block(crop="off")),
     Method("no-blocking", "w/o blocking", without_blocking, cites="VDGS, Table II (b)"),
+    Method(
+        "no-blocking-as-long",
+        "w/o blocking, as long as one block",
+        without_blocking_as_long,
+        less="iterations of the coarse stage and one block: as much time, if all blocks are trained at once",
+    ),
     Method("no-anchor-generation", "w/o anchor generation", without_anchor_generation, cites="VDGS, Table II (c)"),
 ]
 _OTHERS = [
@@ -265,10 +278,6 @@ _CHOICES = [
         "printed-rates", "damped rates, as printed", with_block(offset_rate=0.4, scale_rate=0.8, feature_rate=1.0)
     ),
     Method("full-size", "full size throughout", with_block(resolutions=((0.0, 1),))),
-    Method("whole-photographs", "whole photographs", with_block(crop="off")),
-    Method(
-        "crop-steps", "parts of photographs, as many steps", with_block(crop="steps"), less="pixels in blocks",
-    ),
     Method("last-model", "the last model, no mean", with_block(average=0.0)),
     Method(
         "printed-compensation", "compensation as printed", lambda config, _: with_printed_compensation(config),

@@ -41,6 +41,9 @@ def _fairness(plan: Plan) -> str:
         "Same photographs, sparse points, split and total of iterations for all methods of a scene, but for rows of "
         "which it is said below that they get less or more; where a cut gives fewer blocks than asked for, a method "
         "gets fewer iterations, as its row says.",
+        "Where a block draws only the part of each photograph that shows it (--block.crop pixels), its share of the "
+        "total counts photographs' worth of pixels: it makes more iterations, of smaller pictures. The method "
+        "`whole-photographs` does not.",
         "A coarse stage that several methods share is trained once; its time counts for each of them. Training time is "
         "the sum over all blocks, as if one after the other; it depends on how many runs went at once (--jobs).",
         "LPIPS is VGG with input in [-1, 1]; a dash means that no weights were given (--lpips-weights).",

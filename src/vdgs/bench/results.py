@@ -87,8 +87,8 @@ def _sizes(metrics: Mapping[str, Any], planned: PlannedRun) -> dict[str, float |
 
 
 def _costs(run: RunFolder, names: Sequence[str], stages: Mapping[str, float]) -> dict[str, float | None]:
-    """Iterations, seconds, memory and cameras of a run with the stages `names`. The shared coarse stage counts in full
-    for each run that takes it."""
+    """Iterations, photographs drawn, seconds, memory and cameras of a run with the stages `names`. The shared coarse
+    stage counts in full for each run that takes it."""
     blocks = "blocks" in names
     coarse = (gaussians_folder(run.path) if tuple(names) == EXPLICIT else run.coarse).status()
     trained = [folder.status() for folder in run.block_folders()] if blocks else []
@@ -97,6 +97,7 @@ def _costs(run: RunFolder, names: Sequence[str], stages: Mapping[str, float]) ->
     peaks = [each.get("peak_memory_bytes") or 0 for each in [coarse, *trained]]
     return {
         "iterations": coarse.get("iteration", 0) + sum(each.get("iteration", 0) for each in trained),
+        "photographs": _drawn(coarse) + sum(_drawn(each) for each in trained),
         "coarse_seconds": coarse.get("seconds"),
         "block_seconds": sum(seconds) if blocks else None,
         "longest_block_seconds": max(seconds, default=None),
@@ -108,3 +109,8 @@ def _costs(run: RunFolder, names: Sequence[str], stages: Mapping[str, float]) ->
         "coarse_anchors": coarse.get("anchors"),
         "cameras_per_block": sum(row["cameras"] for row in rows) / len(rows) if rows else None,
     }
+
+
+def _drawn(status: Mapping[str, Any]) -> float:
+    """How many photographs' worth of pixels a stage drew: fewer than its steps where these draw parts."""
+    return float(status.get("photographs", status.get("iteration", 0)))

@@ -23,16 +23,18 @@ _ABLATION = (
     "coarse-as-long",
     "baseline",
     "baseline-mean",
+    "no-blocking-as-long",
     "no-blocking",
     "no-anchor-generation",
     "printed",
+    "whole-photographs",
     "full",
 )
 
 #: Each departs from the full method in one choice, or says beside it in what else.
 CHOICES = (
-    "full", "frozen-decoder", "even-sampling", "printed-rates", "full-size", "last-model", "no-anchor-generation",
-    "printed-compensation", "share-0.45", "literal-assignment", "leave-one-out", "frustum",
+    "full", "frozen-decoder", "even-sampling", "printed-rates", "full-size", "last-model", "whole-photographs",
+    "no-anchor-generation", "printed-compensation", "share-0.45", "literal-assignment", "leave-one-out", "frustum",
     "no-context", "free-ring", "literal-gate", "cap",
 )  # fmt: skip
 

@@ -74,12 +74,14 @@ def train_watched(
     watch(training, loop)
 
 
-def finish(folder: StageFolder, state: TrainingState, model: AnchorModel, console: Console) -> None:
-    """Save the model of a stage that is complete, mark it done and say so."""
+def finish(folder: StageFolder, state: TrainingState, model: AnchorModel, console: Console, area: float = 1.0) -> None:
+    """Save the model of a stage that is complete, mark it done and say so. `area`: mean share of a photograph that a
+    step drew."""
     save_state(folder.checkpoints, to_saved(state))
     model.save(folder.model)
     folder.set_status(
-        "done", iteration=state.iteration, iterations=state.iteration, anchors=len(state.anchors),
+        "done", iteration=state.iteration, iterations=state.iteration, photographs=round(area * state.iteration, 1),
+        anchors=len(state.anchors),
         model=identity(folder.model),
         seconds=state.seconds, psnr_training=None if math.isnan(state.psnr) else state.psnr,
         peak_memory_bytes=state.peak_memory_bytes,

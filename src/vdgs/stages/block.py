@@ -24,7 +24,7 @@ from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import capture_facts
 from vdgs.captures.images import ImageCache
-from vdgs.config import BlockConfig, TrainConfig, block_training
+from vdgs.config import BlockConfig, block_training
 from vdgs.errors import RunError
 from vdgs.kernels import native as kernels
 from vdgs.partition.blocks import Blocks, load_blocks
@@ -35,7 +35,7 @@ from vdgs.stages.anchor_watching import continue_or_start, finish, identity, tra
 from vdgs.stages.coarse import camera_height, image_budget, note_without_growth, shares_for
 from vdgs.stages.opening import open_run
 from vdgs.training import Stage, Surroundings, start_state
-from vdgs.training.crops import Crop, crops_of, mean_area
+from vdgs.training.crops import crops_of, mean_area
 
 #: Cells on each side of the table of the ramp.
 RAMP_CELLS = 512
@@ -94,10 +94,10 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
         return
     config = block_training(method, len(views))
     shares = shares_for(config, anchors, views)
-    crops = None
-    if method.block.crop != "off":
-        crops = crops_of(coarse, own, [view.camera for view in views])
-        config = with_crops(config, method.block, crops, shares)
+    crops = None if method.block.crop == "off" else crops_of(coarse, own, [view.camera for view in views])
+    area = mean_area(crops, shares) if crops else 1.0
+    if method.block.crop == "pixels":
+        config = replace(config, iterations=round(config.iterations / area))
     note_without_growth(config, console, "--block.")
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
     with ImageCache(views, image_budget(options), downscales=factors) as images:
@@ -110,7 +110,8 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
         state = continue_or_start(folder, stage, lambda: start_state(anchors, coarse.decoder.copy(), stage), console)
         console.print(
             f"block {index}: {len(views)} of {len(capture.train_views)} training views, {int(own.sum()):,} anchors of "
-            f"its own, {len(surroundings):,} around it, {config.iterations:,} iterations",
+            f"its own, {len(surroundings):,} around it, {config.iterations:,} iterations"
+            + (f", {area:.0%} of a photograph each" if crops else ""),
             highlight=False,
         )
         train_watched(folder, state, stage, options, console)
@@ -120,17 +121,7 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
         coarse.background,
         facts | {"iterations": state.iteration, "decoder": method.block.decoder},
     )
-    finish(folder, state, model, console)
-
-
-def with_crops(
-    config: TrainConfig, block: BlockConfig, crops: Sequence[Crop], shares: Sequence[float] | None
-) -> TrainConfig:
-    """The settings of a block that draws parts of photographs: where pixels count, as many more steps as these are
-    smaller."""
-    if block.crop != "pixels":
-        return config
-    return replace(config, iterations=max(1, round(config.iterations / mean_area(crops, shares))))
+    finish(folder, state, model, console, area)
 
 
 def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: Console) -> None:

@@ -94,11 +94,12 @@ def _photograph(stage: Stage, view: int, downscale: int) -> tuple[Tensor, Tensor
     if stage.crops is None or stage.crops[view] == WHOLE:
         return target, mask, camera, 1.0
     left, top, right, bottom = stage.crops[view].pixels(camera.width, camera.height)
+    inside = (slice(top, bottom), slice(left, right))
     part = camera.cropped(left, top, right, bottom)
     if mask is None:
-        return target[top:bottom, left:right], None, part, (right - left) * (bottom - top) / (camera.width * camera.height)
-    kept = mask[top:bottom, left:right]
-    return target[top:bottom, left:right], kept, part, int(kept.count_nonzero()) / max(int(mask.count_nonzero()), 1)
+        return target[inside], None, part, part.width * part.height / (camera.width * camera.height)
+    kept = mask[inside]
+    return target[inside], kept, part, int(kept.count_nonzero()) / max(int(mask.count_nonzero()), 1)
 
 
 @torch.no_grad()
