@@ -17,6 +17,7 @@ from vdgs.config import BlockConfig, MethodConfig
 from vdgs.kernels import native, reference
 from vdgs.render import paint
 from vdgs.stages.block import split_anchors
+from vdgs.stages.memory_notes import need_of
 from vdgs.training import from_saved, to_saved, train, train_step
 from vdgs.training.crops import CUT_OFF, LEAST_SHARE, MARGIN, NEARLY_ALL, WHOLE, Crop, crops_of, mean_area
 
@@ -157,6 +158,14 @@ def test_a_block_in_parts_is_stopped_and_continued_with_the_same_bits():
     _, broken = block_stage(BlockConfig())
     trained_bits(stage, broken, until=17)
     assert trained_bits(stage, from_saved(to_saved(broken), stage)) == trained_bits(stage, state)
+
+
+def test_memory_is_that_of_the_largest_part():
+    stage, state = block_stage(BlockConfig())
+    camera = stage.images.camera(0)
+    left, top, right, bottom = Crop(0.0, 0.0, 0.5, 0.5).pixels(camera.width, camera.height)
+    assert need_of(state, stage).pixels == camera.width * camera.height
+    assert need_of(state, in_parts(stage, Crop(0.0, 0.0, 0.5, 0.5))).pixels == (right - left) * (bottom - top)
 
 
 def test_anchors_outside_of_all_parts_do_not_move():

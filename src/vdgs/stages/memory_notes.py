@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import psutil
 from rich.console import Console
 
+from vdgs.cameras import Camera
 from vdgs.kernels import native as kernels
 from vdgs.memory import available_bytes
 from vdgs.memory_estimate import Advice, Kind, Need, advice, describe, estimate, in_gb
 from vdgs.training import Stage, TrainingState
+from vdgs.training.crops import Crop
 
 #: Views in which the anchors are counted, evenly chosen.
 VIEWS_COUNTED = 16
@@ -39,11 +42,17 @@ def need_of(state: TrainingState, stage: Stage) -> Need:
         max_anchors=config.growth.max_anchors if growing else len(anchors),
         offsets=anchors.offsets.shape[1],
         seen=max(seen) / max(len(anchors), 1),
-        pixels=max(pixels),
+        pixels=max(pixels) if stage.crops is None else _largest_part(stage.crops, cameras),
         images_bytes=min(photographs, getattr(stage.images, "budget_bytes", photographs)),
         surroundings=0 if stage.surroundings is None else len(stage.surroundings.anchors),
         averaged=config.average > 0,
     )
+
+
+def _largest_part(crops: Sequence[Crop], cameras: Sequence[Camera]) -> int:
+    """Pixels of the largest picture that is drawn where photographs are drawn in part."""
+    parts = [crop.pixels(camera.width, camera.height) for crop, camera in zip(crops, cameras, strict=True)]
+    return max((right - left) * (bottom - top) for left, top, right, bottom in parts)
 
 
 def announce(need: Need, kind: Kind, console: Console) -> None:
