@@ -10,8 +10,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from block_support import BLOCKS, block_stage, coarse
 from decode_scenes import Scene, looking_down, turned
-from test_block import block_stage, coarse
 from vdgs.anchors import AnchorModel
 from vdgs.config import BlockConfig, MethodConfig
 from vdgs.kernels import native, reference
@@ -100,8 +100,6 @@ def model_and_own() -> tuple[AnchorModel, torch.Tensor]:
     """A plane of opaque anchors and those of the western block."""
     anchors, decoder = coarse()
     anchors = replace(anchors, log_scales=torch.full_like(anchors.log_scales, -1.0))
-    from test_block import BLOCKS
-
     own, _ = split_anchors(anchors, BLOCKS, 0, BlockConfig())
     return AnchorModel(anchors, decoder, 0.4, (0.0, 0.0, 0.0), {}), own
 

@@ -22,6 +22,7 @@ from vdgs.errors import TrainingDiverged
 from vdgs.kernels import native as kernels
 from vdgs.optimiser import Moments, rebuild
 from vdgs.training import PSNR_INTERVAL, TrainingImages, view_at
+from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
 
 
 @dataclass(frozen=True)
@@ -228,13 +229,10 @@ def _apply(state: GaussiansState, added: Gaussians, kept: Tensor) -> None:
 
 
 def _smooth(state: GaussiansState, loss: float, image: Tensor, target: Tensor, mask: Tensor | None) -> None:
-    state.loss = loss if math.isnan(state.loss) else 0.98 * state.loss + 0.02 * loss
-    if state.iteration % PSNR_INTERVAL == 0:
-        squared = (image.clamp(0, 1) - target.float() / 255.0) ** 2
-        counted = squared if mask is None else squared[mask > 0]
-        if counted.numel():
-            psnr = -10.0 * math.log10(max(float(counted.mean()), 1e-10))
-            state.psnr = psnr if math.isnan(state.psnr) else 0.9 * state.psnr + 0.1 * psnr
+    state.loss = smoothed(state.loss, loss, KEEP_LOSS)
+    psnr = psnr_of(image, target, mask) if state.iteration % PSNR_INTERVAL == 0 else None
+    if psnr is not None:
+        state.psnr = smoothed(state.psnr, psnr, KEEP_PSNR)
 
 
 def train(

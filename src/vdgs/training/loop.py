@@ -25,6 +25,7 @@ from vdgs.training.background import background_at
 from vdgs.training.crops import WHOLE
 from vdgs.training.growing import grow, reorder
 from vdgs.training.schedule import downscale_at, view_at
+from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
 from vdgs.training.state import Stage, StepReport, TrainingState
 
 #: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
@@ -63,7 +64,7 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
     (image_gradient,) = torch.autograd.grad(photometric.loss, image)
     gradients = drawn.backward(share * image_gradient, volume_weight)
-    psnr = _psnr(image.detach(), target, mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
+    psnr = psnr_of(image.detach(), target, mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
     state.whole = False
     _move(state, stage, rows, gradients, weights, camera)
 
@@ -142,28 +143,17 @@ def _average(state: TrainingState) -> None:
         state.average.add(state.anchors, state.decoder)
 
 
-def _psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float | None:
-    """PSNR of a training view; None where the mask keeps nothing."""
-    squared = (image.clamp(0, 1) - target.float() / 255.0) ** 2
-    counted = squared if mask is None else squared[mask > 0]
-    return -10.0 * math.log10(max(float(counted.mean()), 1e-10)) if counted.numel() else None
-
-
 def _smooth(state: TrainingState, loss: float, psnr: float | None) -> None:
     """Update the smoothed loss and, where it was taken, PSNR (for people and for the divergence check)."""
-    state.loss = _moving(state.loss, loss, 0.98)
+    state.loss = smoothed(state.loss, loss, KEEP_LOSS)
     if psnr is not None:
-        state.psnr = _moving(state.psnr, psnr, 0.9)
+        state.psnr = smoothed(state.psnr, psnr, KEEP_PSNR)
     if state.iteration > 100:
         state.best_loss = min(state.best_loss, state.loss)
         if state.loss > 0.3 and state.loss > 4 * state.best_loss:
             raise TrainingDiverged(
                 f"The smoothed loss rose to {state.loss:.3f} from {state.best_loss:.3f} by iteration {state.iteration}."
             )
-
-
-def _moving(before: float, value: float, keep: float) -> float:
-    return value if math.isnan(before) else keep * before + (1 - keep) * value
 
 
 def train(
