@@ -14,7 +14,7 @@ from rich.console import Console
 from captures_support import tiny_scene, write_colmap
 from vdgs.bench import bench
 from vdgs.bench.bench import BenchSettings, run_bench
-from vdgs.bench.explicit import gaussians_config, gaussians_folder
+from vdgs.bench.explicit import gaussians_config
 from vdgs.bench.measure import GROUPS_FILE
 from vdgs.bench.notes import notes_of
 from vdgs.bench.plan import Choices, make_plan
@@ -25,7 +25,9 @@ from vdgs.comparators import gaussian_watching
 from vdgs.comparators.gaussian_schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS, scheduled
 from vdgs.comparators.gaussian_training import GaussiansConfig
 from vdgs.config import MethodConfig
+from vdgs.errors import RunError
 from vdgs.run import RunFolder
+from vdgs.stages.opening import open_run
 from vdgs.stages.watching import Stopped
 
 
@@ -119,7 +121,9 @@ def test_alone_it_has_no_groups_and_other_settings_train_it_again(data, tmp_path
     assert (alone.state, alone.groups, alone.seen_by) == ("done", (), "")
     run = RunFolder(tmp_path / alone.folder)
     assert not (run.path / GROUPS_FILE).exists()
-    model = gaussians_folder(run.path).model
+    with pytest.raises(RunError, match=r"is a run of 3DGS .* pictures and figures are in .*evaluation"):
+        open_run(run.path)
+    model = run.gaussians.model
     before = model.stat().st_mtime_ns
     (run.path / "bench.json").unlink()  # measured again, not trained
     assert benched(data, tmp_path, "3dgs")["3dgs"].figures["psnr"] == alone.figures["psnr"]
@@ -140,7 +144,7 @@ def test_a_stopped_run_continues(data, tmp_path, monkeypatch):
         patched.setattr(gaussian_watching, "train", half)
         with pytest.raises(Stopped):
             benched(data, tmp_path / "half", "3dgs")
-    folder = gaussians_folder(tmp_path / "half" / whole.folder)
+    folder = RunFolder(tmp_path / "half" / whole.folder).gaussians
     assert json.loads(folder.status_file.read_text())["iteration"] == 20
     continued = benched(data, tmp_path / "half", "3dgs")["3dgs"]
     assert continued.figures["psnr"] == whole.figures["psnr"]

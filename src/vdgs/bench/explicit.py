@@ -13,7 +13,7 @@ from vdgs.comparators.gaussian_schedule import scheduled
 from vdgs.comparators.gaussian_training import GaussiansConfig
 from vdgs.comparators.gaussians import run_gaussians
 from vdgs.config import MethodConfig, to_dict
-from vdgs.run import RunFolder, StageFolder
+from vdgs.run import RunFolder
 
 
 def gaussians_config(method: MethodConfig) -> GaussiansConfig:
@@ -26,11 +26,6 @@ def gaussians_config(method: MethodConfig) -> GaussiansConfig:
     return scheduled(training.iterations, published, most)
 
 
-def gaussians_folder(run: Path) -> StageFolder:
-    """Where the Gaussians of a run are."""
-    return StageFolder(run / "gaussians")
-
-
 def train_explicit(run: RunFolder, capture: Capture, lpips_weights: Path | None, console: Console) -> None:
     """Train, or continue, 3DGS for the settings of a run and measure it. What was trained for other settings or on
     another choice of photographs goes first (that it may go was asked before: `RunFolder.change`).
@@ -40,5 +35,5 @@ def train_explicit(run: RunFolder, capture: Capture, lpips_weights: Path | None,
     config = gaussians_config(run.method())
     made_for = json.dumps([run.keys().coarse, to_dict(config)], sort_keys=True)
     with run.locked():
-        gaussians_folder(run.path).claim(hashlib.sha256(made_for.encode()).hexdigest()[:16])
+        run.gaussians.claim(hashlib.sha256(made_for.encode()).hexdigest()[:16])
     run_gaussians(run, capture, config, console, lpips_weights=lpips_weights)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from vdgs.bench.definitions import EXPLICIT
-from vdgs.bench.explicit import gaussians_folder
 from vdgs.bench.measure import GROUPS_FILE, evaluated
 from vdgs.bench.plan import Plan, PlannedRun
 from vdgs.bench.processes import Ended
@@ -90,7 +89,7 @@ def _costs(run: RunFolder, names: Sequence[str], stages: Mapping[str, float]) ->
     """Iterations, photographs drawn, seconds, memory and cameras of a run with the stages `names`. The shared coarse
     stage counts in full for each run that takes it."""
     blocks = "blocks" in names
-    coarse = (gaussians_folder(run.path) if tuple(names) == EXPLICIT else run.coarse).status()
+    coarse = (run.gaussians if tuple(names) == EXPLICIT else run.coarse).status()
     trained = [folder.status() for folder in run.block_folders()] if blocks else []
     rows = run.partition_facts().get("blocks", []) if blocks else []
     seconds = [float(each.get("seconds") or 0) for each in trained]

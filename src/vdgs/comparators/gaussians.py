@@ -67,7 +67,7 @@ def run_gaussians(
 
     Raises what `train_gaussians` and `evaluate_gaussians` raise.
     """
-    folder = StageFolder(run.path / "gaussians")
+    folder = run.gaussians
     with run.locked():
         model = train_gaussians(capture, config, folder.path, console, options=options)
         write_json(run.capture_file, capture_facts(capture))

@@ -49,6 +49,11 @@ def open_run(path: Path, which: ModelName = "best") -> TrainedRun:
     stage = folder.merged if name == "merged" else folder.coarse
     key = folder.keys().merge if name == "merged" else folder.keys().coarse
     if not stage.is_done(key):
+        if folder.gaussians.path.is_dir():
+            raise RunError(
+                f"{path}: is a run of 3DGS from `vdgs bench`; only runs with anchors can be opened. Its pictures and "
+                f"figures are in {path / 'evaluation'}."
+            )
         verb = "vdgs merge RUN" if name == "merged" else "the same `vdgs coarse` or `vdgs run` command"
         raise RunError(
             f"{path}: has no {name} model of its settings yet (state: {stage.status()['state']}). Run {verb} (again): "
