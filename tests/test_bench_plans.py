@@ -15,6 +15,7 @@ from vdgs.bench.worker import STAGES
 from vdgs.config import PRESETS, to_dict
 from vdgs.config_checks import validate
 from vdgs.errors import VdgsError
+from vdgs.stages.keys import SINCE
 from vdgs.verbs.benching import BenchArguments
 
 
@@ -135,8 +136,10 @@ def test_a_setting_that_came_later_leaves_older_runs_finished(monkeypatch):
 
     def of_then(config) -> dict:
         settings = to_dict(config)  # of everything, or of the coarse stage alone
-        for part in (settings, settings.get("training", {}), settings.get("block", {})):
-            part.pop("average", None)
+        for section, since in SINCE.items():
+            for part in (settings, settings.get(section, {})):
+                for name in since:
+                    part.pop(name, None)
         return settings
 
     now = keys()

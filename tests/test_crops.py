@@ -14,12 +14,26 @@ from block_support import BLOCKS, block_stage, coarse
 from decode_scenes import Scene, looking_down, turned
 from vdgs.anchors import AnchorModel
 from vdgs.config import BlockConfig, MethodConfig
+from vdgs.errors import RunError
 from vdgs.kernels import native, reference
 from vdgs.render import paint
 from vdgs.stages.block import split_anchors
 from vdgs.stages.memory_notes import need_of
 from vdgs.training import from_saved, to_saved, train, train_step
-from vdgs.training.crops import CUT_OFF, LEAST_SHARE, MARGIN, NEARLY_ALL, WHOLE, Crop, crops_of, mean_area
+from vdgs.training.crops import (
+    CUT_OFF,
+    LEAST_SHARE,
+    MARGIN,
+    MOST_STEPS,
+    NEARLY_ALL,
+    WHOLE,
+    Crop,
+    _crop,
+    crops_of,
+    load_or_find,
+    mean_area,
+    steps_for,
+)
 
 CAMERAS = [looking_down(), looking_down("orthographic"), turned()]
 ALL_OF = (0, 0, 64, 48)
@@ -135,6 +149,41 @@ def test_the_mean_area_is_that_of_the_photographs_as_they_are_used():
     assert mean_area(crops, (1.0, 3.0)) == pytest.approx((1 + 3 * 0.25) / 4)
 
 
+def test_few_pixels_make_more_steps_but_not_endlessly_many():
+    assert steps_for(100, 1.0) == 100
+    assert steps_for(100, 0.5) == 200
+    assert steps_for(100, 1e-4) == MOST_STEPS * 100
+
+
+def test_parts_are_found_once_and_kept(tmp_path):
+    def never():
+        raise AssertionError("looked for again")
+
+    path, found = tmp_path / "crops.json", (WHOLE, Crop(0.1, 0.2, 1 / 3, 0.9))
+    assert load_or_find(path, 2, lambda: found) == found
+    assert load_or_find(path, 2, never) == found
+    with pytest.raises(RunError, match=r"crops\.json: is damaged \(3 parts .* were expected\)\. Delete it"):
+        load_or_find(path, 3, never)
+    for damage in ("{}", '{"crops": [[0, 0, 1]]}', '{"crops": [[0, 0, 2, 1], [0, 0, 1, 1]]}', "nothing", "[1]"):
+        path.write_text(damage)
+        with pytest.raises(RunError, match=r"crops\.json"):
+            load_or_find(path, 2, never)
+
+
+def test_single_pixels_far_away_do_not_open_a_part_wide():
+    shown = np.zeros((100, 200), np.float32)
+    shown[40:60, 50:90] = 1
+    near = _crop(shown)
+    shown[2, 190] = shown[97, 3] = 1
+    assert _crop(shown) == near
+    left, top, right, bottom = near.pixels(200, 100)
+    margin = MARGIN * 200
+    assert left <= 50 - margin + 1
+    assert right >= 90 + margin - 1
+    assert top <= 40 - margin + 1
+    assert bottom >= 60 + margin - 1
+
+
 def in_parts(stage, crop: Crop):
     return replace(stage, crops=(crop,) * stage.image_count)
 
@@ -163,7 +212,8 @@ def test_memory_is_that_of_the_largest_part():
     camera = stage.images.camera(0)
     left, top, right, bottom = Crop(0.0, 0.0, 0.5, 0.5).pixels(camera.width, camera.height)
     assert need_of(state, stage).pixels == camera.width * camera.height
-    assert need_of(state, in_parts(stage, Crop(0.0, 0.0, 0.5, 0.5))).pixels == (right - left) * (bottom - top)
+    drawn, whole = (right - left) * (bottom - top), camera.width * camera.height
+    assert drawn < need_of(state, in_parts(stage, Crop(0.0, 0.0, 0.5, 0.5))).pixels < (drawn + whole) / 2
 
 
 def test_anchors_outside_of_all_parts_do_not_move():

@@ -79,6 +79,22 @@ def moments(run: Path) -> dict[str, int]:
     }
 
 
+def test_blocks_draw_parts_of_photographs_and_the_pixels_that_were_asked_for(unbroken, capture, tmp_path):
+    """250 photographs' worth of pixels in more steps, or 250 steps with fewer pixels: by the setting."""
+    shutil.copytree(unbroken, tmp_path / "run", ignore=shutil.ignore_patterns(".lock"))
+    for index, folder in enumerate(RunFolder(unbroken).block_folders()):
+        status, cameras = folder.status(), load_scores(unbroken / "partition" / "scores.npz")[2].cameras
+        assert status["iteration"] > 260
+        assert status["photographs"] == pytest.approx(250, abs=1)
+        assert len(json.loads((folder.path / "crops.json").read_text())["crops"]) == cameras[:, index].sum()
+    done = vdgs("run", capture, "--output", tmp_path / "run", *SETTINGS, "--block.crop", "steps", "--redo")
+    assert done.returncode == 0, done.stderr + done.stdout
+    for folder in RunFolder(tmp_path / "run").block_folders():
+        assert folder.status()["iteration"] == 250
+        assert folder.status()["photographs"] < 240
+    assert model(tmp_path / "run") != model(unbroken)
+
+
 def test_a_run_leaves_what_the_documents_say(unbroken):
     expected = [
         "config.yaml", "capture.json", "coarse/model.safetensors", "coarse/evaluation/metrics.json",

@@ -218,7 +218,8 @@ class BlockConfig:
     """As in the coarse stage."""
     crop: Literal["off", "steps", "pixels"] = "off"
     """Draw only the part of each photograph in which the block has a share. `steps`: each step costs less; `pixels`: as
-    many pixels are drawn as without, in more steps, so that each place of the scene is drawn more often (choice)."""
+    many pixels are drawn as without, in up to four times more steps, so that each place of the scene is drawn more
+    often: `iterations` then counts photographs, whatever their size (choice)."""
     offset_rate: float = 0.4
     """The rates of the coarse stage start again, those of offsets times this."""
     scale_rate: float = 0.8

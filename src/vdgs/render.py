@@ -85,9 +85,11 @@ def render(
 
 
 @torch.no_grad()
-def paint(model: AnchorModel, values: Float[Tensor, " n"], camera: Camera) -> tuple[Tensor, Tensor]:
+def paint(
+    model: AnchorModel, values: Float[Tensor, " n"], camera: Camera
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """A value per anchor in place of its colour, on black: the sum of the values that a pixel shows, each by its part
-    of the pixel, [h, w], and alpha, the sum of the parts, [h, w]."""
+    of the pixel, and alpha, the sum of the parts."""
     rows, splats = decode_view(model, camera)
     k = model.anchors.offsets.shape[1]
     of_splat = values[rows][splats.source.long() // k].float()

@@ -1,7 +1,7 @@
 """The methods: VDGS, its ablations, its parameter sweeps and the partitions of others.
 
 All but 3DGS share the anchor model, the loss and the block training of this package; all spend the same total of
-iterations.
+iterations, one photograph each (blocks that draw parts of photographs: as many photographs in more iterations).
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ _ABLATIONS = [
         "no-blocking-as-long",
         "w/o blocking, as long as one block",
         without_blocking_as_long,
-        less="iterations of the coarse stage and one block: as much time, if all blocks are trained at once",
+        less="photographs of the coarse stage and one block: as much time, if all blocks are trained at once",
     ),
     Method("no-anchor-generation", "w/o anchor generation", without_anchor_generation, cites="VDGS, Table II (c)"),
 ]

@@ -36,18 +36,24 @@ def notes_of(plan: Plan, results: Sequence[Result], lines: Sequence[Line], figur
     return [part for part in parts if part]
 
 
+_PARTS = (
+    "Where blocks draw only the part of each photograph that shows them (--block.crop pixels), their share of the "
+    "total counts photographs, whatever their size: they make more iterations, of smaller pictures (and so decide more "
+    "often about growth). The columns have both; in rows where these are the same, blocks draw whole photographs."
+)
+
+
 def _fairness(plan: Plan) -> str:
     said = [
         "Same photographs, sparse points, split and total of iterations for all methods of a scene, but for rows of "
         "which it is said below that they get less or more; where a cut gives fewer blocks than asked for, a method "
         "gets fewer iterations, as its row says.",
-        "Where a block draws only the part of each photograph that shows it (--block.crop pixels), its share of the "
-        "total counts photographs' worth of pixels: it makes more iterations, of smaller pictures. The method "
-        "`whole-photographs` does not.",
         "A coarse stage that several methods share is trained once; its time counts for each of them. Training time is "
         "the sum over all blocks, as if one after the other; it depends on how many runs went at once (--jobs).",
         "LPIPS is VGG with input in [-1, 1]; a dash means that no weights were given (--lpips-weights).",
     ]
+    if any(run.config.block.crop == "pixels" for run in plan.runs if "blocks" in run.stages):
+        said.append(_PARTS)
     said += [
         f"{scene.title}: {budget.coarse:,} coarse iterations and {budget.blocks} × {budget.per_block:,} for blocks, "
         f"{budget.total:,} in all."

@@ -7,6 +7,7 @@ that no anchor covers would push the anchors at the boundary to fill the hole).
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +36,7 @@ from vdgs.stages.anchor_watching import continue_or_start, finish, identity, tra
 from vdgs.stages.coarse import camera_height, image_budget, note_without_growth, shares_for
 from vdgs.stages.opening import open_run
 from vdgs.training import Stage, Surroundings, start_state
-from vdgs.training.crops import crops_of, mean_area
+from vdgs.training.crops import crops_of, load_or_find, mean_area, steps_for
 
 #: Cells on each side of the table of the ramp.
 RAMP_CELLS = 512
@@ -94,10 +95,15 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
         return
     config = block_training(method, len(views))
     shares = shares_for(config, anchors, views)
-    crops = None if method.block.crop == "off" else crops_of(coarse, own, [view.camera for view in views])
+    began = time.monotonic()
+    crops = None
+    if method.block.crop != "off":
+        cameras = [view.camera for view in views]
+        crops = load_or_find(folder.path / "crops.json", len(views), lambda: crops_of(coarse, own, cameras))
     area = mean_area(crops, shares) if crops else 1.0
     if method.block.crop == "pixels":
-        config = replace(config, iterations=round(config.iterations / area))
+        config = replace(config, iterations=steps_for(config.iterations, area))
+    prepared = time.monotonic() - began
     note_without_growth(config, console, "--block.")
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
     with ImageCache(views, image_budget(options), downscales=factors) as images:
@@ -108,6 +114,7 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
             appearance_of=chosen, shares=shares, crops=crops,
         )  # fmt: skip
         state = continue_or_start(folder, stage, lambda: start_state(anchors, coarse.decoder.copy(), stage), console)
+        state.seconds += prepared
         console.print(
             f"block {index}: {len(views)} of {len(capture.train_views)} training views, {int(own.sum()):,} anchors of "
             f"its own, {len(surroundings):,} around it, {config.iterations:,} iterations"

@@ -18,6 +18,8 @@ from vdgs.training.crops import Crop
 
 #: Views in which the anchors are counted, evenly chosen.
 VIEWS_COUNTED = 16
+#: Of what is held for each pixel, one part in so many is of the photographs themselves (`BYTES_PER_PIXEL`).
+WHOLE_PHOTOGRAPH = 8
 #: After a failure: what a remedy should save, of all that the process takes.
 SAVE_SHARE = 0.3
 
@@ -50,9 +52,14 @@ def need_of(state: TrainingState, stage: Stage) -> Need:
 
 
 def _largest_part(crops: Sequence[Crop], cameras: Sequence[Camera]) -> int:
-    """Pixels of the largest picture that is drawn where photographs are drawn in part."""
-    parts = [crop.pixels(camera.width, camera.height) for crop, camera in zip(crops, cameras, strict=True)]
-    return max((right - left) * (bottom - top) for left, top, right, bottom in parts)
+    """Pixels of the largest picture that is drawn where photographs are drawn in part; a share of the rest is counted
+    too, for the photograph and the next ones in advance stay whole."""
+    found = 0
+    for crop, camera in zip(crops, cameras, strict=True):
+        left, top, right, bottom = crop.pixels(camera.width, camera.height)
+        drawn = (right - left) * (bottom - top)
+        found = max(found, drawn + (camera.width * camera.height - drawn) // WHOLE_PHOTOGRAPH)
+    return found
 
 
 def announce(need: Need, kind: Kind, console: Console) -> None:

@@ -1,13 +1,15 @@
-"""The part of each photograph that shows a block: what lies outside teaches the block nothing, so it is not drawn.
+"""The part of each photograph that shows a block: what lies outside teaches the block little, so it is not drawn.
 
-A block's anchors are painted white, all others black; where the picture is not black they have a share in its pixels.
+The coarse model says what shows it: the block's anchors are painted white, all others black, and where the picture is
+not black they have a share in its pixels.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,6 +17,8 @@ from torch import Tensor
 
 from vdgs.anchors import AnchorModel
 from vdgs.cameras import Camera
+from vdgs.errors import RunError, VdgsError
+from vdgs.files import read_json, write_json
 from vdgs.render import paint
 
 #: Longest side in pixels at which the parts are looked for.
@@ -24,7 +28,8 @@ LEAST_SHARE = 0.1
 #: So much of what a photograph shows of a block may lie outside of each side of its part: single pixels seen through
 #: gaps would else open it wide (choice).
 CUT_OFF = 0.005
-#: The part is widened by this share of the photograph's longest side, on each side (choice).
+#: The part is widened by this share of the photograph's longest side, on each side (choice). It also keeps off the
+#: block what SSIM sees at the border of a picture, where its windows of 11 pixels find nothing.
 MARGIN = 0.04
 #: A part as large as this is the whole photograph: nothing would be saved.
 NEARLY_ALL = 0.9
@@ -50,6 +55,9 @@ class Crop:
         left, top = min(left, width - 1), min(top, height - 1)
         return left, top, max(math.ceil(self.right * width), left + 1), max(math.ceil(self.bottom * height), top + 1)
 
+
+#: Smaller parts make at most so many times more steps: a step costs something however little it draws (choice).
+MOST_STEPS = 4.0
 
 #: The whole photograph.
 WHOLE = Crop(0.0, 0.0, 1.0, 1.0)
@@ -96,3 +104,24 @@ def _span(counts: Int[np.ndarray, " s"], margin: float) -> tuple[float, float]:
 def mean_area(crops: Sequence[Crop], shares: Sequence[float] | None) -> float:
     """Share of a photograph that a step draws on average, photographs being used in proportion to `shares`."""
     return float(np.average([crop.area for crop in crops], weights=shares))
+
+
+def steps_for(photographs: int, area: float) -> int:
+    """How many steps, of pictures that are this share of a photograph, draw as much as so many photographs."""
+    return round(photographs * min(1.0 / area, MOST_STEPS))
+
+
+def load_or_find(path: Path, count: int, find: Callable[[], tuple[Crop, ...]]) -> tuple[Crop, ...]:
+    """The crops of a file, or those found now and written to it: training that continues, perhaps on another machine
+    or with another version, draws the same parts. Raises RunError for a file that does not hold `count` of them."""
+    if not path.exists():
+        crops = find()
+        write_json(path, {"crops": [[*vars(crop).values()] for crop in crops]})
+        return crops
+    try:
+        crops = tuple(Crop(*map(float, sides)) for sides in read_json(path)["crops"])
+        if len(crops) != count or not all(0 <= c.left < c.right <= 1 and 0 <= c.top < c.bottom <= 1 for c in crops):
+            raise ValueError(f"{count} parts of photographs were expected")
+    except (KeyError, TypeError, ValueError, VdgsError) as error:
+        raise RunError(f"{path}: is damaged ({error}). Delete it, and the parts are found again.") from error
+    return crops

@@ -63,7 +63,9 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
     (image_gradient,) = torch.autograd.grad(photometric.loss, image)
-    gradients = drawn.backward(share * image_gradient, volume_weight)
+    if share != 1.0:
+        image_gradient.mul_(share)
+    gradients = drawn.backward(image_gradient, volume_weight)
     psnr = psnr_of(image.detach(), target, mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
     state.whole = False
     _move(state, stage, rows, gradients, weights, camera)
@@ -88,7 +90,8 @@ def _photograph(stage: Stage, view: int, downscale: int) -> tuple[Tensor, Tensor
     """What a step is to draw: the photograph, its mask, its camera, or those of the part that the stage wants of it.
 
     Last the share of the photograph's pixels that count in that part. Gradients are multiplied by it: those of a mean
-    over the part become those of a mean over the whole picture, in which thresholds of growth are given.
+    over the part become those of a mean over the whole picture, in which thresholds of growth are given (but for SSIM
+    within its window of the part's border, where it sees nothing beyond).
     """
     target, mask = stage.images.get(view, downscale)
     camera = stage.images.camera(view, downscale)
