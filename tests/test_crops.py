@@ -27,8 +27,10 @@ from vdgs.training.crops import (
     MOST_STEPS,
     NEARLY_ALL,
     WHOLE,
+    WHOLE_EVERY,
     Crop,
     _crop,
+    crop_at,
     crops_of,
     load_or_find,
     mean_area,
@@ -145,8 +147,18 @@ def test_what_shows_nothing_or_nearly_everything_of_the_block_stays_whole():
 
 def test_the_mean_area_is_that_of_the_photographs_as_they_are_used():
     crops = [WHOLE, Crop(0, 0, 0.5, 0.5)]
-    assert mean_area(crops, None) == pytest.approx(0.625)
-    assert mean_area(crops, (1.0, 3.0)) == pytest.approx((1 + 3 * 0.25) / 4)
+    every = 1 / WHOLE_EVERY
+    assert mean_area(crops, None) == pytest.approx(every + (1 - every) * 0.625)
+    assert mean_area(crops, (1.0, 3.0)) == pytest.approx(every + (1 - every) * (1 + 3 * 0.25) / 4)
+
+
+def test_now_and_then_a_whole_photograph_is_drawn():
+    """What a block lets stand beyond the parts must be seen by some step."""
+    crops = (Crop(0, 0, 0.5, 0.5),) * 3
+    drawn = [crop_at(crops, 1, iteration) for iteration in range(5 * WHOLE_EVERY)]
+    assert drawn.count(WHOLE) == 5
+    assert set(drawn) == {WHOLE, crops[1]}
+    assert crop_at(None, 1, 0) == WHOLE
 
 
 def test_few_pixels_make_more_steps_but_not_endlessly_many():
@@ -221,7 +233,7 @@ def test_anchors_outside_of_all_parts_do_not_move():
     before = state.anchors.features.clone()
     positions = state.anchors.positions.clone()
     stage = in_parts(stage, Crop(0.0, 0.0, 0.5, 0.5))
-    for _ in range(8):
+    for _ in range(WHOLE_EVERY - 1):
         train_step(state, stage)
     seen = torch.zeros(len(before), dtype=torch.bool)
     for camera in stage.images.cameras:

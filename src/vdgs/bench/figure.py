@@ -20,6 +20,8 @@ from vdgs.figure_parts import ACCENT, DPI, FAINT, INK, plain, titles
 #: Colours and markers of the other methods, told apart without colour too.
 COLOURS = ("#1f6f8b", "#8ab17d", "#e0a030", "#7b5ea7", "#22262b", "#2a9d8f", "#b5838d", "#6c757d")
 MARKERS = ("s", "^", "v", "D", "P", "X", "<", ">")
+#: ... and where there are more methods than colours, those of each further round by their lines and hollow markers.
+LINES = ("-", "--", ":")
 #: In the title of a panel.
 WHICH_V = {"truth": "true V", "model": "V by a coarse model"}
 PANEL_WIDTH, PANEL_HEIGHT = 4.4, 3.6
@@ -57,7 +59,8 @@ def _panel(axes: Axes, plan: Plan, results: Sequence[Result], title: str, first:
     others = 0
     for index, method in enumerate(plan.methods):
         ours = method.name == plan.table.ours
-        colour, marker = (ACCENT, "o") if ours else (COLOURS[others % 8], MARKERS[others % 8])
+        round_, place_in_round = (0, 0) if ours else divmod(others, len(COLOURS))
+        colour, marker = (ACCENT, "o") if ours else (COLOURS[place_in_round], MARKERS[place_in_round])
         others += not ours
         summaries = [_of(results, method.name, group) for group in range(len(groups))]
         known = [(place, each) for place, each in zip(places, summaries, strict=True) if each is not None]
@@ -65,8 +68,9 @@ def _panel(axes: Axes, plan: Plan, results: Sequence[Result], title: str, first:
         axes.errorbar(
             [place + shift for place, _ in known], [each.mean for _, each in known],
             yerr=[each.spread or 0.0 for _, each in known] if len(plan.seeds) > 1 else None,
-            color=colour, marker=marker, markersize=5.5,
-            linewidth=2.2 if ours else 1.3, elinewidth=1.0, capsize=2.5, label=method.title, zorder=3 if ours else 2,
+            color=colour, marker=marker, markersize=5.5, markerfacecolor="white" if round_ else colour,
+            linestyle=LINES[round_ % len(LINES)], linewidth=2.2 if ours else 1.3, elinewidth=1.0, capsize=2.5,
+            label=method.title, zorder=3 if ours else 2,
         )  # fmt: skip
     names = [
         f"{name}\nV {bounds_of(group)}"

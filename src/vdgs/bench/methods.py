@@ -82,6 +82,11 @@ def with_printed_compensation(config: MethodConfig, **values: float) -> MethodCo
     return replace(config, block=replace(config.block, compensation=printed))
 
 
+def in_whole_photographs(change: Change) -> Change:
+    """A method whose blocks draw whole photographs, so that each makes exactly as many iterations."""
+    return lambda config, budget: change(replace(config, block=replace(config.block, crop="off")), budget)
+
+
 def with_longer_blocks(factor: int) -> Change:
     """Blocks that train so many times as long."""
     return lambda config, budget: replace(config, block=replace(config.block, iterations=factor * budget.per_block))
@@ -167,9 +172,12 @@ def _compensated(config: MethodConfig, **values: float | bool | str) -> MethodCo
 
 
 def _sweep(
-    prefix: str, symbol: str, values: tuple[float, ...], change: Callable[[float], Change], differs: str = ""
+    prefix: str, symbol: str, values: tuple[float, ...], change: Callable[[float], Change], differs: str
 ) -> list[Method]:
-    return [Method(f"{prefix}-{value:g}", f"{symbol} = {value:g}", change(value), differs=differs) for value in values]
+    return [
+        Method(f"{prefix}-{value:g}", f"{symbol} = {value:g}", in_whole_photographs(change(value)), differs=differs)
+        for value in values
+    ]
 
 
 #: What the partitions leave out beyond what `partition.strategies` says of each.
@@ -213,7 +221,7 @@ _ABLATIONS = [
         differs="blocks of the paper: frozen decoder, even use of photographs, damped rates, full size, no mean of "
         "models, whole photographs, share of 0.45, its compensation; growth, coarse stage and cut as `full`",
     ),
-    Method("whole-photographs", "VDGS (full), whole photographs", with_block(crop="off")),
+    Method("whole-photographs", "VDGS (full), whole photographs", in_whole_photographs(full)),
     Method("no-blocking", "w/o blocking", without_blocking, cites="VDGS, Table II (b)"),
     Method(
         "no-blocking-as-long",
@@ -288,9 +296,10 @@ _CHOICES = [
     Method("literal-gate", "literal gate", with_literal_gate),
     Method("cap", "g capped at 4 thresholds", with_cap(4)),
 ]  # fmt: skip
-_AS_PRINTED = "all other settings of compensation are the paper's"
+_WHOLE = "whole photographs"
+_AS_PRINTED = f"{_WHOLE}; all other settings of compensation are the paper's"
 _SWEEPS = [
-    *_sweep("lambda-vis", "λ_vis", LAMBDA_VIS, with_lambda_vis),
+    *_sweep("lambda-vis", "λ_vis", LAMBDA_VIS, with_lambda_vis, _WHOLE),
     *_sweep("t-low", "T_low", T_LOW, with_t_low, _AS_PRINTED),
     *_sweep("beta-g", "β_g", BETA_G, with_beta_g, _AS_PRINTED),
     *_sweep("gamma", "γ", GAMMA, with_gamma, _AS_PRINTED),

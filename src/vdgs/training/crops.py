@@ -56,6 +56,9 @@ class Crop:
         return left, top, max(math.ceil(self.right * width), left + 1), max(math.ceil(self.bottom * height), top + 1)
 
 
+#: Every so many steps draw the whole photograph (choice): what a block lets stand beyond the parts no step would else
+#: see, and it would stand in the pictures of other blocks once all are merged.
+WHOLE_EVERY = 4
 #: Smaller parts make at most so many times more steps: a step costs something however little it draws (choice).
 MOST_STEPS = 4.0
 
@@ -101,9 +104,15 @@ def _span(counts: Int[np.ndarray, " s"], margin: float) -> tuple[float, float]:
     return max(first - margin, 0) / size, min(last + margin, size) / size
 
 
+def crop_at(crops: Sequence[Crop] | None, view: int, iteration: int) -> Crop:
+    """The part of a view that iteration (from 0) draws."""
+    return WHOLE if crops is None or (iteration + 1) % WHOLE_EVERY == 0 else crops[view]
+
+
 def mean_area(crops: Sequence[Crop], shares: Sequence[float] | None) -> float:
     """Share of a photograph that a step draws on average, photographs being used in proportion to `shares`."""
-    return float(np.average([crop.area for crop in crops], weights=shares))
+    part = float(np.average([crop.area for crop in crops], weights=shares))
+    return part + (1.0 - part) / WHOLE_EVERY
 
 
 def steps_for(photographs: int, area: float) -> int:

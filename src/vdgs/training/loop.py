@@ -22,7 +22,7 @@ from vdgs.render import decode_rows, visible_rows
 from vdgs.step import draw_view, move_anchors
 from vdgs.training.averaging import Average, counts_in_mean
 from vdgs.training.background import background_at
-from vdgs.training.crops import WHOLE
+from vdgs.training.crops import WHOLE, crop_at
 from vdgs.training.growing import grow, reorder
 from vdgs.training.schedule import downscale_at, view_at
 from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
@@ -44,7 +44,7 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     config, iteration = stage.config, state.iteration
     downscale = downscale_at(iteration, config)
     view = view_at(iteration, stage.image_count, config.seed, stage.shares)
-    target, mask, camera, share = _photograph(stage, view, downscale)
+    target, mask, camera, share = _photograph(stage, view, downscale, iteration)
 
     rows = visible_rows(state.anchors, camera)
     weights = state.decoder.for_image(appearance_at(stage, view))
@@ -86,7 +86,7 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     return report
 
 
-def _photograph(stage: Stage, view: int, downscale: int) -> tuple[Tensor, Tensor | None, Camera, float]:
+def _photograph(stage: Stage, view: int, downscale: int, iteration: int) -> tuple[Tensor, Tensor | None, Camera, float]:
     """What a step is to draw: the photograph, its mask, its camera, or those of the part that the stage wants of it.
 
     Last the share of the photograph's pixels that count in that part. Gradients are multiplied by it: those of a mean
@@ -95,9 +95,10 @@ def _photograph(stage: Stage, view: int, downscale: int) -> tuple[Tensor, Tensor
     """
     target, mask = stage.images.get(view, downscale)
     camera = stage.images.camera(view, downscale)
-    if stage.crops is None or stage.crops[view] == WHOLE:
+    crop = crop_at(stage.crops, view, iteration)
+    if crop == WHOLE:
         return target, mask, camera, 1.0
-    left, top, right, bottom = stage.crops[view].pixels(camera.width, camera.height)
+    left, top, right, bottom = crop.pixels(camera.width, camera.height)
     inside = (slice(top, bottom), slice(left, right))
     part = camera.cropped(left, top, right, bottom)
     if mask is None:
