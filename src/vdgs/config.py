@@ -217,9 +217,10 @@ class BlockConfig:
     average: float = 0.0
     """As in the coarse stage."""
     crop: Literal["off", "steps", "pixels"] = "off"
-    """Draw only the part of each photograph in which the block has a share, and in every fourth step all of it. `steps`:
-    each step costs less; `pixels`: as many pixels are drawn as without, in up to four times more steps, so that each
-    place of the scene is drawn more often: `iterations` then counts photographs, whatever their size (choice)."""
+    """Draw only the part of each photograph in which the block has a share, and all of it in every fourth step.
+    `steps`: each step costs less; `pixels`: as many pixels are drawn as without, in up to four times more steps, so
+    that each place of the scene is drawn more often: `iterations` then counts photographs, whatever their size
+    (choice)."""
     offset_rate: float = 0.4
     """The rates of the coarse stage start again, those of offsets times this."""
     scale_rate: float = 0.8
