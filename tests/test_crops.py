@@ -18,7 +18,6 @@ from vdgs.errors import RunError
 from vdgs.kernels import native, reference
 from vdgs.render import paint
 from vdgs.stages.block import split_anchors
-from vdgs.stages.memory_notes import need_of
 from vdgs.training import from_saved, to_saved, train, train_step
 from vdgs.training.crops import (
     CUT_OFF,
@@ -217,15 +216,6 @@ def test_a_block_in_parts_is_stopped_and_continued_with_the_same_bits():
     _, broken = block_stage(BlockConfig())
     trained_bits(stage, broken, until=17)
     assert trained_bits(stage, from_saved(to_saved(broken), stage)) == trained_bits(stage, state)
-
-
-def test_memory_is_that_of_the_largest_part():
-    stage, state = block_stage(BlockConfig())
-    camera = stage.images.camera(0)
-    left, top, right, bottom = Crop(0.0, 0.0, 0.5, 0.5).pixels(camera.width, camera.height)
-    assert need_of(state, stage).pixels == camera.width * camera.height
-    drawn, whole = (right - left) * (bottom - top), camera.width * camera.height
-    assert drawn < need_of(state, in_parts(stage, Crop(0.0, 0.0, 0.5, 0.5))).pixels < (drawn + whole) / 2
 
 
 def test_anchors_outside_of_all_parts_do_not_move():

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import psutil
 from rich.console import Console
 
-from vdgs.cameras import Camera
 from vdgs.kernels import native as kernels
 from vdgs.memory import available_bytes
 from vdgs.memory_estimate import Advice, Kind, Need, advice, describe, estimate, in_gb
 from vdgs.training import Stage, TrainingState
-from vdgs.training.crops import Crop
 
 #: Views in which the anchors are counted, evenly chosen.
 VIEWS_COUNTED = 16
-#: Of what is held for each pixel, one part in so many is of the photographs themselves (`BYTES_PER_PIXEL`).
-WHOLE_PHOTOGRAPH = 8
 #: After a failure: what a remedy should save, of all that the process takes.
 SAVE_SHARE = 0.3
 
@@ -44,22 +39,11 @@ def need_of(state: TrainingState, stage: Stage) -> Need:
         max_anchors=config.growth.max_anchors if growing else len(anchors),
         offsets=anchors.offsets.shape[1],
         seen=max(seen) / max(len(anchors), 1),
-        pixels=max(pixels) if stage.crops is None else _largest_part(stage.crops, cameras),
+        pixels=max(pixels),
         images_bytes=min(photographs, getattr(stage.images, "budget_bytes", photographs)),
         surroundings=0 if stage.surroundings is None else len(stage.surroundings.anchors),
         averaged=config.average > 0,
     )
-
-
-def _largest_part(crops: Sequence[Crop], cameras: Sequence[Camera]) -> int:
-    """Pixels of the largest picture that is drawn where photographs are drawn in part; a share of the rest is counted
-    too, for the photograph and the next ones in advance stay whole."""
-    found = 0
-    for crop, camera in zip(crops, cameras, strict=True):
-        left, top, right, bottom = crop.pixels(camera.width, camera.height)
-        drawn = (right - left) * (bottom - top)
-        found = max(found, drawn + (camera.width * camera.height - drawn) // WHOLE_PHOTOGRAPH)
-    return found
 
 
 def announce(need: Need, kind: Kind, console: Console) -> None:
