@@ -87,7 +87,7 @@ def test_the_verdict_asks_for_more_than_the_spread_and_allows_a_tenth():
 
 def test_rows_that_are_the_same_run_are_not_compared():
     plan = make_plan("table4", Choices(scenes=("residence",)))
-    assert len(verdict(plan, [])) == 16 - 4  # lambda-vis-1 is what the three other defaults are, too
+    assert len(verdict(plan, [])) == 17 - 4  # lambda-vis-1 is what the three other defaults are, too
 
 
 def test_an_even_scene_is_judged_against_the_best():

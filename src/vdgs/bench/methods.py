@@ -299,6 +299,7 @@ _CHOICES = [
 _WHOLE = "whole photographs"
 _AS_PRINTED = f"{_WHOLE}; all other settings of compensation are the paper's"
 _SWEEPS = [
+    Method("plain-growth", "no compensation", in_whole_photographs(without_anchor_generation), differs=_WHOLE),
     *_sweep("lambda-vis", "λ_vis", LAMBDA_VIS, with_lambda_vis, _WHOLE),
     *_sweep("t-low", "T_low", T_LOW, with_t_low, _AS_PRINTED),
     *_sweep("beta-g", "β_g", BETA_G, with_beta_g, _AS_PRINTED),

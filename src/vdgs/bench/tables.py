@@ -13,6 +13,7 @@ def _sweep(title: str, prefix: str, values: tuple[float, ...]) -> Group:
 
 
 _SWEEPS = (
+    Group("plain growth", ("plain-growth",)),
     _sweep("(a) visibility weight λ_vis", "lambda-vis", LAMBDA_VIS),
     _sweep("(b) low-visibility threshold T_low", "t-low", T_LOW),
     _sweep("(c) compensation scale β_g", "beta-g", BETA_G),
