@@ -15,7 +15,7 @@ from vdgs.cameras import Camera
 from vdgs.config import AssignmentConfig
 from vdgs.kernels import native as kernels
 from vdgs.partition.blocks import Blocks
-from vdgs.partition.scores import reduced, score_matrix, select_splats
+from vdgs.partition.scores import score_matrix, select_splats
 from vdgs.render import decode_rows, render, visible_rows
 
 
@@ -56,7 +56,7 @@ def expected_scores(mode: str, model: AnchorModel, blocks: Blocks, view: Camera)
     positions, black = model.anchors.positions, (0.0, 0.0, 0.0)
     places = positions[:, :2].double().numpy()
     part = lambda keep: replace(model, anchors=model.anchors.select(torch.from_numpy(keep)))  # noqa: E731
-    small = reduced(view, CONFIG)
+    small = view.within(CONFIG.longest_side_px)
     full, scores = render(model, small, background=black), []
     for index in range(len(blocks)):
         own = blocks.owner(places) == index
@@ -124,5 +124,5 @@ def test_scores_depend_on_no_other_camera_and_on_no_number_of_threads(mode):
 
 def test_pictures_are_made_smaller_and_never_larger():
     big = replace(camera(0.0), width=6400, height=4800)
-    assert (reduced(big, CONFIG).width, reduced(big, CONFIG).height) == (48, 36)
-    assert reduced(camera(0.0), AssignmentConfig()).width == 64
+    assert (big.within(CONFIG.longest_side_px).width, big.within(CONFIG.longest_side_px).height) == (48, 36)
+    assert camera(0.0).within(AssignmentConfig().longest_side_px).width == 64

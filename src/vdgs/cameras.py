@@ -89,6 +89,11 @@ class Camera:
             height=height,
         )
 
+    def within(self, longest_side_px: int) -> Camera:
+        """The same view at most so many pixels wide and high; never enlarged."""
+        scale = min(1.0, longest_side_px / max(self.width, self.height))
+        return self.resized(max(1, round(scale * self.width)), max(1, round(scale * self.height)))
+
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World points [n, 3] to pixels [n, 2] and depths [n] (float64; no clipping)."""
         local = points @ self.camera_from_world[:3, :3].T + self.camera_from_world[:3, 3]

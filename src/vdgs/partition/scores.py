@@ -89,12 +89,6 @@ def score_matrix(
     return Scores(config.mode, scores, held, covered, members.counts(), blocks.owner(positions))
 
 
-def reduced(camera: Camera, config: AssignmentConfig) -> Camera:
-    """The view at the size at which renders are compared; never enlarged."""
-    scale = min(1.0, config.longest_side_px / max(camera.width, camera.height))
-    return camera.resized(max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))
-
-
 def difference(block: Raster, full: Raster) -> Float[np.ndarray, "h w"]:
     """Δ(u) of eq. 6: the mean over the channels of the absolute difference."""
     apart = np.abs(block.image.numpy() - full.image.numpy())
@@ -168,7 +162,7 @@ def _score_camera(
     held = np.array(members.held(camera), np.int32)
     if config.mode == "frustum":
         return held, held / np.maximum(members.counts(), 1), np.full(len(held), np.nan)
-    scores, covered = _rendered_scores(model, members, reduced(camera, config), config)
+    scores, covered = _rendered_scores(model, members, camera.within(config.longest_side_px), config)
     return held, np.array(scores), np.array(covered)
 
 

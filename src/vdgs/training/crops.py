@@ -33,6 +33,11 @@ CUT_OFF = 0.005
 MARGIN = 0.04
 #: A part as large as this is the whole photograph: nothing would be saved.
 NEARLY_ALL = 0.9
+#: Every so many steps draw the whole photograph (choice): what a block lets stand beyond the parts no step would else
+#: see, and it would stand in the pictures of other blocks once all are merged.
+WHOLE_EVERY = 4
+#: Smaller parts make at most so many times more steps: a step costs something however little it draws (choice).
+MOST_STEPS = 4.0
 
 
 @dataclass(frozen=True)
@@ -56,12 +61,6 @@ class Crop:
         return left, top, max(math.ceil(self.right * width), left + 1), max(math.ceil(self.bottom * height), top + 1)
 
 
-#: Every so many steps draw the whole photograph (choice): what a block lets stand beyond the parts no step would else
-#: see, and it would stand in the pictures of other blocks once all are merged.
-WHOLE_EVERY = 4
-#: Smaller parts make at most so many times more steps: a step costs something however little it draws (choice).
-MOST_STEPS = 4.0
-
 #: The whole photograph.
 WHOLE = Crop(0.0, 0.0, 1.0, 1.0)
 
@@ -77,9 +76,7 @@ def crops_of(model: AnchorModel, own: Bool[Tensor, " n"], cameras: Sequence[Came
 
 def _own_share(model: AnchorModel, own: Bool[Tensor, " n"], camera: Camera) -> Float[np.ndarray, "h w"]:
     """What share the anchors have in each pixel of a small picture."""
-    factor = min(1.0, LONGEST_SIDE_PX / max(camera.width, camera.height))
-    small = camera.resized(max(1, round(factor * camera.width)), max(1, round(factor * camera.height)))
-    return paint(model, own.float(), small)[0].numpy()
+    return paint(model, own.float(), camera.within(LONGEST_SIDE_PX))[0].numpy()
 
 
 def _crop(share: Float[np.ndarray, "h w"]) -> Crop:
