@@ -98,7 +98,7 @@ def test_blocks_as_printed_take_back_what_the_laptop_changes():
     alone = {
         name: METHODS[name].settings(base, scene.budget)
         for name in (
-            "frozen-decoder", "even-sampling", "share-0.45", "printed-rates", "full-size", "last-model",
+            "frozen-decoder", "even-sampling", "by-votes", "share-0.45", "printed-rates", "full-size", "last-model",
             "printed-compensation",
         )
     }  # fmt: skip

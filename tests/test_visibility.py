@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from captures_support import look_down
+from vdgs.anchors import Anchors
 from vdgs.cameras import NEAR, Camera, CameraModel
+from vdgs.captures.capture import View
+from vdgs.config import TrainConfig
+from vdgs.stages.coarse import shares_for
 from vdgs.visibility import imbalance, normalised, share_in_cycle, shares_of, views_of
 
 
@@ -105,6 +111,18 @@ def test_every_anchor_divides_its_vote_among_the_cameras_that_hold_it() -> None:
     shares = shares_of(points, cameras)
     assert np.allclose(shares, expected)
     assert np.isclose(sum(shares), (seen > 0).sum())
+
+
+@pytest.mark.parametrize(("sampling", "ratio"), [("even", None), ("shares", 9.0), ("roots", 3.0)])
+def test_how_often_a_photograph_with_nine_times_the_votes_is_used(sampling: str, ratio: float | None) -> None:
+    cameras = [
+        Camera(look_down(np.array([x, 0.0, 8.0]), 0.0, 0.0), 60.0, 60.0, 32.0, 24.0, 64, 48) for x in (0.0, 100.0)
+    ]
+    positions = torch.tensor([[0.0, 0.0, 0.0]] + [[100.0, 0.0, 0.0]] * 9)
+    anchors = Anchors(positions, torch.zeros(10, 32), torch.zeros(10, 1, 3), torch.zeros(10, 6))
+    views = [View("", camera, Path(), None, "train") for camera in cameras]
+    shares = shares_for(TrainConfig(sampling=sampling), anchors, views)
+    assert (None if shares is None else shares[1] / shares[0]) == (ratio and pytest.approx(ratio))
 
 
 def test_a_camera_alone_over_a_place_has_the_votes_of_all_its_anchors() -> None:

@@ -134,10 +134,10 @@ class TrainConfig:
     iterations: int = 100_000
     """Number of steps, one photograph each; 0 takes sixty for each training photograph, but at least 3000 and at
     most 30 000 (choice: few photographs are soon learnt by heart, many need their time)."""
-    sampling: Literal["even", "shares"] = "even"
+    sampling: Literal["even", "shares", "roots"] = "even"
     """How often each photograph is used. `even`: all alike (the paper). `shares`: every anchor has one vote, divided
-    among the cameras that see it, and a photograph is used in proportion to its votes: most where few others look
-    (choice)."""
+    among the cameras that see it, and a photograph is used in proportion to its votes: most where few others look.
+    `roots`: in proportion to the square root of its votes, which keeps more photographs in use (choice)."""
     resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
     """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
     average: float = 0.0
@@ -209,7 +209,7 @@ class BlockConfig:
     """Steps for each block; 0 takes fifteen for each of its photographs, at least 500 and at most 15 000 (choice)."""
     scale_iterations: float = 1.0
     """Factor on the steps and on the start of statistics and growth, for scenes smaller than the paper's."""
-    sampling: Literal["even", "shares"] = "even"
+    sampling: Literal["even", "shares", "roots"] = "even"
     """As in the coarse stage, by the votes of the anchors that the block moves: photographs that show little of the
     block are used little."""
     resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
@@ -319,7 +319,7 @@ PRESETS: dict[str, MethodConfig] = {
         assignment=AssignmentConfig(threshold=0.1),
         block=BlockConfig(
             iterations=0,
-            sampling="shares",
+            sampling="roots",
             resolutions=((0.0, 2), (0.3, 1)),
             average=0.5,
             crop="pixels",

@@ -272,6 +272,7 @@ _LONGER = [
 _CHOICES = [
     Method("frozen-decoder", "frozen decoder", with_block(decoder="frozen")),
     Method("even-sampling", "photographs used alike", with_block(sampling="even")),
+    Method("by-votes", "photographs by votes", with_block(sampling="shares")),
     Method("share-0.45", "cameras above a share of 0.45", with_assignment(threshold=0.45)),
     Method(
         "literal-assignment", "eq. 7 as printed", with_assignment(mode="literal", threshold=0.45),

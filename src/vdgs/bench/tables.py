@@ -34,9 +34,9 @@ _ABLATION = (
 
 #: Each departs from the full method in one choice, or says beside it in what else.
 CHOICES = (
-    "full", "frozen-decoder", "even-sampling", "printed-rates", "full-size", "last-model", "whole-photographs",
-    "no-anchor-generation", "printed-compensation", "share-0.45", "literal-assignment", "leave-one-out", "frustum",
-    "no-context", "free-ring", "literal-gate", "cap",
+    "full", "frozen-decoder", "even-sampling", "by-votes", "printed-rates", "full-size", "last-model",
+    "whole-photographs", "no-anchor-generation", "printed-compensation", "share-0.45", "literal-assignment",
+    "leave-one-out", "frustum", "no-context", "free-ring", "literal-gate", "cap",
 )  # fmt: skip
 
 #: Every table by name.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -112,8 +113,15 @@ def camera_height(capture: Capture) -> float:
 
 
 def shares_for(config: TrainConfig, anchors: Anchors, views: Sequence[View]) -> tuple[float, ...] | None:
-    """How often each training view is used, by the settings, for the anchors that training starts with."""
-    return shares_of(anchors.positions, [view.camera for view in views]) if config.sampling == "shares" else None
+    """How often each training view is used, by the settings, for the anchors that training starts with.
+
+    Roots, because a view with few votes also costs little (`training.crops`): a mean varies least for what it costs
+    if strata are drawn in proportion to their weight over the root of their cost (Cochran, 1977, section 5.5).
+    """
+    if config.sampling == "even":
+        return None
+    votes = shares_of(anchors.positions, [view.camera for view in views])
+    return votes if config.sampling == "shares" else tuple(math.sqrt(share) for share in votes)
 
 
 def image_budget(options: WatchOptions) -> int:
