@@ -16,7 +16,7 @@ from vdgs.cameras import NEAR, Camera, CameraModel
 from vdgs.captures.capture import View
 from vdgs.config import TrainConfig
 from vdgs.stages.coarse import shares_for
-from vdgs.visibility import imbalance, normalised, share_in_cycle, shares_of, views_of
+from vdgs.visibility import effective_count, imbalance, normalised, share_in_cycle, shares_of, views_of
 
 
 def flight(count: int, model: CameraModel = "pinhole", seed: int = 0) -> list[Camera]:
@@ -111,6 +111,15 @@ def test_every_anchor_divides_its_vote_among_the_cameras_that_hold_it() -> None:
     shares = shares_of(points, cameras)
     assert np.allclose(shares, expected)
     assert np.isclose(sum(shares), (seen > 0).sum())
+
+
+@given(count=st.integers(1, 50), weight=st.floats(1e-3, 1e3))
+def test_photographs_used_alike_are_worth_their_number_and_one_that_outweighs_all_is_worth_one(
+    count: int, weight: float
+) -> None:
+    assert effective_count([weight] * count) == pytest.approx(count)
+    assert effective_count([weight] * count + [0.0] * 7) == pytest.approx(count)
+    assert effective_count([weight] * count + [1e9 * weight]) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("sampling", "ratio"), [("even", None), ("shares", 9.0), ("roots", 3.0)])

@@ -56,6 +56,12 @@ def shares_of(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> tup
     return shares if any(shares) else (1.0,) * len(cameras)
 
 
+def effective_count(shares: Sequence[float]) -> float:
+    """How many things used alike vary as much in the mean as these used in proportion to `shares`: (Σ w)² / Σ w²
+    (Kish, Survey Sampling, 1965, section 11.7). At least one share is above 0."""
+    return sum(shares) ** 2 / sum(share * share for share in shares)
+
+
 def normalised(views: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """V̂_i = (V_i - min V) / (max V - min V + 1e-8), float64 in [0, 1) (below eq. 5)."""
     count = np.asarray(views, np.float64)

@@ -37,6 +37,7 @@ from vdgs.stages.coarse import camera_height, image_budget, note_without_growth,
 from vdgs.stages.opening import open_run
 from vdgs.training import Stage, Surroundings, start_state
 from vdgs.training.crops import crops_of, load_or_find, mean_area, steps_for
+from vdgs.visibility import effective_count
 
 #: Cells on each side of the table of the ramp.
 RAMP_CELLS = 512
@@ -115,10 +116,10 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
         )  # fmt: skip
         state = continue_or_start(folder, stage, lambda: start_state(anchors, coarse.decoder.copy(), stage), console)
         state.seconds += prepared
+        parts = f", {area:.0%} of a photograph each" if crops else ""
         console.print(
-            f"block {index}: {len(views)} of {len(capture.train_views)} training views, {int(own.sum()):,} anchors of "
-            f"its own, {len(surroundings):,} around it, {config.iterations:,} iterations"
-            + (f", {area:.0%} of a photograph each" if crops else ""),
+            f"block {index}: {_views_served(len(views), len(capture.train_views), shares)}, {int(own.sum()):,} anchors "
+            f"of its own, {len(surroundings):,} around it, {config.iterations:,} iterations{parts}",
             highlight=False,
         )
         train_watched(folder, state, stage, options, console)
@@ -129,6 +130,12 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
         facts | {"iterations": state.iteration, "decoder": method.block.decoder},
     )
     finish(folder, state, model, console, area)
+
+
+def _views_served(count: int, of: int, shares: Sequence[float] | None) -> str:
+    """How many views a block has, in words, and how many they are worth where some are used more than others."""
+    worth = f" (worth {effective_count(shares):.0f} used alike)" if shares else ""
+    return f"{count} of {of} training views{worth}"
 
 
 def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: Console) -> None:
