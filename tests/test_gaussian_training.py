@@ -1,13 +1,17 @@
 """Training of 3DGS: deterministic, resumable bit for bit, on the schedules of its paper."""
 
+import io
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from checkerboard import Photographs
 from vdgs.checkpoints import load_newest, save_state
+from vdgs.comparators import gaussian_training
 from vdgs.comparators.gaussian_density import DensityConfig
 from vdgs.comparators.gaussian_model import (
     GaussiansModel,
@@ -27,8 +31,11 @@ from vdgs.comparators.gaussian_training import (
     train,
     train_step,
 )
-from vdgs.errors import TrainingDiverged
+from vdgs.comparators.gaussian_watching import train_watched
+from vdgs.errors import TrainingDiverged, VdgsError
 from vdgs.kernels.native.module import set_threads, threads
+from vdgs.run import StageFolder
+from vdgs.run_options import WatchOptions
 
 CONFIG = GaussiansConfig(
     iterations=80,
@@ -99,6 +106,43 @@ def test_the_number_of_threads_changes_no_bit(unbroken):
         assert bits(run(start(), stage())) == bits(unbroken)
     finally:
         set_threads(before)
+
+
+def memory_runs_out(monkeypatch, where: str, at_call: int) -> None:
+    """The given function of the training, by name, finds no memory in its call of that number."""
+    function, calls = getattr(gaussian_training, where), itertools.count(1)
+
+    def scarce(*values):
+        if next(calls) == at_call:
+            raise MemoryError("std::bad_alloc")
+        return function(*values)
+
+    monkeypatch.setattr(gaussian_training, where, scarce)
+
+
+def watched(folder: StageFolder):
+    folder.path.mkdir(exist_ok=True)
+    console = Console(file=io.StringIO())
+    saved, _ = load_newest(folder.checkpoints)
+    state = start() if saved is None else from_saved(saved)
+    train_watched(folder, state, stage(), WatchOptions(), console)
+    return state
+
+
+def test_where_memory_runs_out_between_steps_no_step_is_lost(unbroken, tmp_path, monkeypatch):
+    folder = StageFolder(tmp_path / "gaussians")
+    with monkeypatch.context() as scarcity:
+        memory_runs_out(scarcity, "draw_gaussians", 38)
+        with pytest.raises(VdgsError, match=r"out of memory with .* The state of iteration 37 is saved in"):
+            watched(folder)
+    assert bits(watched(folder)) == bits(unbroken)
+
+
+def test_where_memory_runs_out_within_a_step_nothing_half_moved_is_saved(tmp_path, monkeypatch):
+    folder = StageFolder(tmp_path / "gaussians")
+    memory_runs_out(monkeypatch, "_move", 38)
+    with pytest.raises(VdgsError, match="No state was saved yet"):
+        watched(folder)
 
 
 def test_another_seed_is_another_run():

@@ -97,6 +97,8 @@ class GaussiansState:
     psnr: float = math.nan
     seconds: float = 0.0
     peak_memory_bytes: int = 0
+    #: False while a step changes tensors: one that is broken off there leaves no state that may be saved.
+    whole: bool = True
     #: Zeros between steps, in the shape of each tensor of the Gaussians: where gradients are put. Not saved.
     room: dict[str, Tensor] = field(default_factory=dict)
 
@@ -162,6 +164,7 @@ def train_step(state: GaussiansState, stage: GaussiansStage) -> GaussiansReport:
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
     *gradients, of_means_px = torch.autograd.grad(found.loss, [*seen.values(), means_px], materialize_grads=True)
+    state.whole = False
     _move(state, rows, dict(zip(seen, gradients, strict=True)), rates_at(config, stage.extent, iteration), degree)
     state.iteration += 1
 
@@ -170,6 +173,7 @@ def train_step(state: GaussiansState, stage: GaussiansStage) -> GaussiansReport:
         _count(state, rows, of_means_px, camera)
         report = replace(report, **_control(state, stage))
     _smooth(state, value, raster.image.detach(), target, mask)
+    state.whole = True
     return report
 
 

@@ -61,6 +61,7 @@ def train_watched(
         size=lambda: f"{len(state.gaussians):,} Gaussians",
         after_divergence="",
         save_memory=lambda: "Set density.max_gaussians or use smaller photographs, in another output folder.",
+        whole=lambda: state.whole,
     )  # fmt: skip
 
     def loop(stop: Callable[[], bool]) -> bool:

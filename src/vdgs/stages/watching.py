@@ -58,7 +58,7 @@ class Watched:
     after_divergence: str
     save_memory: Callable[[], str]
     #: Whether every step of the state is whole, so that it may be saved though a step was broken off.
-    whole: Callable[[], bool] = lambda: False
+    whole: Callable[[], bool]
 
     def save(self) -> None:
         save_state(self.folder.checkpoints, self.to_saved())
