@@ -1,26 +1,20 @@
 """3DGS as a method of the bench: its schedule, its settings, its run, its row."""
 
-import io
 import json
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
 
-from captures_support import tiny_scene, write_colmap
+from bench_support import benched, run_here, write_data
 from vdgs.bench import bench
-from vdgs.bench.bench import BenchSettings, run_bench
 from vdgs.bench.explicit import gaussians_config
 from vdgs.bench.measure import GROUPS_FILE
 from vdgs.bench.notes import notes_of
 from vdgs.bench.plan import Choices, make_plan
-from vdgs.bench.processes import Ended, Task
 from vdgs.bench.results import Result
-from vdgs.bench.worker import Job, work
 from vdgs.comparators import gaussian_watching
 from vdgs.comparators.gaussian_schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS, scheduled
 from vdgs.comparators.gaussian_training import GaussiansConfig
@@ -77,25 +71,11 @@ def test_its_settings_are_those_of_the_table():
     assert alone.runs[0].key({}, {}) != replace(alone.runs[0], config=MethodConfig()).key({}, {})
 
 
-def run_here(tasks: Sequence[Task], _at_once: int, _tell: Callable[..., None]) -> dict[str, Ended]:
-    """As `run_tasks`, but in this process: starting others would take most of the time."""
-    for task in tasks:
-        work(Job.read(task.file))
-    return {task.name: Ended(task.name, "done") for task in tasks}
-
-
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("data")
-    write_colmap(folder / "copr", tiny_scene())
-    (folder / "copr" / "images").rename(folder / "copr" / "images_4")  # what the bench reads of it
+    write_data(folder)
     return folder
-
-
-def benched(data: Path, output: Path, *methods: str, total: int = 40, redo: bool = False) -> dict[str, Result]:
-    choices = Choices(seeds=1, scenes=("copr",), methods=methods, iterations_total=total, max_anchors=300)
-    asked = BenchSettings("table1", output, choices, data, redo=redo)
-    return {each.method: each for each in run_bench(asked, Console(file=io.StringIO()))}
 
 
 def test_it_stands_beside_methods_with_anchors(data, tmp_path, monkeypatch):

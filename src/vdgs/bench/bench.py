@@ -25,6 +25,7 @@ from vdgs.bench.figure import draw_groups
 from vdgs.bench.grids import grids_of
 from vdgs.bench.measure import GROUPS_FILE, measure_groups
 from vdgs.bench.notes import notes_of
+from vdgs.bench.pictures import check_pictures
 from vdgs.bench.plan import Choices, Plan, PlannedRun, make_plan
 from vdgs.bench.processes import Ended, Task, run_tasks
 from vdgs.bench.results import Result, as_json, gather
@@ -32,6 +33,7 @@ from vdgs.bench.seen import Seen, seen_by_model, seen_truly
 from vdgs.bench.verdict import verdict
 from vdgs.bench.worker import RECORD, Job
 from vdgs.bench.writing import latex, markdown, tidy_csv
+from vdgs.captures.loading import load_capture
 from vdgs.captures.options import CaptureOptions
 from vdgs.config import differences, to_dict
 from vdgs.errors import VdgsError
@@ -69,6 +71,7 @@ def run_bench(settings: BenchSettings, console: Console) -> list[Result]:
     began = time.monotonic()
     with _locked(settings.output):
         captures, lost = _captures(plan, settings, console)
+        _check_pictures(plan, captures, settings)
         ended = lost | _train(plan, captures, settings, console)
         ended |= _measure(plan, captures, ended, settings, console)
         results = gather(plan, settings.output, ended)
@@ -119,6 +122,16 @@ def _capture(scene: Scene, settings: BenchSettings, console: Console) -> Path:
     return folder
 
 
+def _check_pictures(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings) -> None:
+    """Raise VdgsError, before anything is trained, for pictures by other programs that cannot be measured."""
+    for scene in [scene for scene in plan.scenes if scene.name in captures]:
+        folders = [run.pictures for run in plan.runs if run.scene == scene.name and run.pictures is not None]
+        if folders:
+            views = load_capture(captures[scene.name], _options(scene, settings)).test_views
+            for folder in folders:
+                check_pictures(folder, views)
+
+
 def _train(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings, console: Console) -> dict[str, Ended]:
     """Every run whose scene is there, trained or found finished."""
     done, tasks = dict[str, Ended](), list[Task]()
@@ -160,7 +173,7 @@ def _train(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings, co
 def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
     """Raise VdgsError, before anything is trained, if the run's folder was filled with other settings."""
     folder = RunFolder(settings.output / run.folder)
-    if settings.redo or not folder.config_file.exists():
+    if settings.redo or run.pictures is not None or not folder.config_file.exists():
         return
     wanted, held = to_dict(run.config), folder.settings()
     if "blocks" not in run.stages:  # no other section matters to it
@@ -184,7 +197,8 @@ def _job(run: PlannedRun, plan: Plan, capture: Path, settings: BenchSettings, th
         None if run.coarse_from is None else (settings.output / run.coarse_from).resolve(),
         run.key({"options": options, "scene": dict(scene.synth) or scene.capture}, measured),
         settings.lpips_weights and settings.lpips_weights.resolve(), settings.bins, threads,
-        threads if settings.jobs == 1 else 1, settings.redo,
+        threads if settings.jobs == 1 else 1, settings.redo or run.pictures is not None,
+        run.pictures and run.pictures.resolve(),
     )  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from vdgs.config import PRESETS, MethodConfig, PresetName
@@ -12,6 +13,7 @@ from vdgs.config import PRESETS, MethodConfig, PresetName
 COARSE_ONLY = ("coarse", "evaluate")
 WITH_BLOCKS = ("coarse", "partition", "blocks", "merge", "evaluate")
 EXPLICIT = ("gaussians",)
+PICTURES = ("pictures",)
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,8 @@ class Method:
     less: str = ""
     #: What it gets more than the others, to find out what holds them back.
     more: str = ""
+    #: Where another program left its pictures of the test views (`pictures`); None: the method is trained here.
+    pictures: Path | None = None
 
     def settings(self, base: MethodConfig, budget: Budget) -> MethodConfig:
         return self.change(base, budget)

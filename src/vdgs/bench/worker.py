@@ -38,6 +38,7 @@ class Job:
     threads: int
     block_jobs: int
     redo: bool = False
+    pictures: Path | None = None
 
     def write(self, path: Path) -> None:
         write_json(path, {name: _plain(value) for name, value in vars(self).items()})
@@ -45,7 +46,7 @@ class Job:
     @staticmethod
     def read(path: Path) -> Job:
         values = read_json(path)
-        for name in ("capture", "output", "coarse_from", "lpips_weights"):
+        for name in ("capture", "output", "coarse_from", "lpips_weights", "pictures"):
             values[name] = None if values[name] is None else Path(values[name])
         return Job(**values | {"stages": tuple(values["stages"])})
 
@@ -101,10 +102,17 @@ def _gaussians(at: _Working) -> None:
     train_explicit(at.run, at.capture, at.job.lpips_weights, at.console)
 
 
+def _pictures(at: _Working) -> None:
+    from vdgs.bench.pictures import measure_pictures
+
+    assert at.job.pictures is not None
+    measure_pictures(at.capture, at.job.pictures, at.run.evaluation, at.job.lpips_weights, at.job.bins, at.console)
+
+
 #: What a method may name as its stages. Each does nothing, or the same again, where it is done.
 STAGES: dict[str, Callable[[_Working], None]] = {
     "coarse": _coarse, "partition": _partition, "blocks": _blocks, "merge": _merge, "evaluate": _evaluate,
-    "gaussians": _gaussians,
+    "gaussians": _gaussians, "pictures": _pictures,
 }  # fmt: skip
 
 

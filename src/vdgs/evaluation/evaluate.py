@@ -65,6 +65,8 @@ class MeasuredModel:
     #: V per pixel [h, w], NaN where the model shows nothing; without it there are no figures by visibility.
     visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]] | None = None
     facts: ModelFacts = ModelFacts()
+    #: Whether the time that `render` takes says anything.
+    timed: bool = True
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ def evaluate(
     """Render and measure every view, write `output`, and return what `metrics.json` holds.
 
     `lpips_note` says why LPIPS is null. A table is printed to `console` if there is one. fps is one over the median
-    time of `model.render`, which on a GPU includes waiting for it.
+    time of `model.render`, which on a GPU includes waiting for it; None unless `model.timed`.
 
     Raises RunError without views, CaptureError where a photograph or mask does not fit its camera,
     TrainingDiverged where a render is not finite.
@@ -147,7 +149,7 @@ def evaluate(
     on_sheet = set(np.linspace(0, len(views) - 1, min(len(views), settings.contact_views)).round().astype(int))
     for index, view in enumerate(views):
         _evaluate_view(view, stems[index], index in on_sheet, inputs, gathered)
-    result = _summary(gathered, model.facts, lpips_note, settings)
+    result = _summary(gathered, model, lpips_note, settings)
     _write(output, result, gathered, settings.title)
     if console is not None:
         console.print(metrics_table(result, f"{len(views)} {settings.title}"))
@@ -285,7 +287,9 @@ def _draw(
         gathered.cells.append(pictures.Thumbnail(view.name, f"{row['psnr']:.2f} dB", *small))
 
 
-def _summary(gathered: _Gathered, facts: ModelFacts, lpips_note: str, settings: EvaluationSettings) -> dict[str, Any]:
+def _summary(
+    gathered: _Gathered, model: MeasuredModel, lpips_note: str, settings: EvaluationSettings
+) -> dict[str, Any]:
     rows = gathered.rows
     means = {name: mean_or_none([row[name] for row in rows]) for name in RAW + CORRECTED}
     pixel_bins = gathered.histogram.bins(settings.visibility_bins) if gathered.histogram else None
@@ -299,8 +303,8 @@ def _summary(gathered: _Gathered, facts: ModelFacts, lpips_note: str, settings: 
         **means,
         "by_visibility": pixel_bins,
         "views_by_visibility": view_bins(visible, figures, settings.visibility_bins) if pixel_bins else None,
-        **asdict(facts),
-        "fps": 1.0 / max(statistics.median(gathered.seconds), 1e-9),
+        **asdict(model.facts),
+        "fps": 1.0 / max(statistics.median(gathered.seconds), 1e-9) if model.timed else None,
         settings.title.replace(" ", "_"): len(rows),
         "notes": notes,
     }

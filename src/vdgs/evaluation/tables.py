@@ -53,7 +53,9 @@ def _visibility_table(bins: list[Mapping[str, Any]]) -> Table:
 
 
 def _model_line(result: Mapping[str, Any]) -> str:
-    parts = [f"{result['fps']:.3g} images a second"]
+    parts = []
+    if result["fps"] is not None:
+        parts.append(f"{result['fps']:.3g} images a second")
     if result["n_anchors"] is not None:
         parts.append(f"{result['n_anchors']:,} anchors")
     if result["model_bytes"] is not None:

@@ -30,6 +30,9 @@ class BenchArguments:
     """Other scenes than the table's, by name: tiny, lab-uneven, town-even, copr, residence, sci-art, ..."""
     methods: tuple[str, ...] = ()
     """Other methods than the table's, by name: full, baseline, no-blocking, vastgaussian, lambda-vis-0, ..."""
+    renders: tuple[str, ...] = ()
+    """Pictures of the test views by other programs, a row for each NAME=FOLDER: FOLDER/SCENE/PHOTOGRAPH.png, or
+    FOLDER/SCENE/SEED/PHOTOGRAPH.png. They are measured as all others."""
     data: Path | None = None
     """Folder that holds the captures which are not generated: residence-pixsfm, copr, ..."""
     scale_iterations: float = 1.0
@@ -60,7 +63,7 @@ def bench(arguments: list[str]) -> None:
     use_device(asked.device)
     choices = Choices(
         asked.seeds, asked.scenes, asked.methods, asked.scale_iterations, asked.iterations_total, asked.max_anchors,
-        asked.validation,
+        asked.validation, asked.renders,
     )  # fmt: skip
     run_bench(
         BenchSettings(
