@@ -3,6 +3,7 @@
 import io
 import itertools
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -110,14 +111,15 @@ def test_the_number_of_threads_changes_no_bit(unbroken):
 
 def memory_runs_out(monkeypatch, where: str, at_call: int) -> None:
     """The given function of the training, by name, finds no memory in its call of that number."""
-    function, calls = getattr(gaussian_training, where), itertools.count(1)
+    function, calls = attrgetter(where)(gaussian_training), itertools.count(1)
 
-    def scarce(*values):
+    def scarce(*values, **named):
         if next(calls) == at_call:
             raise MemoryError("std::bad_alloc")
-        return function(*values)
+        return function(*values, **named)
 
-    monkeypatch.setattr(gaussian_training, where, scarce)
+    *module, name = where.split(".")
+    monkeypatch.setattr(attrgetter(*module)(gaussian_training) if module else gaussian_training, name, scarce)
 
 
 def watched(folder: StageFolder):
@@ -129,10 +131,11 @@ def watched(folder: StageFolder):
     return state
 
 
-def test_where_memory_runs_out_between_steps_no_step_is_lost(unbroken, tmp_path, monkeypatch):
+@pytest.mark.parametrize("where", ["draw_gaussians", "_make_room"])
+def test_where_memory_runs_out_before_anything_moves_no_step_is_lost(where, unbroken, tmp_path, monkeypatch):
     folder = StageFolder(tmp_path / "gaussians")
     with monkeypatch.context() as scarcity:
-        memory_runs_out(scarcity, "draw_gaussians", 38)
+        memory_runs_out(scarcity, where, 38)
         with pytest.raises(VdgsError, match=r"out of memory with .* The state of iteration 37 is saved in"):
             watched(folder)
     assert bits(watched(folder)) == bits(unbroken)
@@ -140,7 +143,7 @@ def test_where_memory_runs_out_between_steps_no_step_is_lost(unbroken, tmp_path,
 
 def test_where_memory_runs_out_within_a_step_nothing_half_moved_is_saved(tmp_path, monkeypatch):
     folder = StageFolder(tmp_path / "gaussians")
-    memory_runs_out(monkeypatch, "_move", 38)
+    memory_runs_out(monkeypatch, "kernels.adam_rows", 38 * 5)  # four of the tensors have moved, or three
     with pytest.raises(VdgsError, match="No state was saved yet"):
         watched(folder)
 

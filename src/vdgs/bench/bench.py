@@ -25,9 +25,9 @@ from vdgs.bench.figure import draw_groups
 from vdgs.bench.grids import grids_of
 from vdgs.bench.measure import GROUPS_FILE, measure_groups
 from vdgs.bench.notes import notes_of
-from vdgs.bench.pictures import check_pictures
 from vdgs.bench.plan import Choices, Plan, PlannedRun, make_plan
 from vdgs.bench.processes import Ended, Task, run_tasks
+from vdgs.bench.renders import check_renders
 from vdgs.bench.results import Result, as_json, gather
 from vdgs.bench.seen import Seen, seen_by_model, seen_truly
 from vdgs.bench.verdict import verdict
@@ -71,7 +71,6 @@ def run_bench(settings: BenchSettings, console: Console) -> list[Result]:
     began = time.monotonic()
     with _locked(settings.output):
         captures, lost = _captures(plan, settings, console)
-        _check_pictures(plan, captures, settings)
         ended = lost | _train(plan, captures, settings, console)
         ended |= _measure(plan, captures, ended, settings, console)
         results = gather(plan, settings.output, ended)
@@ -122,16 +121,6 @@ def _capture(scene: Scene, settings: BenchSettings, console: Console) -> Path:
     return folder
 
 
-def _check_pictures(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings) -> None:
-    """Raise VdgsError, before anything is trained, for pictures by other programs that cannot be measured."""
-    for scene in [scene for scene in plan.scenes if scene.name in captures]:
-        folders = [run.pictures for run in plan.runs if run.scene == scene.name and run.pictures is not None]
-        if folders:
-            views = load_capture(captures[scene.name], _options(scene, settings)).test_views
-            for folder in folders:
-                check_pictures(folder, views)
-
-
 def _train(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings, console: Console) -> dict[str, Ended]:
     """Every run whose scene is there, trained or found finished."""
     done, tasks = dict[str, Ended](), list[Task]()
@@ -145,6 +134,7 @@ def _train(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings, co
         if _is_done(settings.output, run, job.key):
             done[run.name] = Ended(run.name, "done")
             continue
+        _check_renders(run, plan, captures[run.scene], settings)
         stem = settings.output / "jobs" / run.name.replace("/", "__")
         job.write(stem.with_name(stem.name + ".json"))
         after = None if run.coarse_from is None else str(run.coarse_from.relative_to("runs"))
@@ -170,10 +160,17 @@ def _train(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings, co
     return done | run_tasks(tasks, settings.jobs, tell)
 
 
+def _check_renders(run: PlannedRun, plan: Plan, capture: Path, settings: BenchSettings) -> None:
+    """Raise VdgsError, before anything is trained, for renders by another program that cannot be measured."""
+    if run.renders is not None:
+        scene = next(scene for scene in plan.scenes if scene.name == run.scene)
+        check_renders(run.renders, load_capture(capture, _options(scene, settings)).test_views)
+
+
 def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
     """Raise VdgsError, before anything is trained, if the run's folder was filled with other settings."""
     folder = RunFolder(settings.output / run.folder)
-    if settings.redo or run.pictures is not None or not folder.config_file.exists():
+    if settings.redo or not folder.config_file.exists():
         return
     wanted, held = to_dict(run.config), folder.settings()
     if "blocks" not in run.stages:  # no other section matters to it
@@ -197,8 +194,8 @@ def _job(run: PlannedRun, plan: Plan, capture: Path, settings: BenchSettings, th
         None if run.coarse_from is None else (settings.output / run.coarse_from).resolve(),
         run.key({"options": options, "scene": dict(scene.synth) or scene.capture}, measured),
         settings.lpips_weights and settings.lpips_weights.resolve(), settings.bins, threads,
-        threads if settings.jobs == 1 else 1, settings.redo or run.pictures is not None,
-        run.pictures and run.pictures.resolve(),
+        threads if settings.jobs == 1 else 1, settings.redo,
+        run.renders and run.renders.resolve(),
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from vdgs.config import PRESETS, MethodConfig, PresetName
 COARSE_ONLY = ("coarse", "evaluate")
 WITH_BLOCKS = ("coarse", "partition", "blocks", "merge", "evaluate")
 EXPLICIT = ("gaussians",)
-PICTURES = ("pictures",)
+RENDERS = ("renders",)
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class Method:
     less: str = ""
     #: What it gets more than the others, to find out what holds them back.
     more: str = ""
-    #: Where another program left its pictures of the test views (`pictures`); None: the method is trained here.
-    pictures: Path | None = None
+    #: Where another program left its renders of the test views (`renders.py`); None: the method is trained here.
+    renders: Path | None = None
 
     def settings(self, base: MethodConfig, budget: Budget) -> MethodConfig:
         return self.change(base, budget)

@@ -24,9 +24,8 @@ def notes_of(plan: Plan, results: Sequence[Result], lines: Sequence[Line], figur
     parts.append(_fairness(plan))
     parts.append(_list("Groups by visibility", _groups(plan, results)))
     lost = [each for each in results if each.state != "done"]
-    if lost:
-        said = [f"{each.method} on {each.scene}, seed {each.seed}: {each.state}. {each.why}" for each in lost]
-        parts.append(_list("Missing", said))
+    said = [f"{each.method} on {each.scene}, seed {each.seed}: {each.state}. {each.why}" for each in lost]
+    parts.append(_list("Missing", [*said, *_not_rendered(plan)]))
     parts.append(_list("Methods", map(_method, plan.methods)))
     parts.append(_list("Scenes", [f"{scene.title}: {scene.note}" for scene in plan.scenes if scene.note]))
     if plan.table.name in QUOTED:
@@ -41,6 +40,17 @@ _PARTS = (
     "total counts photographs, whatever their size: they make more iterations, of smaller pictures (and so decide more "
     "often about growth). The columns have both; in rows where these are the same, blocks draw whole photographs."
 )
+
+
+def _not_rendered(plan: Plan) -> list[str]:
+    """For which scenes and seeds another program left no renders, while it did for others."""
+    return [
+        f"{method.title} on {scene.title}: no renders for seed {', '.join(map(str, seeds))}."
+        for method in plan.methods
+        if method.renders is not None
+        for scene in plan.scenes
+        if (seeds := [seed for seed in plan.seeds if (scene.name, method.name, seed) not in plan.answers])
+    ]
 
 
 def _fairness(plan: Plan) -> str:
@@ -62,6 +72,9 @@ def _fairness(plan: Plan) -> str:
     ]
     if plan.max_anchors:
         said.append(_limit(plan))
+    foreign = [method.title for method in plan.methods if method.renders is not None]
+    if foreign:
+        said.append(f"None of this is known of {', '.join(foreign)}: rendered by another program.")
     return _list("What each method got", said)
 
 

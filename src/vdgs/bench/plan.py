@@ -12,7 +12,7 @@ from typing import Any
 from vdgs.bench.definitions import EXPLICIT, Budget, Method, Scene, Table
 from vdgs.bench.explicit import gaussians_config
 from vdgs.bench.methods import METHODS
-from vdgs.bench.pictures import folder_of_pictures, identity, method_of_pictures
+from vdgs.bench.renders import folder_of, foreign_method, identity
 from vdgs.bench.scenes import SCENES
 from vdgs.bench.tables import TABLES
 from vdgs.config import MethodConfig, to_dict
@@ -32,7 +32,7 @@ class Choices:
     iterations_total: int | None = None
     max_anchors: int = 0
     validation: bool = False
-    #: NAME=FOLDER of pictures by other programs.
+    #: NAME=FOLDER of renders by other programs.
     renders: tuple[str, ...] = ()
 
 
@@ -49,8 +49,9 @@ class PlannedRun:
     config: MethodConfig
     #: The run whose coarse stage this one takes over; None trains its own.
     coarse_from: Path | None = None
-    #: The pictures that it measures; None: it is trained.
-    pictures: Path | None = None
+    #: The renders by another program that it measures, and what tells them from others; None: it is trained.
+    renders: Path | None = None
+    identity: str = ""
 
     @property
     def name(self) -> str:
@@ -58,8 +59,8 @@ class PlannedRun:
 
     def key(self, capture: Mapping[str, Any], measured: Mapping[str, Any]) -> str:
         """Changes with everything that the run's result depends on."""
-        if self.pictures is not None:
-            return _digest([self.stages, identity(self.pictures), dict(capture), dict(measured)])
+        if self.renders is not None:
+            return _digest([self.stages, self.identity, dict(capture), dict(measured)])
         plain = to_dict(self.config)
         # A method without blocks does not depend on their settings.
         sections = list(plain) if "blocks" in self.stages else ["training"]
@@ -103,7 +104,7 @@ def make_plan(name: str, choices: Choices) -> Plan:
     seeds = table.seeds if choices.seeds is None else tuple(range(choices.seeds))
     if not seeds:
         raise VdgsError("--seeds must be at least 1")
-    methods += _of_pictures(choices, methods, scenes, seeds)
+    foreign = _foreign(choices, scenes, seeds)
     budgets: dict[str, Budget] = {}
     answers: dict[tuple[str, str, int], PlannedRun] = {}
     coarse, runs = list[PlannedRun](), list[PlannedRun]()
@@ -111,8 +112,8 @@ def make_plan(name: str, choices: Choices) -> Plan:
         budgets[scene.name] = budget = _budget(scene, choices)
         for seed in seeds:
             base = _limited(scene.base(budget, seed, budget.total / scene.budget.total), choices)
-            planned = [_planned(scene, method, budget, base, seed) for method in methods if not method.pictures]
-            planned += _pictures(scene, methods, base, seed)
+            planned = [_planned(scene, method, budget, base, seed) for method in methods]
+            planned += _foreign_runs(scene, foreign, base, seed)
             shared, planned = _share_coarse(planned)
             coarse += shared
             taken: dict[str, PlannedRun] = {}
@@ -121,37 +122,32 @@ def make_plan(name: str, choices: Choices) -> Plan:
                 answers[scene.name, run.method, seed] = same
             runs += taken.values()
     return Plan(
-        table, scenes, methods, seeds, budgets, tuple(coarse), tuple(runs), answers, choices.max_anchors,
+        table, scenes, methods + foreign, seeds, budgets, tuple(coarse), tuple(runs), answers, choices.max_anchors,
         choices.validation,
     )  # fmt: skip
 
 
-def _of_pictures(
-    choices: Choices, methods: Sequence[Method], scenes: Sequence[Scene], seeds: Sequence[int]
-) -> tuple[Method, ...]:
-    """The methods whose pictures are given. Raises VdgsError for a name that is taken or a folder without pictures."""
-    taken, found = {*METHODS, *(method.name for method in methods)}, list[Method]()
+def _foreign(choices: Choices, scenes: Sequence[Scene], seeds: Sequence[int]) -> tuple[Method, ...]:
+    """The methods whose renders are given. Raises VdgsError for a name that is taken or a folder without renders."""
+    found = list[Method]()
     for text in choices.renders:
-        method = method_of_pictures(text)
-        if method.name in taken:
-            raise VdgsError(f"--renders {text!r}: there is a method {method.name!r} already; choose another name")
-        if not any(folder_of_pictures(method, scene.name, seed) for scene in scenes for seed in seeds):
+        method = foreign_method(text, [*METHODS.values(), *found])
+        if not any(folder_of(method, scene.name, seed) for scene in scenes for seed in seeds):
             names = ", ".join(scene.name for scene in scenes)
             raise VdgsError(
-                f"--renders {text!r}: {method.pictures} holds no pictures. They are looked for in folders named after "
+                f"--renders {text!r}: {method.renders} holds no renders. They are looked for in folders named after "
                 f"the scenes ({names}): SCENE/*.png, or SCENE/0/*.png, SCENE/1/*.png, ... for several seeds."
             )
-        taken.add(method.name)
         found.append(method)
     return tuple(found)
 
 
-def _pictures(scene: Scene, methods: Sequence[Method], base: MethodConfig, seed: int) -> list[PlannedRun]:
+def _foreign_runs(scene: Scene, methods: Sequence[Method], base: MethodConfig, seed: int) -> list[PlannedRun]:
     """The runs that measure what others rendered of a scene, where they did."""
-    found = [(method, folder_of_pictures(method, scene.name, seed)) for method in methods]
+    found = [(method, folder_of(method, scene.name, seed)) for method in methods]
     return [
-        PlannedRun(scene.name, method.name, seed, Path("runs", scene.name, method.name, str(seed)), method.stages, base,
-                   pictures=folder)
+        PlannedRun(scene.name, method.name, seed, Path("runs", scene.name, f"renders-{method.name}", str(seed)),
+                   method.stages, base, renders=folder, identity=identity(folder))
         for method, folder in found if folder is not None
     ]  # fmt: skip
 

@@ -66,7 +66,7 @@ def _read(output: Path, planned: PlannedRun) -> tuple[dict[str, float | None], t
     metrics, record = read_json(evaluated(run.path) / "metrics.json"), read_json(run.path / RECORD)
     figures: dict[str, float | None] = {name: metrics.get(name) for name in QUALITY}
     figures |= {"model_bytes": metrics.get("model_bytes"), "fps": metrics["fps"]}
-    if planned.pictures is None:
+    if planned.renders is None:
         figures |= _sizes(metrics, planned) | _costs(run, planned.stages, record.get("seconds", {}))
     file = run.path / GROUPS_FILE
     measured: dict[str, Any] = read_json(file) if file.exists() else {"groups": [], "seen_by": ""}

@@ -32,18 +32,29 @@ def verdict(plan: Plan, results: Sequence[Result]) -> list[Line]:
     """For each scene with the full method: uneven ones by group, even ones against the best."""
     lines = []
     ours = plan.table.ours
-    titles = {method.name: method.title for method in plan.methods}
+    foreign = {method.name for method in plan.methods if method.renders is not None}
+    titles = {method.name: method.title + " (by another program)" * (method.name in foreign) for method in plan.methods}
     for scene in plan.scenes:
         mine = [result for result in results if result.scene == scene.name]
-        fair = [method.name for method in plan.methods if method.name != ours and not method.more]
+        fair = [
+            method.name for method in plan.methods
+            if method.name != ours and not method.more and _has_answer(plan, scene.name, method.name)
+        ]  # fmt: skip
         others = [name for name in fair if not _same_runs(plan, scene.name, ours, name)]
         if ours not in titles or not others:
             continue
         if scene.uneven:
             lines += [line for other in others for line in _uneven(scene.title, mine, ours, other, titles)]
         else:
-            lines.append(_even(scene.title, mine, ours, {name: titles[name] for name in (ours, *fair)}))
+            # The best of those that had the same means.
+            equal = [name for name in fair if name not in foreign]
+            lines.append(_even(scene.title, mine, ours, {name: titles[name] for name in (ours, *equal)}))
     return lines
+
+
+def _has_answer(plan: Plan, scene: str, method: str) -> bool:
+    """Another program may have left no renders of a scene."""
+    return any((scene, method, seed) in plan.answers for seed in plan.seeds)
 
 
 def _same_runs(plan: Plan, scene: str, ours: str, other: str) -> bool:

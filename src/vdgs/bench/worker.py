@@ -38,7 +38,7 @@ class Job:
     threads: int
     block_jobs: int
     redo: bool = False
-    pictures: Path | None = None
+    renders: Path | None = None
 
     def write(self, path: Path) -> None:
         write_json(path, {name: _plain(value) for name, value in vars(self).items()})
@@ -46,7 +46,7 @@ class Job:
     @staticmethod
     def read(path: Path) -> Job:
         values = read_json(path)
-        for name in ("capture", "output", "coarse_from", "lpips_weights", "pictures"):
+        for name in ("capture", "output", "coarse_from", "lpips_weights", "renders"):
             values[name] = None if values[name] is None else Path(values[name])
         return Job(**values | {"stages": tuple(values["stages"])})
 
@@ -102,17 +102,17 @@ def _gaussians(at: _Working) -> None:
     train_explicit(at.run, at.capture, at.job.lpips_weights, at.console)
 
 
-def _pictures(at: _Working) -> None:
-    from vdgs.bench.pictures import measure_pictures
+def _renders(at: _Working) -> None:
+    from vdgs.bench.renders import measure_renders
 
-    assert at.job.pictures is not None
-    measure_pictures(at.capture, at.job.pictures, at.run.evaluation, at.job.lpips_weights, at.job.bins, at.console)
+    assert at.job.renders is not None
+    measure_renders(at.capture, at.job.renders, at.run.evaluation, at.job.lpips_weights, at.console)
 
 
 #: What a method may name as its stages. Each does nothing, or the same again, where it is done.
 STAGES: dict[str, Callable[[_Working], None]] = {
     "coarse": _coarse, "partition": _partition, "blocks": _blocks, "merge": _merge, "evaluate": _evaluate,
-    "gaussians": _gaussians, "pictures": _pictures,
+    "gaussians": _gaussians, "renders": _renders,
 }  # fmt: skip
 
 
@@ -148,23 +148,31 @@ def work(job: Job) -> None:
     from rich.console import Console
 
     from vdgs.kernels.native.module import set_threads
-    from vdgs.stages.coarse import begin_run
-    from vdgs.stages.opening import options_from
 
     set_threads(job.threads)
     torch.set_num_threads(job.threads)
-    console = Console(soft_wrap=True)
-    options = options_from(job.options, job.output)
-    method = from_dict(MethodConfig, job.method)
-    run, capture = begin_run(job.capture, job.output, options, method, redo=job.redo)
-    working = _Working(job, run, capture, console)
+    working = _Working(job, *_opened(job), Console(soft_wrap=True))
     record = _record(job)
+    write_json(job.output / RECORD, record)  # what an interrupted run leaves is not what it was before
     for name in job.stages:
         began = time.monotonic()
         STAGES[name](working)
         record["seconds"][name] = record["seconds"].get(name, 0.0) + time.monotonic() - began
         write_json(job.output / RECORD, record)
     write_json(job.output / RECORD, record | {"state": "done"})
+
+
+def _opened(job: Job) -> tuple[Any, Any]:
+    """The run folder and the capture. Where renders are measured the folder is no run: nothing is trained there."""
+    from vdgs.captures.loading import load_capture
+    from vdgs.run import RunFolder
+    from vdgs.stages.coarse import begin_run
+    from vdgs.stages.opening import options_from
+
+    options = options_from(job.options, job.output)
+    if job.renders is not None:
+        return RunFolder(job.output), load_capture(job.capture, options)
+    return begin_run(job.capture, job.output, options, from_dict(MethodConfig, job.method), redo=job.redo)
 
 
 def _record(job: Job) -> dict[str, Any]:

@@ -164,6 +164,8 @@ def train_step(state: GaussiansState, stage: GaussiansStage) -> GaussiansReport:
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
     *gradients, of_means_px = torch.autograd.grad(found.loss, [*seen.values(), means_px], materialize_grads=True)
+    psnr = psnr_of(raster.image.detach(), target, mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
+    _make_room(state)
     state.whole = False
     _move(state, rows, dict(zip(seen, gradients, strict=True)), rates_at(config, stage.extent, iteration), degree)
     state.iteration += 1
@@ -172,9 +174,16 @@ def train_step(state: GaussiansState, stage: GaussiansStage) -> GaussiansReport:
     if state.iteration <= config.density.until * config.iterations:
         _count(state, rows, of_means_px, camera)
         report = replace(report, **_control(state, stage))
-    _smooth(state, value, raster.image.detach(), target, mask)
+    _smooth(state, value, psnr)
     state.whole = True
     return report
+
+
+def _make_room(state: GaussiansState) -> None:
+    """Room for gradients, where growth has taken it away: before anything moves, since it is large."""
+    for name, tensor in state.gaussians.tensors().items():
+        if name not in state.room:
+            state.room[name] = torch.zeros_like(tensor)
 
 
 def _move(
@@ -185,8 +194,6 @@ def _move(
     for name, tensor in state.gaussians.tensors().items():
         if name == "rest" and not degree:
             continue  # gradients and moments are zero: nothing moves
-        if name not in state.room:
-            state.room[name] = torch.zeros_like(tensor)
         everywhere = state.room[name].index_copy_(0, rows, gradients[name])
         finite &= kernels.adam_rows(
             tensor, None, everywhere, state.moments.first[name], state.moments.second[name],
@@ -232,9 +239,8 @@ def _apply(state: GaussiansState, added: Gaussians, kept: Tensor) -> None:
     state.gradient, state.views = torch.zeros(len(state.gaussians)), torch.zeros(len(state.gaussians))
 
 
-def _smooth(state: GaussiansState, loss: float, image: Tensor, target: Tensor, mask: Tensor | None) -> None:
+def _smooth(state: GaussiansState, loss: float, psnr: float | None) -> None:
     state.loss = smoothed(state.loss, loss, KEEP_LOSS)
-    psnr = psnr_of(image, target, mask) if state.iteration % PSNR_INTERVAL == 0 else None
     if psnr is not None:
         state.psnr = smoothed(state.psnr, psnr, KEEP_PSNR)
 

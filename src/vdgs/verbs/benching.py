@@ -31,8 +31,8 @@ class BenchArguments:
     methods: tuple[str, ...] = ()
     """Other methods than the table's, by name: full, baseline, no-blocking, vastgaussian, lambda-vis-0, ..."""
     renders: tuple[str, ...] = ()
-    """Pictures of the test views by other programs, a row for each NAME=FOLDER: FOLDER/SCENE/PHOTOGRAPH.png, or
-    FOLDER/SCENE/SEED/PHOTOGRAPH.png. They are measured as all others."""
+    """What other programs rendered of the test views, a row for each NAME=FOLDER (several after one --renders):
+    FOLDER/SCENE/VIEW.png or FOLDER/SCENE/SEED/VIEW.png. Measured as all others (docs/bench.md)."""
     data: Path | None = None
     """Folder that holds the captures which are not generated: residence-pixsfm, copr, ..."""
     scale_iterations: float = 1.0

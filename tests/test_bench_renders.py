@@ -1,4 +1,4 @@
-"""Pictures by other programs as rows of the bench."""
+"""Renders by other programs as rows of the bench."""
 
 import shutil
 from pathlib import Path
@@ -10,8 +10,11 @@ import pytest
 from bench_support import benched, run_here, write_data
 from vdgs.bench import bench
 from vdgs.bench.measure import evaluated
+from vdgs.bench.notes import notes_of
 from vdgs.bench.plan import Choices, make_plan
+from vdgs.bench.verdict import verdict
 from vdgs.errors import VdgsError
+from vdgs.evaluation import saving
 
 
 @pytest.fixture(scope="module")
@@ -38,13 +41,13 @@ def here(monkeypatch) -> None:
 
 @pytest.fixture
 def theirs(output, tmp_path) -> Path:
-    """Its pictures, as another program would leave them."""
+    """Its renders, as another program would leave them."""
     folder = tmp_path / "theirs"
     shutil.copytree(evaluated(output / "runs" / "copr" / "baseline" / "0") / "renders", folder / "copr")
     return folder
 
 
-def test_pictures_of_our_own_measure_as_our_own(data, output, theirs):
+def test_renders_of_our_own_measure_as_our_own(data, output, theirs):
     both = benched(data, output, "baseline", renders=(f"Some Program 2={theirs}",))
     ours, foreign = both["baseline"], both["some-program-2"]
     quality = {name: value for name, value in ours.figures.items() if name.startswith(("psnr", "ssim", "lpips"))}
@@ -57,29 +60,60 @@ def test_pictures_of_our_own_measure_as_our_own(data, output, theirs):
     text = (output / "table1" / "table.md").read_text()
     row = next(line for line in text.splitlines() if line.startswith("| Some Program 2 | –"))
     assert set(row.removeprefix("| Some Program 2 |").split()) == {"–", "|"}  # what it cost
-    assert "pictures that another program rendered" in text
+    assert "rendered by another program" in text
+    assert "None of this is known of Some Program 2" in text
 
 
-def test_other_pictures_are_measured_again(data, output, theirs):
+def test_other_renders_are_measured_again(data, output, theirs):
     def psnr() -> float:
         figure = benched(data, output, "baseline", renders=(f"other={theirs}",))["other"].figures["psnr"]
         assert figure is not None
         return figure
 
     before = psnr()
-    metrics = output / "runs" / "copr" / "other" / "0" / "evaluation" / "metrics.json"
+    metrics = output / "runs" / "copr" / "renders-other" / "0" / "evaluation" / "metrics.json"
     written = metrics.stat().st_mtime_ns
     assert psnr() == before
     assert metrics.stat().st_mtime_ns == written  # not measured twice
     for file in (theirs / "copr").glob("*.png"):
         cv2.imwrite(str(file), 255 - cv2.imread(str(file)))
     assert psnr() < before
-    # The folder of a seed goes before that of the scene.
+    # The folder of a seed goes before that of the scene, but for an empty one.
+    (theirs / "copr" / "0").mkdir()
+    assert psnr() < before
+    (theirs / "copr" / "0").rmdir()
     shutil.copytree(evaluated(output / "runs" / "copr" / "baseline" / "0") / "renders", theirs / "copr" / "0")
     assert psnr() == before
 
 
-def test_pictures_that_cannot_be_measured_are_named_before_anything_is_trained(data, theirs, tmp_path):
+def test_what_was_broken_off_is_measured_again(data, output, theirs, monkeypatch):
+    asked = {"renders": (f"broken={theirs}",)}
+    before = benched(data, output, "baseline", **asked)["broken"].figures["psnr"]
+    files = sorted((theirs / "copr").glob("*.png"))
+    pictures = [file.read_bytes() for file in files]
+    for file in files:
+        cv2.imwrite(str(file), 255 - cv2.imread(str(file)))
+    write, written = saving.write_png, []
+
+    def interrupted(path, picture):
+        if path.parent.name == "renders" and written:
+            raise KeyboardInterrupt
+        written.append(path)
+        write(path, picture)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(saving, "write_png", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            benched(data, output, "baseline", **asked)
+    for file, picture in zip(files, pictures, strict=True):
+        file.write_bytes(picture)
+    assert benched(data, output, "baseline", **asked)["broken"].figures["psnr"] == before
+    for file, picture in zip(files, pictures, strict=True):
+        measured = output / "runs" / "copr" / "renders-broken" / "0" / "evaluation" / "renders" / file.name
+        assert (cv2.imread(str(measured)) == cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)).all()
+
+
+def test_renders_that_cannot_be_measured_are_named_before_anything_is_trained(data, theirs, tmp_path):
     def complaint() -> str:
         with pytest.raises(VdgsError) as raised:
             benched(data, tmp_path / "out", "baseline", renders=(f"other={theirs}",))
@@ -94,17 +128,22 @@ def test_pictures_that_cannot_be_measured_are_named_before_anything_is_trained(d
     first.write_bytes(b"no picture")
     assert f"{first}: cannot be read as a picture" in complaint()
     first.unlink()
-    assert f"{first}: is not there. The test view" in complaint()
+    count = len(list((theirs / "copr").glob("*.png")))
+    assert f"{theirs / 'copr'}: lacks 1 of {count + 1} views: {first.name} (" in complaint()
 
 
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("renders", "give a name and a folder"),
-        ("=renders", "give a name and a folder"),
+        ("renders", r"give a name \(.*\) and a folder"),
+        ("=renders", r"give a name \(.*\) and a folder"),
+        ("name=", r"give a name \(.*\) and a folder"),
+        ("$\\foo$={folder}", r"give a name \(.*\) and a folder"),
+        ("_hidden={folder}", r"give a name \(.*\) and a folder"),
         ("name=nowhere", "'nowhere' is not a folder"),
-        ("3DGS={folder}", "there is a method '3dgs' already"),
-        ("mine={folder}", r"holds no pictures. They are looked for in folders named after the scenes \(copr\)"),
+        ("w/o blocking={folder}", r"give a name \(.*\) and a folder"),
+        ("3DGS={folder}", "there is a method '3DGS' already"),
+        ("mine={folder}", r"holds no renders. They are looked for in folders named after the scenes \(copr\)"),
     ],
 )
 def test_what_cannot_be_a_row_is_refused(text, why, tmp_path):
@@ -112,7 +151,7 @@ def test_what_cannot_be_a_row_is_refused(text, why, tmp_path):
         make_plan("table1", Choices(scenes=("copr",), renders=(text.format(folder=tmp_path),)))
 
 
-def test_scenes_and_seeds_without_pictures_are_left_out(tmp_path):
+def test_scenes_and_seeds_without_renders_are_left_out_and_named(tmp_path):
     for folder in ("copr", "copr/2", "brighton/1"):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "view.png").write_bytes(b"")
@@ -120,7 +159,12 @@ def test_scenes_and_seeds_without_pictures_are_left_out(tmp_path):
         seeds=3, scenes=("copr", "brighton", "seneca"), methods=("baseline",), renders=(f"mine={tmp_path}",)
     )
     plan = make_plan("table1", choices)
-    mine = {(scene, seed): run.pictures for (scene, method, seed), run in plan.answers.items() if method == "mine"}
+    mine = {(scene, seed): run.renders for (scene, method, seed), run in plan.answers.items() if method == "mine"}
     assert mine == {
         ("copr", 0): tmp_path / "copr", ("copr", 2): tmp_path / "copr/2", ("brighton", 1): tmp_path / "brighton/1"
     }  # fmt: skip
+    missing = next(note for note in notes_of(plan, [], [], False) if note.startswith("## Missing"))
+    assert [line.split(": ", 1)[1] for line in missing.splitlines()[2:]] == [
+        "no renders for seed 1.", "no renders for seed 0, 2.", "no renders for seed 0, 1, 2."
+    ]  # fmt: skip
+    assert not [line for line in verdict(plan, []) if line.scene.startswith("seneca") and "mine" in line.question]

@@ -1,0 +1,123 @@
+"""Test views that another program rendered, as a row of a table.
+
+    FOLDER/SCENE/SEED/VIEW.png      of seed 0 also FOLDER/SCENE/VIEW.png
+
+They are measured as the others are: the same pixels, the same groups by visibility. What the program was given and what
+it cost is not known here.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from rich.console import Console
+from torch import Tensor
+
+from vdgs.bench.definitions import RENDERS, Method
+from vdgs.captures.capture import Capture, View
+from vdgs.errors import VdgsError
+from vdgs.evaluation.evaluate import MeasuredModel, evaluate
+from vdgs.evaluation.lpips import load_lpips
+from vdgs.evaluation.of_run import cached_photographs
+from vdgs.evaluation.saving import file_stems
+from vdgs.tensor_files import size_and_checksum
+
+#: What a row may be called: it also names a folder, and stands in tables of three languages and in a figure.
+NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9 .+_()-]*")
+#: Missing files that an error names, at most.
+NAMED = 5
+
+
+def foreign_method(text: str, known: Iterable[Method]) -> Method:
+    """A method from NAME=FOLDER. Raises VdgsError if it is not that, if a known method has the name, or without
+    the folder."""
+    title, _, folder = text.partition("=")
+    title = title.strip()
+    if not folder or not NAMES.fullmatch(title):
+        raise VdgsError(
+            f"--renders {text!r}: give a name (letters a to z, digits, spaces, . + - _ and brackets) and a folder, as "
+            "in OpenSplat=renders/opensplat"
+        )
+    if not Path(folder).is_dir():
+        raise VdgsError(f"--renders {text!r}: {folder!r} is not a folder")
+    name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+    if any(name == method.name or title == method.title for method in known):
+        raise VdgsError(f"--renders {text!r}: there is a method {title!r} already; choose another name")
+    return Method(
+        name, title, lambda config, _: config, RENDERS, renders=Path(folder),
+        differs="rendered by another program; what it was given and what it cost is not known here",
+    )  # fmt: skip
+
+
+def folder_of(method: Method, scene: str, seed: int) -> Path | None:
+    """Where the renders of a scene and seed are; None where there are none."""
+    if method.renders is None:
+        return None
+    of_scene = method.renders / scene
+    folders = [of_scene / str(seed)] + [of_scene] * (seed == 0)
+    return next((folder for folder in folders if any(folder.glob("*.png"))), None)
+
+
+def identity(folder: Path) -> str:
+    """What tells these renders from any others."""
+    crc = 0
+    for file in sorted(folder.glob("*.png")):
+        crc = zlib.crc32(f"{file.name} {size_and_checksum(file)}".encode(), crc)
+    return f"{crc:08x}"
+
+
+def check_renders(folder: Path, views: Sequence[View]) -> list[Path]:
+    """The render of every view, in order. Raises VdgsError, naming files, unless all are there in the size of the
+    photographs."""
+    files = [folder / f"{stem}.png" for stem in file_stems([view.name for view in views])]
+    missing = [f"{file.name} ({view.name})" for file, view in zip(files, views, strict=True) if not file.exists()]
+    if missing:
+        more = f" and {len(missing) - NAMED} more" if len(missing) > NAMED else ""
+        raise VdgsError(
+            f"{folder}: lacks {len(missing)} of {len(files)} views: {', '.join(missing[:NAMED])}{more}. Each is needed "
+            "under that name, as PNG in the size of the photograph."
+        )
+    for file, view in zip(files, views, strict=True):
+        _read(file, view)
+    return files
+
+
+def measure_renders(capture: Capture, folder: Path, output: Path, lpips_weights: Path | None, console: Console) -> None:
+    """Measure the renders against the test photographs; writes an evaluation into `output`, without speed or size.
+
+    Raises what `check_renders` raises.
+    """
+    views = capture.test_views
+    files = check_renders(folder, views)
+    of_camera = {id(view.camera): (file, view) for file, view in zip(files, views, strict=True)}
+    lpips, note = load_lpips(lpips_weights)
+    model = MeasuredModel(lambda camera: _Render(_read(*of_camera[id(camera)])), timed=False)
+    with cached_photographs(views) as photographs:
+        evaluate(photographs, model, output, lpips=lpips, lpips_note=note, console=console)
+
+
+@dataclass(frozen=True)
+class _Render:
+    image: Float[Tensor, "h w 3"]
+
+
+def _read(file: Path, view: View) -> Float[Tensor, "h w 3"]:
+    """RGB in [0, 1]; transparency is not looked at."""
+    picture = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise VdgsError(f"{file}: cannot be read as a picture")
+    height, width = picture.shape[:2]
+    if (width, height) != (view.camera.width, view.camera.height):
+        raise VdgsError(
+            f"{file}: is {width} x {height} pixels, the photograph as it is used here {view.camera.width} x "
+            f"{view.camera.height}. Render it in that size."
+        )
+    return torch.from_numpy(np.ascontiguousarray(picture[..., ::-1])).float() / 255.0
