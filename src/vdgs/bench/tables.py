@@ -27,6 +27,7 @@ _ABLATION = (
     "no-blocking-as-long",
     "no-blocking",
     "no-anchor-generation",
+    "printed-compensation",
     "printed",
     "whole-photographs",
     "full",
