@@ -27,14 +27,15 @@ import torch
 
 from machine import describe
 from stopwatch import medians_ms
-from vdgs.anchors import AnchorModel, Anchors
 from vdgs.cameras import Camera
-from vdgs.config import AssignmentConfig
-from vdgs.decoder import Decoder
 from vdgs.kernels import native as kernels
 from vdgs.kernels.native.module import set_threads, threads
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchors import Anchors
+from vdgs.model.decoder import Decoder
+from vdgs.partition.assignment.scores import score_matrix
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.scores import score_matrix
+from vdgs.settings.method import AssignmentConfig
 
 MODES = get_args(get_type_hints(AssignmentConfig)["mode"])
 SIZE, ALTITUDE = (1200, 800), 20.0
@@ -87,14 +88,14 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     print(describe())
     if arguments.run:
-        from vdgs.stages.opening import open_run
+        from vdgs.runs.opening import open_run
 
         run = open_run(arguments.run)
         model, cameras = run.model, [view.camera for view in run.capture.train_views]
     else:
         model, cameras = strip(arguments.visible, arguments.blocks, arguments.cameras)
     blocks = slices(model, arguments.blocks)
-    seen = [int((kernels.count_views(model.anchors.positions, [camera]) > 0).sum()) for camera in cameras]
+    seen = [int((kernels.count_visibility(model.anchors.positions, [camera]) > 0).sum()) for camera in cameras]
     print(
         f"{len(cameras)} cameras, {len(blocks)} blocks, {len(model.anchors):,} anchors, "
         f"{np.mean(seen):,.0f} in a view, {arguments.threads} thread(s)"

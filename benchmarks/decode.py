@@ -18,12 +18,12 @@ import numpy as np
 import torch
 
 from vdgs.cameras import Camera
-from vdgs.kernels.decode_types import DecoderWeights, Splats
 from vdgs.kernels.native import module
 from vdgs.kernels.native.cull import cull as native_cull
 from vdgs.kernels.native.decode import decode as native_decode
 from vdgs.kernels.reference.cull import cull as twin_cull
 from vdgs.kernels.reference.decode import decode as twin_decode
+from vdgs.kernels.types import DecoderWeights, Splats
 
 
 def overhead_camera() -> Camera:

@@ -19,11 +19,11 @@ import shapely
 import torch
 
 from machine import describe
-from vdgs.config import PartitionConfig
 from vdgs.kernels.native import module
+from vdgs.model.visibility import visibility_of
 from vdgs.partition.blocks import Blocks
 from vdgs.partition.cut import cut_scene
-from vdgs.visibility import views_of
+from vdgs.settings.method import PartitionConfig
 from visibility import flight
 
 EXTENT_M = 2000.0
@@ -72,7 +72,7 @@ def main() -> None:
     print(describe())
     print(f"{arguments.anchors} anchors, {arguments.cameras} cameras")
     positions, cameras = town(arguments.anchors), flight(arguments.cameras, EXTENT_M, 120.0, 45.0)
-    views = timed("V of all anchors", lambda: views_of(torch.from_numpy(positions).float(), cameras)).numpy()
+    views = timed("V of all anchors", lambda: visibility_of(torch.from_numpy(positions).float(), cameras)).numpy()
     generator = np.random.default_rng(2)
     for count, balanced in ((8, False), (8, True), (16, False)):
         config = PartitionConfig(blocks=count, balanced=balanced)

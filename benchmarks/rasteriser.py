@@ -144,8 +144,8 @@ class Prototype:
 
 def scenes_of_run(run: Path, views: int) -> list[tuple[str, Scene]]:
     """What the first test views of a trained run draw."""
-    from vdgs.render import decode_rows, visible_rows
-    from vdgs.stages.opening import open_run
+    from vdgs.model.render import decode_rows, visible_rows
+    from vdgs.runs.opening import open_run
 
     opened, scenes = open_run(run), []
     for view in opened.capture.test_views[:views]:

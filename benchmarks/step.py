@@ -28,18 +28,18 @@ import numpy as np
 import torch
 
 from machine import describe
-from vdgs.anchors import Anchors
 from vdgs.cameras import Camera
-from vdgs.checkpoints import save_state
-from vdgs.config import TrainConfig
-from vdgs.decoder import Decoder
 from vdgs.kernels import native as kernels
 from vdgs.kernels.native.module import set_threads
-from vdgs.memory import forget_peak, peak_memory_bytes
-from vdgs.optimiser import rates_at
-from vdgs.render import decode_rows, visible_rows
-from vdgs.step import draw_view, move_anchors
+from vdgs.memory.process import forget_peak, peak_memory_bytes
+from vdgs.model.anchors import Anchors
+from vdgs.model.decoder import Decoder
+from vdgs.model.render import decode_rows, visible_rows
+from vdgs.settings.method import TrainConfig
+from vdgs.storage.checkpoints import save_state
 from vdgs.training import Stage, start_state, to_saved
+from vdgs.training.optimiser import rates_at
+from vdgs.training.step import draw_view, move_anchors
 
 PHASES = ("cull", "decode", "rasterise", "loss", "backward", "move", "statistics")
 

@@ -64,13 +64,13 @@ def main() -> None:
         points = scene(arguments.points, extent_m)
         cameras = flight(arguments.cameras, extent_m, 120.0, tilt_deg)
         start = time.perf_counter()
-        count = native.count_views(points, cameras)
+        count = native.count_visibility(points, cameras)
         seconds = time.perf_counter() - start
         few = cameras[:BRUTE_FORCE_CAMERAS]
         start = time.perf_counter()
-        expected = reference.count_views(points, few)
+        expected = reference.count_visibility(points, few)
         brute_force = (time.perf_counter() - start) * len(cameras) / len(few)
-        differing = int((native.count_views(points, few) != expected).sum())
+        differing = int((native.count_visibility(points, few) != expected).sum())
         print(f"{name:>22} {seconds:9.2f} {brute_force:23.1f} {float(count.float().mean()):7.1f} {differing:9}")
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB")
 

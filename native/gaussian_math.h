@@ -10,7 +10,7 @@
 #define VDGS_FN __host__ __device__ __forceinline__
 #else
 #define VDGS_FN inline __attribute__((always_inline))
-#include "simd_math.h"
+#include "simd/math.h"
 #endif
 
 #include "image_formation.h"

@@ -10,12 +10,13 @@ import shapely
 import torch
 
 from captures_support import look_down
-from vdgs.anchors import AnchorModel, Anchors
 from vdgs.cameras import Camera
-from vdgs.config import AssignmentConfig
-from vdgs.decoder import Decoder
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchors import Anchors
+from vdgs.model.decoder import Decoder
+from vdgs.partition.assignment.scores import Scores
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.scores import Scores
+from vdgs.settings.method import AssignmentConfig
 
 MODES = ("coverage", "literal", "leave_one_out", "frustum")
 RENDERED = MODES[:3]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from vdgs.cameras import Camera, CameraModel
-from vdgs.kernels.decode_types import DecoderWeights
+from vdgs.kernels.types import DecoderWeights
 
 
 def looking_down(model: CameraModel = "pinhole", width: int = 64, height: int = 48) -> Camera:

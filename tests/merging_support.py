@@ -9,9 +9,10 @@ import shapely
 import torch
 
 from captures_support import look_down
-from vdgs.anchors import AnchorModel, Anchors
 from vdgs.cameras import Camera
-from vdgs.decoder import Decoder
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchors import Anchors
+from vdgs.model.decoder import Decoder
 from vdgs.partition.blocks import Block, Blocks
 
 OFFSETS = 2

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from native_choice import every_instruction_set, on_threads, using
 from vdgs.kernels.native import adam as native
 from vdgs.kernels.reference import adam as reference
-from vdgs.optimiser import rebuild
+from vdgs.training.optimiser import rebuild
 
 BOTH = pytest.mark.parametrize("implementation", [reference, native])
 

@@ -15,10 +15,10 @@ from rich.console import Console
 from assignment_support import CONFIG, MODES, camera, hand_made, scene, skyward, strips
 from vdgs.errors import RunError
 from vdgs.kernels import native as kernels
-from vdgs.partition.assignment import ABOVE_THRESHOLD, BEST_BLOCK, NOT_ASSIGNED, TOPPED_UP, assign
-from vdgs.partition.assignment_tables import assignment_rows, assignment_table, explain
-from vdgs.partition.saving import load_scores, save_scores
-from vdgs.partition.scores import score_matrix
+from vdgs.partition.assignment.assign import ABOVE_THRESHOLD, BEST_BLOCK, NOT_ASSIGNED, TOPPED_UP, assign
+from vdgs.partition.assignment.saving import load_scores, save_scores
+from vdgs.partition.assignment.scores import score_matrix
+from vdgs.partition.assignment.tables import assignment_rows, assignment_table, explain
 
 # Whom each block gets
 
@@ -181,7 +181,7 @@ def test_anyone_can_ask_why(saved):
 def test_the_table_counts_what_was_decided(saved):
     _, scores, result = saved
     blocks, positions = strips(4), scene().anchors.positions.numpy()
-    visibility = kernels.count_views(scene().anchors.positions, [camera(2.0), camera(8.0)]).numpy()
+    visibility = kernels.count_visibility(scene().anchors.positions, [camera(2.0), camera(8.0)]).numpy()
     rows = assignment_rows(blocks, positions, visibility, result)
     for index, row in enumerate(rows):
         assert row["cameras"] == row["above_threshold"] + row["best_block"] + row["topped_up"]

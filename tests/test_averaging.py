@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from test_training import CONFIG, run, stage, start
-from vdgs.anchors import TRAINED
-from vdgs.checkpoints import load_newest, save_state
-from vdgs.config import GrowthConfig, TrainConfig
+from vdgs.model.anchors import TRAINED
+from vdgs.settings.method import GrowthConfig, TrainConfig
+from vdgs.storage.checkpoints import load_newest, save_state
 from vdgs.training import from_saved, loop, to_saved, train_step
 from vdgs.training.averaging import MODELS, counts_in_mean
 

@@ -23,8 +23,8 @@ from vdgs.bench.processes import Task, run_tasks
 from vdgs.bench.seen import seen_truly
 from vdgs.bench.worker import Job
 from vdgs.cameras import Camera
-from vdgs.captures.options import CaptureOptions
 from vdgs.errors import VdgsError
+from vdgs.settings.capture import CaptureOptions
 
 
 def test_a_failed_run_stops_only_those_that_build_on_it(tmp_path):

@@ -15,14 +15,14 @@ from vdgs.bench.measure import GROUPS_FILE
 from vdgs.bench.notes import notes_of
 from vdgs.bench.plan import Choices, make_plan
 from vdgs.bench.results import Result
-from vdgs.comparators import gaussian_watching
-from vdgs.comparators.gaussian_schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS, scheduled
-from vdgs.comparators.gaussian_training import GaussiansConfig
-from vdgs.config import MethodConfig
+from vdgs.comparators.gaussians import watching as gaussian_watching
+from vdgs.comparators.gaussians.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS, scheduled
+from vdgs.comparators.gaussians.training import GaussiansConfig
 from vdgs.errors import RunError
-from vdgs.run import RunFolder
-from vdgs.stages.opening import open_run
-from vdgs.stages.watching import Stopped
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import open_run
+from vdgs.settings.method import MethodConfig
+from vdgs.watching.watch import Stopped
 
 
 def test_the_published_length_has_the_published_schedule():

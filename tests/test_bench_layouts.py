@@ -17,7 +17,7 @@ from vdgs.bench.worker import Job, work
 from vdgs.captures.capture import Capture
 from vdgs.captures.loading import load_capture
 from vdgs.cli import main
-from vdgs.run import RunFolder
+from vdgs.runs.folder import RunFolder
 from vdgs.synth import SynthOptions, generate
 
 WIDTH, HEIGHT = 160, 120

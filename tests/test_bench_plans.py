@@ -12,10 +12,11 @@ from vdgs.bench.quoted import QUOTED
 from vdgs.bench.scenes import PUBLISHED, SCENES
 from vdgs.bench.tables import TABLES
 from vdgs.bench.worker import STAGES
-from vdgs.config import PRESETS, to_dict
-from vdgs.config_checks import validate
 from vdgs.errors import VdgsError
-from vdgs.stages.keys import SINCE
+from vdgs.runs.keys import SINCE
+from vdgs.settings.checks import validate
+from vdgs.settings.plain import to_dict
+from vdgs.settings.presets import PRESETS
 from vdgs.verbs.benching import BenchArguments
 
 

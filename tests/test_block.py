@@ -8,17 +8,17 @@ import torch
 
 from block_support import BLOCKS, CONFIG, block_stage, coarse
 from checkerboard import Photographs
-from vdgs.anchors import Anchors
-from vdgs.config import (
+from vdgs.model.anchors import Anchors
+from vdgs.model.render import visible_rows
+from vdgs.partition.blocks import Block, Blocks, places_of
+from vdgs.partition.regions import drawn_by, holds, ramp, split_anchors
+from vdgs.settings.method import (
     BlockConfig,
     CompensationConfig,
     GrowthConfig,
     MethodConfig,
     block_training,
 )
-from vdgs.partition.blocks import Block, Blocks
-from vdgs.render import visible_rows
-from vdgs.stages.block import drawn_by, holds, places, ramp, split_anchors
 from vdgs.training import Stage, Surroundings, TrainingState, from_saved, start_state, to_saved, train, views_in_cycle
 
 
@@ -64,7 +64,7 @@ def test_new_anchors_stand_in_the_core():
     before = len(state.anchors)
     finish(stage, state)
     assert len(state.anchors) > before
-    assert (BLOCKS.owner(places(state.anchors.positions)) == 0).all()
+    assert (BLOCKS.owner(places_of(state.anchors.positions)) == 0).all()
 
 
 def test_every_anchor_is_own_or_around_and_only_what_cameras_draw_is_held():

@@ -31,7 +31,7 @@ from vdgs.evaluation.by_block import (
 from vdgs.evaluation.photographs import Photographs
 from vdgs.evaluation.seams import SEAM_VIEWS, block_table, evaluate_blocks
 from vdgs.kernels.types import Raster
-from vdgs.render import render
+from vdgs.model.render import render
 
 CAMERAS = [
     camera_above(0.3, -0.2),

@@ -14,11 +14,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from captures_support import TinyScene, data_folder, tiny_scene, write_colmap
-from vdgs.captures.colmap import read_colmap
+from vdgs.captures.formats.colmap import read_colmap
+from vdgs.captures.formats.source import CAMERA_MODELS
 from vdgs.captures.loading import load_capture
-from vdgs.captures.options import CaptureOptions
-from vdgs.captures.source import CAMERA_MODELS
 from vdgs.errors import CaptureError
+from vdgs.settings.capture import CaptureOptions
 
 FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

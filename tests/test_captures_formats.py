@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from captures_support import TinyScene, moved, tiny_scene, write_colmap, write_images, write_ply
 from layouts_support import DRB, OPENGL, halves, matrixcity_frames, write_matrixcity, write_mega_nerf
 from vdgs.captures.capture import Capture
+from vdgs.captures.formats.ply import read_point_cloud
 from vdgs.captures.loading import load_capture
-from vdgs.captures.options import CaptureOptions
-from vdgs.captures.ply import read_point_cloud
 from vdgs.errors import CaptureError
+from vdgs.settings.capture import CaptureOptions
 
 FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from captures_support import data_folder, moved, tiny_scene, write_colmap
 from vdgs.captures.alignment import fit_similarity, fit_similarity_robust, geometric_median
+from vdgs.captures.formats.source import Intrinsics, SourceCapture, SourceView
 from vdgs.captures.geodesy import ecef_from_geodetic, enu_from_geodetic, geodetic_from_ecef, geodetic_from_enu
 from vdgs.captures.ground import CAMERA_HEIGHT, find_ground_frame, rotation_to_z, transform_pose
 from vdgs.captures.loading import load_capture
-from vdgs.captures.options import CaptureOptions
-from vdgs.captures.source import Intrinsics, SourceCapture, SourceView
 from vdgs.errors import CaptureError
+from vdgs.settings.capture import CaptureOptions
 
 ORIGIN = (46.8426, -91.994, 159.4)
 

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 
 from captures_support import TinyScene, data_folder, render_plane, tiny_scene, write_colmap, write_images
 from vdgs.captures.checks import check_images
+from vdgs.captures.formats.source import Intrinsics, SourceView
 from vdgs.captures.images import load_picture
 from vdgs.captures.loading import fit_to_image, load_capture, scaled
-from vdgs.captures.options import CaptureOptions
 from vdgs.captures.photographs import decode_photograph
-from vdgs.captures.source import Intrinsics, SourceView
 from vdgs.errors import CaptureError
+from vdgs.settings.capture import CaptureOptions
 
 UP = CaptureOptions(up="z")
 
@@ -39,7 +39,7 @@ def folder(tmp_path, scene):
 
 
 def test_options_import_nothing_heavy():
-    code = "import sys, vdgs.captures.options; print(*{'torch', 'numpy', 'cv2', 'pycolmap'} & set(sys.modules))"
+    code = "import sys, vdgs.settings.capture; print(*{'torch', 'numpy', 'cv2', 'pycolmap'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
 

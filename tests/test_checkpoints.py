@@ -6,8 +6,8 @@ import resource
 import pytest
 import torch
 
-from vdgs.checkpoints import SavedState, load_newest, remove_leftovers, save_state
 from vdgs.errors import VdgsError
+from vdgs.storage.checkpoints import SavedState, load_newest, remove_leftovers, save_state
 
 
 def state(iteration: int) -> SavedState:

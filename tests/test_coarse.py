@@ -15,9 +15,9 @@ import pytest
 import torch
 
 from captures_support import tiny_scene, write_colmap
-from vdgs.anchors import AnchorModel
 from vdgs.errors import VdgsError
-from vdgs.stages.opening import open_run
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.runs.opening import open_run
 
 SETTINGS = (
     "--preset", "laptop", "--iterations", "1500", "--save-every", "50", "--anchors.offsets", "3", "--up", "z",

@@ -10,8 +10,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vdgs.anchors import Anchors
-from vdgs.compensation import (
+from vdgs.model.anchors import Anchors
+from vdgs.settings.method import CompensationConfig, GrowthConfig
+from vdgs.training.compensation import (
     Compensation,
     begin_cycle,
     compensate,
@@ -20,8 +21,7 @@ from vdgs.compensation import (
     low_visibility,
     update_cache,
 )
-from vdgs.config import CompensationConfig, GrowthConfig
-from vdgs.growth import Statistics, decide
+from vdgs.training.growth import Statistics, decide
 
 K = 3
 PAPER = CompensationConfig()

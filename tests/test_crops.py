@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from block_support import BLOCKS, block_stage, coarse
 from decode_scenes import Scene, looking_down, turned
-from vdgs.anchors import AnchorModel
-from vdgs.config import BlockConfig, MethodConfig
 from vdgs.errors import RunError
 from vdgs.kernels import native, reference
-from vdgs.render import paint
-from vdgs.stages.block import split_anchors
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.render import paint
+from vdgs.partition.regions import split_anchors
+from vdgs.settings.method import BlockConfig, MethodConfig
 from vdgs.training import from_saved, to_saved, train, train_step
 from vdgs.training.crops import (
     CUT_OFF,

@@ -9,10 +9,10 @@ import torch
 
 from decode_scenes import Scene, looking_down, turned
 from vdgs.kernels.constants import ALPHA_MIN
-from vdgs.kernels.decode_types import DecoderWeights, Splats
 from vdgs.kernels.native import module
 from vdgs.kernels.native.decode import decode as native_decode
 from vdgs.kernels.reference.decode import decode as twin_decode
+from vdgs.kernels.types import DecoderWeights, Splats
 
 CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
 EVERY_ISA = pytest.mark.parametrize("isa", module.supported())

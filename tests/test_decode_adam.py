@@ -8,7 +8,7 @@ import torch
 from decode_scenes import Scene, looking_down, turned
 from native_choice import every_instruction_set, on_threads, using
 from vdgs.kernels import native, reference
-from vdgs.kernels.decode_types import AdamState, SplatGradients
+from vdgs.kernels.types import AdamState, SplatGradients
 
 CAMERA = turned(96, 64)
 #: A few of the anchors, some of them neighbours.

@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from vdgs import devices, doctor_cuda
-from vdgs.devices import Choice, DeviceUnavailable, choose
+from vdgs.doctor import cuda as doctor_cuda
 from vdgs.errors import VdgsError
-from vdgs.kernels import cuda, native, operations, reference
+from vdgs.kernels import cuda, devices, native, operations, reference
 from vdgs.kernels.cuda import driver
 from vdgs.kernels.cuda import nvrtc as nvrtc_module
 from vdgs.kernels.cuda.driver import Card, CudaUnavailable
+from vdgs.kernels.devices import Choice, DeviceUnavailable, choose
 
 
 @pytest.fixture
@@ -81,7 +81,7 @@ class TestOnceEverythingIsThere:
 
 
 def test_deciding_needs_no_torch():
-    code = "import sys, vdgs.devices as d; d.choose('auto'); print('torch' in sys.modules)"
+    code = "import sys, vdgs.kernels.devices as d; d.choose('auto'); print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"
 
 

@@ -9,8 +9,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from vdgs import doctor
-from vdgs.doctor import Check, healthy, print_report, report
+from vdgs.doctor import checks as doctor
+from vdgs.doctor import report as doctor_report
+from vdgs.doctor.check import Check
+from vdgs.doctor.report import healthy, print_report, report
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +101,7 @@ def test_a_broken_part_is_reported_not_raised(monkeypatch: pytest.MonkeyPatch):
     def explode() -> list[Check]:
         raise OSError("no such device")
 
-    monkeypatch.setattr(doctor, "_LOOKS", (explode, doctor._disk))
+    monkeypatch.setattr(doctor_report, "LOOKS", (explode, doctor._disk))
     first, disk = report()
     assert (first.name, first.state, first.works) == ("explode", "broken", False)
     assert "no such device" in first.value
@@ -114,6 +116,6 @@ def test_a_missing_dependency_has_its_command(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_it_imports_nothing_heavy_before_it_looks():
-    code = "import sys, vdgs.doctor; print(sorted({'torch', 'numpy', 'cv2', 'rich'} & set(sys.modules)))"
+    code = "import sys, vdgs.doctor.report; print(sorted({'torch', 'numpy', 'cv2', 'rich'} & set(sys.modules)))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"

@@ -17,7 +17,7 @@ from vdgs.executors import local
 from vdgs.executors.jobs import Job
 from vdgs.executors.local import run_jobs
 from vdgs.executors.parent import PARENT, stop_when_parent_dies
-from vdgs.run import StageFolder
+from vdgs.runs.folder import StageFolder
 
 #: What every fake block begins with: it knows its folder, can say how far it is, and lists the SIGTERMs it gets.
 PRELUDE = """
@@ -201,7 +201,7 @@ import json, sys
 from pathlib import Path
 from rich.console import Console
 from vdgs.executors.local import Job, run_jobs
-from vdgs.run import StageFolder
+from vdgs.runs.folder import StageFolder
 jobs = [Job(index, StageFolder(Path(folder)), command, {}) for index, folder, command in json.loads(sys.argv[1])]
 outcomes = run_jobs(jobs, at_once=2, retries=2, console=Console(), poll_seconds=0.02)
 print("OUTCOMES", json.dumps([[o.state, o.attempts, o.why] for o in outcomes]))

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vdgs.cameras import Camera
-from vdgs.gaps import CELL_VOXELS, LARGEST_SHARE, gap_points
+from vdgs.model.gaps import CELL_VOXELS, LARGEST_SHARE, gap_points
 
 VOXEL = 0.25
 

@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 
 from checkerboard import Photographs
 from vdgs.cameras import Camera
-from vdgs.comparators.gaussian_density import DensityConfig, control_density, reset_logits, split
-from vdgs.comparators.gaussian_model import (
+from vdgs.comparators.gaussians.density import DensityConfig, control_density, reset_logits, split
+from vdgs.comparators.gaussians.model import (
     Gaussians,
     GaussiansModel,
     draw_gaussians,
     initial_gaussians,
     visible_rows,
 )
-from vdgs.comparators.spherical_harmonics import view_colours
+from vdgs.comparators.gaussians.spherical_harmonics import view_colours
 from vdgs.errors import VdgsError
 
 # What a view shows

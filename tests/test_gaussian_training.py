@@ -11,14 +11,13 @@ import torch
 from rich.console import Console
 
 from checkerboard import Photographs
-from vdgs.checkpoints import load_newest, save_state
-from vdgs.comparators import gaussian_training
-from vdgs.comparators.gaussian_density import DensityConfig
-from vdgs.comparators.gaussian_model import (
+from vdgs.comparators.gaussians import training as gaussian_training
+from vdgs.comparators.gaussians.density import DensityConfig
+from vdgs.comparators.gaussians.model import (
     GaussiansModel,
     initial_gaussians,
 )
-from vdgs.comparators.gaussian_training import (
+from vdgs.comparators.gaussians.training import (
     GaussianRates,
     GaussiansConfig,
     GaussiansStage,
@@ -32,11 +31,12 @@ from vdgs.comparators.gaussian_training import (
     train,
     train_step,
 )
-from vdgs.comparators.gaussian_watching import train_watched
+from vdgs.comparators.gaussians.watching import train_watched
 from vdgs.errors import TrainingDiverged, VdgsError
 from vdgs.kernels.native.module import set_threads, threads
-from vdgs.run import StageFolder
-from vdgs.run_options import WatchOptions
+from vdgs.runs.folder import StageFolder
+from vdgs.settings.watching import WatchOptions
+from vdgs.storage.checkpoints import load_newest, save_state
 
 CONFIG = GaussiansConfig(
     iterations=80,

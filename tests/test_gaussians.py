@@ -12,22 +12,22 @@ from rich.console import Console
 from captures_support import tiny_scene, write_colmap
 from vdgs.cameras import Camera
 from vdgs.captures.loading import load_capture
-from vdgs.captures.options import CaptureOptions
-from vdgs.comparators import gaussian_watching
-from vdgs.comparators import gaussians as comparator
-from vdgs.comparators.gaussian_density import DensityConfig
-from vdgs.comparators.gaussian_model import (
+from vdgs.comparators.gaussians import run as comparator
+from vdgs.comparators.gaussians import watching as gaussian_watching
+from vdgs.comparators.gaussians.density import DensityConfig
+from vdgs.comparators.gaussians.model import (
     GaussiansModel,
 )
-from vdgs.comparators.gaussian_training import (
+from vdgs.comparators.gaussians.training import (
     GaussiansConfig,
     train,
 )
 from vdgs.errors import RunError, VdgsError
 from vdgs.evaluation.evaluate import EvaluationSettings
-from vdgs.run import RunFolder, StageFolder
-from vdgs.run_options import WatchOptions
-from vdgs.stages.watching import Stopped
+from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.watching import WatchOptions
+from vdgs.watching.watch import Stopped
 
 DENSITY = DensityConfig(start=15, interval=10, until=0.5, dense=0.08, reset_interval=40)
 SHORT = GaussiansConfig(iterations=60, resolutions=((0, 2), (30, 1)), density=DENSITY)

@@ -7,10 +7,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vdgs import growth
-from vdgs.anchors import Anchors
-from vdgs.config import GrowthConfig
-from vdgs.growth import Statistics, decide
+from vdgs.model.anchors import Anchors
+from vdgs.settings.method import GrowthConfig
+from vdgs.training import growth
+from vdgs.training.growth import Statistics, decide
 
 K = 4
 ALWAYS = GrowthConfig(gate=0.0, levels=1, coarsest_cell=1.0, threshold=1.0)

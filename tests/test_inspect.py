@@ -8,14 +8,18 @@ import json
 import cv2
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
 from captures_support import TinyScene, data_folder, tiny_scene, write_colmap
 from vdgs.captures.loading import load_capture
-from vdgs.captures.options import CaptureOptions
-from vdgs.inspect import count_views, gini, inspect_capture, length, print_report, sample_points
+from vdgs.figures.sampling import sample_points
+from vdgs.inspection.inspect import inspect_capture, print_report
+from vdgs.inspection.measure import length
+from vdgs.model.visibility import imbalance, visibility_of
+from vdgs.settings.capture import CaptureOptions
 
 
 @pytest.fixture
@@ -26,7 +30,7 @@ def capture(tmp_path):
 
 def test_visibility_is_a_count_of_frusta(capture):
     """V against one projection at a time, written out."""
-    visibility = count_views(capture.points, capture.train_views)
+    visibility = visibility_of(torch.from_numpy(capture.points), [view.camera for view in capture.train_views]).numpy()
     for index in range(0, len(capture.points), 17):
         seen = 0
         for view in capture.train_views:
@@ -40,7 +44,7 @@ def test_visibility_is_a_count_of_frusta(capture):
 
 def test_the_report_says_what_is_there(capture, tmp_path):
     report = inspect_capture(capture, tmp_path / "out")
-    visibility = count_views(capture.points, capture.train_views)
+    visibility = visibility_of(torch.from_numpy(capture.points), [view.camera for view in capture.train_views]).numpy()
     assert (report.photographs, report.train, report.test) == (12, 10, 2)
     assert report.image_sizes == [(64, 48)]
     assert report.image_bytes == 12 * 64 * 48 * 3
@@ -74,8 +78,8 @@ def test_the_table_is_printed_with_its_warnings(tmp_path):
 
 @given(st.lists(st.integers(0, 1000), min_size=1, max_size=60))
 def test_gini_is_the_mean_difference(values):
-    array = np.array(values, float)
-    found = gini(array)
+    array = np.array(values)
+    found = imbalance(array).gini
     if array.sum() == 0:
         assert found == 0
         return

@@ -19,10 +19,10 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from captures_support import tiny_scene, write_colmap
-from vdgs.memory import available_bytes, is_out_of_memory
-from vdgs.memory_estimate import Need, advice, bytes_per_anchor, describe, estimate
-from vdgs.stages import memory_notes
-from vdgs.stages.memory_notes import announce
+from vdgs.memory.estimate import Need, advice, bytes_per_anchor, describe, estimate
+from vdgs.memory.process import available_bytes, is_out_of_memory
+from vdgs.watching import memory_notes
+from vdgs.watching.memory_notes import announce
 
 needs = st.builds(
     Need,
@@ -144,7 +144,7 @@ def test_other_errors_are_not_taken_for_it():
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of address space")
 def test_a_limit_of_the_process_counts():
     code = (
-        "import resource, psutil; from vdgs.memory import available_bytes\n"
+        "import resource, psutil; from vdgs.memory.process import available_bytes\n"
         "vms = psutil.Process().memory_info().vms\n"
         "resource.setrlimit(resource.RLIMIT_AS, (vms + 10**8,) * 2); print(available_bytes())"
     )
@@ -159,7 +159,7 @@ def test_a_limit_of_the_process_counts():
 LIMITED = """
 import resource, sys
 import psutil
-import vdgs.stages.anchor_watching as watching
+import vdgs.watching.anchors as watching
 
 train = watching.train
 

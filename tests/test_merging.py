@@ -12,13 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merging_support import camera_above, model_at, opaque_plane, quadrant_of, quadrants
-from vdgs.anchors import AnchorModel, Anchors
-from vdgs.config import MergeConfig
 from vdgs.errors import VdgsError
 from vdgs.kernels import native as kernels
-from vdgs.merging import giver_of_places, merge
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchors import Anchors
+from vdgs.model.render import render
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.render import render
+from vdgs.partition.merging import giver_of_places, merge
+from vdgs.settings.method import MergeConfig
 
 OWNER, BEST_SEEN = MergeConfig("owner"), MergeConfig("best_seen")
 NO_CAMERAS = [[]] * 4
@@ -119,7 +120,7 @@ def test_what_the_owner_did_not_see_is_coarse_still():
     trained, unseen = [], []
     for i in range(4):
         own = part(coarse, quadrant_of(places(coarse)) == i)
-        seen = kernels.count_views(own.anchors.positions, cameras[i]) > 0
+        seen = kernels.count_visibility(own.anchors.positions, cameras[i]) > 0
         features = torch.where(seen[:, None], own.anchors.features + 1, own.anchors.features)
         trained.append(replace(own, anchors=replace(own.anchors, features=features)))
         unseen.append(int((~seen).sum()))

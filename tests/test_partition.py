@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 
 from vdgs.captures.capture import GroundFrame
 from vdgs.captures.geodesy import enu_from_geodetic
-from vdgs.config import PartitionConfig
 from vdgs.errors import RunError, VdgsError
-from vdgs.memory_estimate import Need, estimate
+from vdgs.memory.estimate import Need, estimate
 from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks, save_blocks_wgs84
 from vdgs.partition.boundary import alpha_shape, widen
 from vdgs.partition.cut import choose_block_count, cut_scene
+from vdgs.settings.method import PartitionConfig
 
 
 def town(n: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -12,12 +12,12 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 from vdgs.cameras import Camera
-from vdgs.config import PartitionConfig
-from vdgs.partition import figures
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.fact_figures import block_facts
-from vdgs.partition.figure_words import PALETTE, block_colour
-from vdgs.partition.score_figures import order_of_cameras
+from vdgs.partition.figures import maps as figures
+from vdgs.partition.figures.facts import block_facts
+from vdgs.partition.figures.scores import order_of_cameras
+from vdgs.partition.figures.words import PALETTE, block_colour
+from vdgs.settings.method import PartitionConfig
 from vdgs.stages.partition import how_cut
 
 

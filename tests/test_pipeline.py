@@ -14,15 +14,14 @@ import pytest
 import torch
 
 from captures_support import tiny_scene, write_colmap
-from vdgs.anchors import AnchorModel
-from vdgs.decoder import Decoder
-from vdgs.partition.blocks import load_blocks
-from vdgs.partition.saving import load_scores
-from vdgs.run import RunFolder
-from vdgs.stages.block import places
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.decoder import Decoder
+from vdgs.model.visibility import visibility_of
+from vdgs.partition.assignment.saving import load_scores
+from vdgs.partition.blocks import load_blocks, places_of
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import open_run
 from vdgs.stages.evaluate import BlocksAlone
-from vdgs.stages.opening import open_run
-from vdgs.visibility import views_of
 
 SETTINGS = (
     "--preset", "laptop", "--iterations", "400", "--save-every", "40", "--anchors.offsets", "3",
@@ -116,7 +115,7 @@ def test_a_run_leaves_what_the_documents_say(unbroken):
 def test_the_merged_scene_is_the_cores_of_the_blocks(unbroken):
     blocks, merged = load_blocks(unbroken / "partition/blocks.geojson"), AnchorModel.load(unbroken / MERGED)
     assert len(blocks) == 2
-    owner = blocks.owner(places(merged.anchors.positions))
+    owner = blocks.owner(places_of(merged.anchors.positions))
     for index in range(2):
         own = AnchorModel.load(unbroken / f"blocks/{index:02d}/model.safetensors").anchors
         part = merged.anchors.select(torch.from_numpy(owner == index))
@@ -173,7 +172,7 @@ def test_every_camera_serves_a_block_and_v_is_brute_force(unbroken):
     opened = open_run(unbroken, "coarse")
     cameras = [view.camera for view in opened.capture.train_views]
     brute = sum(camera.sees(opened.model.anchors.positions.double().numpy()).astype(int) for camera in cameras)
-    assert np.array_equal(views_of(opened.model.anchors.positions, cameras).numpy(), brute)
+    assert np.array_equal(visibility_of(opened.model.anchors.positions, cameras).numpy(), brute)
 
 
 def test_a_finished_run_does_nothing_again(capture, copied):
@@ -256,8 +255,8 @@ def test_a_missing_block_stops_the_merge_unless_the_coarse_model_may_stand_in(co
     assert done.returncode == 0, done.stderr
     blocks, merged = load_blocks(copied / "partition/blocks.geojson"), AnchorModel.load(copied / MERGED)
     coarse = AnchorModel.load(copied / "coarse/model.safetensors").anchors
-    stood_in = coarse.positions[torch.from_numpy(blocks.owner(places(coarse.positions)) == 1)]
-    held = merged.anchors.positions[torch.from_numpy(blocks.owner(places(merged.anchors.positions)) == 1)]
+    stood_in = coarse.positions[torch.from_numpy(blocks.owner(places_of(coarse.positions)) == 1)]
+    held = merged.anchors.positions[torch.from_numpy(blocks.owner(places_of(merged.anchors.positions)) == 1)]
     assert torch.equal(stood_in, held)
 
 

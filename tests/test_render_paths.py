@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from vdgs.cameras import Camera
 from vdgs.captures.capture import GroundFrame
 from vdgs.errors import VdgsError
-from vdgs.render_paths import flyover, interpolate, load_path, look_at, orbit
-from vdgs.video import VideoWriter, best_encoder
+from vdgs.films.paths import flyover, interpolate, load_path, look_at, orbit
+from vdgs.films.video import VideoWriter, best_encoder
 
 TEMPLATE = Camera(np.eye(4), 400.0, 410.0, 160.0, 90.0, 320, 180)
 
@@ -301,9 +301,9 @@ def test_a_film_that_fails_leaves_nothing(tmp_path: Path):
 
 
 def test_a_missing_encoder_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("vdgs.video.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("vdgs.films.video.importlib.util.find_spec", lambda name: None)
     assert best_encoder() == "mpeg4"
-    monkeypatch.setattr("vdgs.video.cv2.VideoWriter.fourcc", lambda *letters: 0, raising=False)
+    monkeypatch.setattr("vdgs.films.video.cv2.VideoWriter.fourcc", lambda *letters: 0, raising=False)
 
     class Closed:
         fourcc = staticmethod(lambda *letters: 0)
@@ -313,7 +313,7 @@ def test_a_missing_encoder_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         def isOpened(self) -> bool:
             return False
 
-    monkeypatch.setattr("vdgs.video.cv2.VideoWriter", Closed)
+    monkeypatch.setattr("vdgs.films.video.cv2.VideoWriter", Closed)
     with (
         pytest.raises(VdgsError, match="pip install imageio-ffmpeg"),
         VideoWriter(tmp_path / "film.mp4", 30.0) as film,

@@ -18,7 +18,7 @@ from vdgs.report.charts import running_median
 from vdgs.report.page import escaped
 from vdgs.report.pictures import MOST_BYTES, reduced
 from vdgs.report.words import duration, gain, memory
-from vdgs.run import RunFolder
+from vdgs.runs.folder import RunFolder
 
 VOID = {"meta", "img", "br", "link", "hr", "input"}
 FILES = ("coarse/log.jsonl", "coarse/evaluation/metrics.json", "visibility/visibility.json", "partition/partition.json",

@@ -5,21 +5,13 @@ from dataclasses import replace
 
 import pytest
 
-from vdgs.config import (
-    PRESETS,
-    BlockConfig,
-    GrowthConfig,
-    MethodConfig,
-    TrainConfig,
-    differences,
-    from_dict,
-    to_dict,
-    with_iterations,
-)
-from vdgs.config_checks import validate
 from vdgs.errors import RunError
-from vdgs.run import RunFolder, StageFolder
-from vdgs.stages.keys import SINCE, stage_keys
+from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.keys import SINCE, stage_keys
+from vdgs.settings.checks import validate
+from vdgs.settings.method import BlockConfig, GrowthConfig, MethodConfig, TrainConfig, with_iterations
+from vdgs.settings.plain import differences, from_dict, to_dict
+from vdgs.settings.presets import PRESETS
 
 
 def settings(**changes) -> dict:

@@ -10,13 +10,13 @@ import torch
 
 from assignment_support import CONFIG, MODES, RENDERED, WIDTH, camera, flight, scene, skyward, strips
 from native_choice import every_instruction_set, on_threads, using
-from vdgs.anchors import AnchorModel
 from vdgs.cameras import Camera
-from vdgs.config import AssignmentConfig
 from vdgs.kernels import native as kernels
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.render import decode_rows, render, visible_rows
+from vdgs.partition.assignment.scores import score_matrix, select_splats
 from vdgs.partition.blocks import Blocks
-from vdgs.partition.scores import score_matrix, select_splats
-from vdgs.render import decode_rows, render, visible_rows
+from vdgs.settings.method import AssignmentConfig
 
 
 @pytest.mark.parametrize("mode", RENDERED)

@@ -12,8 +12,8 @@ import pytest
 pytest.importorskip("embreex")
 
 from vdgs.captures.loading import load_capture
-from vdgs.captures.options import CaptureOptions
 from vdgs.errors import VdgsError
+from vdgs.settings.capture import CaptureOptions
 from vdgs.synth import SynthOptions, generate
 from vdgs.synth.disturbances import disturbed, exposure_gains, with_outliers
 from vdgs.synth.flight import fly, pinhole
@@ -22,7 +22,7 @@ from vdgs.synth.imbalance import flight_imbalance, survey
 from vdgs.synth.mesh import Material, MeshBuilder
 from vdgs.synth.options import ResolvedOptions
 from vdgs.synth.sparse import SparseCloud
-from vdgs.synth.surveying import count_views, surface_places, view_truth
+from vdgs.synth.surveying import count_visibility, surface_places, view_truth
 from vdgs.synth.town import Town, build_town
 from vdgs.synth.tracing import Tracer
 from vdgs.synth.truth import load_truth, pack_depth, unpack_depth, visibility_map_from_truth
@@ -85,8 +85,8 @@ def test_test_views_fall_all_over_what_was_seen(flight: str, town: Town, tracer:
     training = fly(options, town)
     places, views = survey(tracer, town.mesh, training, 60.0, np.random.default_rng(0))
     held = held_out_cameras(tracer, town.terrain, training, places, 8, options, np.random.default_rng(3))
-    by_tests = count_views(tracer, held, places) > 0
-    every_eighth = count_views(tracer, training[::8][:8], places) > 0
+    by_tests = count_visibility(tracer, held, places) > 0
+    every_eighth = count_visibility(tracer, training[::8][:8], places) > 0
     poor = views <= np.percentile(views, 25)
     assert by_tests[poor].mean() > every_eighth[poor].mean(), "poorly seen places are tested on less than by n-th"
     shares = [(view_truth(tracer, camera, training)[1] > 0).mean() for camera in held]
@@ -117,7 +117,7 @@ def test_what_stands_in_between_hides() -> None:
     rigid[:3, 3] = [0, 0, 40]
     above = replace(camera, camera_from_world=rigid)
     places = np.array([(0, 0, 0), (0, 0, 10), (12, 0, 0), (200, 0, 0)], float)
-    assert count_views(Tracer(mesh), [above, above], places).tolist() == [0, 2, 2, 0]
+    assert count_visibility(Tracer(mesh), [above, above], places).tolist() == [0, 2, 2, 0]
     depth, views = view_truth(Tracer(mesh), above, [above])
     assert set(np.unique(np.round(depth))) == {30.0, 40.0}
     assert (views == 1).all()

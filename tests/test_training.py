@@ -9,13 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from checkerboard import Photographs
-from vdgs.anchors import AnchorModel, initial_anchors
-from vdgs.checkpoints import load_newest, save_state
-from vdgs.config import AnchorConfig, GrowthConfig, TrainConfig
-from vdgs.decoder import Decoder
 from vdgs.errors import TrainingDiverged, VdgsError
 from vdgs.kernels.native.module import set_threads, threads
-from vdgs.render import render
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.decoder import Decoder
+from vdgs.model.render import render
+from vdgs.model.start import initial_anchors
+from vdgs.settings.method import AnchorConfig, GrowthConfig, TrainConfig
+from vdgs.storage.checkpoints import load_newest, save_state
 from vdgs.training import Stage, downscale_at, from_saved, start_state, to_saved, train, train_step, view_at
 
 BLACK = (0.0, 0.0, 0.0)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -11,12 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from captures_support import look_down
-from vdgs.anchors import Anchors
 from vdgs.cameras import NEAR, Camera, CameraModel
-from vdgs.captures.capture import View
-from vdgs.config import TrainConfig
-from vdgs.stages.coarse import shares_for
-from vdgs.visibility import effective_count, imbalance, normalised, share_in_cycle, shares_of, views_of
+from vdgs.model.anchors import Anchors
+from vdgs.model.visibility import effective_count, imbalance, normalised, share_in_cycle, visibility_of, votes_of
+from vdgs.settings.method import TrainConfig
+from vdgs.training.sampling import shares_for
 
 
 def flight(count: int, model: CameraModel = "pinhole", seed: int = 0) -> list[Camera]:
@@ -45,12 +42,12 @@ def test_v_is_the_number_of_frusta_that_hold_an_anchor(model: CameraModel) -> No
         borderless &= np.abs(depth - NEAR) > 1e-4
     points = points[borderless]
     expected = sum(camera.sees(points).astype(int) for camera in cameras)
-    views = views_of(torch.from_numpy(points).float(), cameras)
+    views = visibility_of(torch.from_numpy(points).float(), cameras)
     assert views.dtype == torch.int32
     assert views.tolist() == expected.tolist()
     assert len(set(views.tolist())) > 3
     behind = [torch.from_numpy(camera.position - camera.forward).float()[None] for camera in cameras[:5]]
-    alone = [int(views_of(place, [camera])) for place, camera in zip(behind, cameras[:5], strict=True)]
+    alone = [int(visibility_of(place, [camera])) for place, camera in zip(behind, cameras[:5], strict=True)]
     assert alone == [0] * 5
 
 
@@ -58,14 +55,14 @@ def test_the_left_and_upper_border_belong_to_the_image_the_right_and_lower_do_no
     camera = Camera(np.eye(4), 32.0, 32.0, 32.0, 16.0, 64, 32)
     places = [[-1, 0, 1], [1, 0, 1], [0, -0.5, 1], [0, 0.5, 1], [0, 0, 1], [0, 0, -1], [0, 0, NEAR / 2]]
     points = np.array(places, np.float64)
-    assert views_of(torch.from_numpy(points).float(), [camera]).tolist() == [1, 0, 1, 0, 1, 0, 0]
+    assert visibility_of(torch.from_numpy(points).float(), [camera]).tolist() == [1, 0, 1, 0, 1, 0, 0]
     assert camera.sees(points).tolist() == [True, False, True, False, True, False, False]
 
 
 def test_v_does_not_depend_on_the_order_of_cameras_and_no_camera_sees_nothing() -> None:
     cameras, points = flight(12), torch.from_numpy(cloud(500)).float()
-    assert torch.equal(views_of(points, cameras), views_of(points, cameras[::-1]))
-    assert views_of(points, []).tolist() == [0] * 500
+    assert torch.equal(visibility_of(points, cameras), visibility_of(points, cameras[::-1]))
+    assert visibility_of(points, []).tolist() == [0] * 500
 
 
 def test_a_view_counts_once_in_a_cycle_at_whatever_resolution() -> None:
@@ -73,7 +70,7 @@ def test_a_view_counts_once_in_a_cycle_at_whatever_resolution() -> None:
     share = share_in_cycle(points, cameras)
     again = share_in_cycle(points, [*cameras, cameras[0], cameras[3].resized(32, 24), cameras[3].resized(16, 12)])
     assert torch.equal(share, again)
-    assert torch.equal(share, views_of(points, cameras).float() / 7)
+    assert torch.equal(share, visibility_of(points, cameras).float() / 7)
     moved = Camera(**{**cameras[0].__dict__, "cx": cameras[0].cx + 4})
     assert not torch.equal(share, share_in_cycle(points, [*cameras, moved]))
     with pytest.raises(ValueError, match="without cameras"):
@@ -105,10 +102,10 @@ def test_imbalance_in_numbers() -> None:
 
 def test_every_anchor_divides_its_vote_among_the_cameras_that_hold_it() -> None:
     cameras, points = flight(20), torch.from_numpy(cloud(500))
-    held = np.array([views_of(points, [camera]).numpy() > 0 for camera in cameras])
+    held = np.array([visibility_of(points, [camera]).numpy() > 0 for camera in cameras])
     seen = held.sum(0)
     expected = [sum(1.0 / seen[i] for i in np.flatnonzero(row)) for row in held]
-    shares = shares_of(points, cameras)
+    shares = votes_of(points, cameras)
     assert np.allclose(shares, expected)
     assert np.isclose(sum(shares), (seen > 0).sum())
 
@@ -129,8 +126,7 @@ def test_how_often_a_photograph_with_nine_times_the_votes_is_used(sampling: str,
     ]
     positions = torch.tensor([[0.0, 0.0, 0.0]] + [[100.0, 0.0, 0.0]] * 9)
     anchors = Anchors(positions, torch.zeros(10, 32), torch.zeros(10, 1, 3), torch.zeros(10, 6))
-    views = [View("", camera, Path(), None, "train") for camera in cameras]
-    shares = shares_for(TrainConfig(sampling=sampling), anchors, views)
+    shares = shares_for(TrainConfig(sampling=sampling), anchors, cameras)
     assert (None if shares is None else shares[1] / shares[0]) == (ratio and pytest.approx(ratio))
 
 
@@ -140,5 +136,5 @@ def test_a_camera_alone_over_a_place_has_the_votes_of_all_its_anchors() -> None:
 
     crowd, lonely = [above(0.0)] * 9, above(100.0)
     points = torch.tensor([[0.0, 0.0, 0.0]] * 9 + [[100.0, 0.0, 0.0]] * 9)
-    assert np.allclose(shares_of(points, [*crowd, lonely]), [1.0] * 9 + [9.0])
-    assert shares_of(torch.zeros(0, 3), crowd) == (1.0,) * 9
+    assert np.allclose(votes_of(points, [*crowd, lonely]), [1.0] * 9 + [9.0])
+    assert votes_of(torch.zeros(0, 3), crowd) == (1.0,) * 9

@@ -1,5 +1,5 @@
 // Adam is bound by memory: one pass over the gradient to see that it is finite, one over everything.
-#include "adam.h"
+#include "cpu/adam.h"
 
 #include <algorithm>
 #include <atomic>
@@ -10,7 +10,7 @@
 #include <nanobind/stl/optional.h>
 
 #include "bindings.h"
-#include "simd.h"
+#include "simd/simd.h"
 #include "threads.h"
 
 namespace vdgs {

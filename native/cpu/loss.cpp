@@ -28,8 +28,8 @@
 #include <nanobind/stl/tuple.h>
 
 #include "bindings.h"
-#include "buffer.h"
-#include "simd.h"
+#include "cpu/buffer.h"
+#include "simd/simd.h"
 #include "threads.h"
 
 namespace vdgs {

@@ -4,7 +4,7 @@
 
 #include <type_traits>
 
-#include "simd_math.h"
+#include "simd/math.h"
 
 namespace vdgs {
 

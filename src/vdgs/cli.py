@@ -75,7 +75,7 @@ def _run(verb: str, arguments: list[str]) -> int:
         print(f"vdgs {verb}: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
         return 1
     except (MemoryError, RuntimeError) as error:
-        from vdgs.memory import is_out_of_memory
+        from vdgs.memory.process import is_out_of_memory
 
         if not is_out_of_memory(error):
             raise

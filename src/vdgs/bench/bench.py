@@ -34,15 +34,15 @@ from vdgs.bench.verdict import verdict
 from vdgs.bench.worker import RECORD, Job
 from vdgs.bench.writing import latex, markdown, tidy_csv
 from vdgs.captures.loading import load_capture
-from vdgs.captures.options import CaptureOptions
-from vdgs.config import differences, to_dict
 from vdgs.errors import VdgsError
 from vdgs.evaluation.saving import write_json
-from vdgs.files import read_json, write_text
-from vdgs.run import RunFolder
-from vdgs.stages.keys import counted
-from vdgs.stages.watching import Stopped
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.keys import counted
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.plain import differences, to_dict
+from vdgs.storage.files import read_json, write_text
 from vdgs.synth import SynthOptions, generate
+from vdgs.watching.watch import Stopped
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from vdgs.config import PRESETS, MethodConfig, PresetName
+from vdgs.settings.method import MethodConfig
+from vdgs.settings.presets import PRESETS, PresetName
 
 #: Stages of the run of a method, by the names that `worker.STAGES` knows.
 COARSE_ONLY = ("coarse", "evaluate")

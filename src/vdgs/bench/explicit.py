@@ -9,11 +9,12 @@ from pathlib import Path
 from rich.console import Console
 
 from vdgs.captures.capture import Capture
-from vdgs.comparators.gaussian_schedule import scheduled
-from vdgs.comparators.gaussian_training import GaussiansConfig
-from vdgs.comparators.gaussians import run_gaussians
-from vdgs.config import MethodConfig, to_dict
-from vdgs.run import RunFolder
+from vdgs.comparators.gaussians.run import run_gaussians
+from vdgs.comparators.gaussians.schedule import scheduled
+from vdgs.comparators.gaussians.training import GaussiansConfig
+from vdgs.runs.folder import RunFolder
+from vdgs.settings.method import MethodConfig
+from vdgs.settings.plain import to_dict
 
 
 def gaussians_config(method: MethodConfig) -> GaussiansConfig:

@@ -15,7 +15,7 @@ from vdgs.bench.measure import group_names
 from vdgs.bench.plan import Plan
 from vdgs.bench.results import Result
 from vdgs.bench.statistics import Summary, summarise
-from vdgs.figure_parts import ACCENT, DPI, FAINT, INK, plain, titles
+from vdgs.figures.style import ACCENT, DPI, FAINT, INK, plain, titles
 
 #: Colours and markers of the other methods, told apart without colour too.
 COLOURS = ("#1f6f8b", "#8ab17d", "#e0a030", "#7b5ea7", "#22262b", "#2a9d8f", "#b5838d", "#6c757d")

@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import Literal
 
 from vdgs.bench.definitions import COARSE_ONLY, EXPLICIT, Budget, Change, Method
-from vdgs.comparators.gaussian_schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS
-from vdgs.config import CompensationConfig, MethodConfig, PartitionStrategy
+from vdgs.comparators.gaussians.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS
+from vdgs.settings.method import CompensationConfig, MethodConfig, PartitionStrategy
 
 LAMBDA_VIS = (0.0, 0.5, 1.0, 1.3)
 T_LOW = (0.05, 0.15, 0.20, 0.30)

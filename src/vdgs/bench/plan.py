@@ -15,10 +15,11 @@ from vdgs.bench.methods import METHODS
 from vdgs.bench.renders import folder_of, foreign_method, identity
 from vdgs.bench.scenes import SCENES
 from vdgs.bench.tables import TABLES
-from vdgs.config import MethodConfig, to_dict
-from vdgs.config_checks import validate
 from vdgs.errors import VdgsError
-from vdgs.stages.keys import counted
+from vdgs.runs.keys import counted
+from vdgs.settings.checks import validate
+from vdgs.settings.method import MethodConfig
+from vdgs.settings.plain import to_dict
 
 
 @dataclass(frozen=True)

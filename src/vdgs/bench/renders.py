@@ -28,7 +28,7 @@ from vdgs.evaluation.evaluate import MeasuredModel, evaluate
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.of_run import cached_photographs
 from vdgs.evaluation.saving import file_stems
-from vdgs.tensor_files import size_and_checksum
+from vdgs.storage.tensors import size_and_checksum
 
 #: What a row may be called: it also names a folder, and stands in tables of three languages and in a figure.
 NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9 .+_()-]*")

@@ -13,8 +13,8 @@ from vdgs.bench.plan import Plan, PlannedRun
 from vdgs.bench.processes import Ended
 from vdgs.bench.worker import RECORD
 from vdgs.errors import VdgsError
-from vdgs.files import read_json
-from vdgs.run import RunFolder
+from vdgs.runs.folder import RunFolder
+from vdgs.storage.files import read_json
 
 #: What evaluations report, raw and after colour correction.
 QUALITY = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01", "psnr_cc", "ssim_cc", "lpips_vgg_cc", "lpips_vgg_01_cc")

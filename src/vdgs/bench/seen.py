@@ -15,9 +15,9 @@ from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import fingerprint
 from vdgs.captures.loading import load_capture
-from vdgs.captures.options import CaptureOptions
 from vdgs.evaluation.of_run import visibility_map
-from vdgs.stages.opening import open_run
+from vdgs.runs.opening import open_run
+from vdgs.settings.capture import CaptureOptions
 from vdgs.synth.truth import load_truth
 
 #: `truth`: training cameras that truly see the surface. `model`: whose frustum holds the place that a model draws.

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vdgs.config import MethodConfig, from_dict
 from vdgs.errors import VdgsError
-from vdgs.files import read_json, write_json
+from vdgs.settings.method import MethodConfig
+from vdgs.settings.plain import from_dict
+from vdgs.storage.files import read_json, write_json
 
 #: In the run folder: state, key, why, seconds of each stage.
 RECORD = "bench.json"
@@ -62,7 +63,7 @@ class _Working:
 
 
 def _coarse(at: _Working) -> None:
-    from vdgs.run_options import WatchOptions
+    from vdgs.settings.watching import WatchOptions
     from vdgs.stages.coarse import train_coarse
 
     if at.job.coarse_from is not None:
@@ -71,14 +72,15 @@ def _coarse(at: _Working) -> None:
 
 
 def _partition(at: _Working) -> None:
-    from vdgs.stages.partition import measure_visibility, partition_run
+    from vdgs.stages.partition import partition_run
+    from vdgs.stages.visibility import measure_visibility
 
     measure_visibility(at.run, at.console)
     partition_run(at.run, at.console)
 
 
 def _blocks(at: _Working) -> None:
-    from vdgs.run_options import WatchOptions
+    from vdgs.settings.watching import WatchOptions
     from vdgs.stages.train import train_blocks
 
     train_blocks(at.run.path, WatchOptions(), at.job.block_jobs, at.console)
@@ -165,9 +167,9 @@ def work(job: Job) -> None:
 def _opened(job: Job) -> tuple[Any, Any]:
     """The run folder and the capture. Where renders are measured the folder is no run: nothing is trained there."""
     from vdgs.captures.loading import load_capture
-    from vdgs.run import RunFolder
-    from vdgs.stages.coarse import begin_run
-    from vdgs.stages.opening import options_from
+    from vdgs.runs.beginning import begin_run
+    from vdgs.runs.folder import RunFolder
+    from vdgs.runs.opening import options_from
 
     options = options_from(job.options, job.output)
     if job.renders is not None:

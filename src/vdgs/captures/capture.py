@@ -30,6 +30,11 @@ class GroundFrame:
     #: Latitude (deg), longitude (deg), altitude (m) of the ground frame's origin (ENU), where known.
     origin_geo: tuple[float, float, float] | None = None
 
+    @property
+    def unit(self) -> str:
+        """What one unit of the ground frame is called."""
+        return "m" if self.metric else "units"
+
     def to_ground(self, points: np.ndarray) -> np.ndarray:
         """Source points [n, 3] to the ground frame."""
         return self.scale * points @ self.rotation.T + self.translation

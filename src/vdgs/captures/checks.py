@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from vdgs.captures.capture import Capture
+from vdgs.captures.formats.source import listing
 from vdgs.captures.photographs import pillow_quietly, verify
-from vdgs.captures.source import listing
 from vdgs.errors import CaptureError
 
 DECODERS = 2

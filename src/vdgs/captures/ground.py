@@ -23,11 +23,11 @@ import numpy as np
 
 from vdgs.captures.alignment import Similarity, fit_similarity_robust, geometric_median, is_collinear
 from vdgs.captures.capture import GroundFrame
+from vdgs.captures.formats.source import KnownWorld, SourceCapture
 from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.captures.georeference import match_gps, read_georef, read_gps
-from vdgs.captures.options import CaptureOptions
-from vdgs.captures.source import KnownWorld, SourceCapture
 from vdgs.errors import CaptureError
+from vdgs.settings.capture import CaptureOptions
 
 #: Median camera height above the ground, in units, where the capture has no metres (choice).
 CAMERA_HEIGHT = 10.0

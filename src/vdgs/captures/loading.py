@@ -9,17 +9,17 @@ import numpy as np
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
-from vdgs.captures.colmap import count_images, find_models, read_colmap
+from vdgs.captures.formats.colmap import count_images, find_models, read_colmap
+from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
+from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
+from vdgs.captures.formats.source import SINGLE_FOCAL, Intrinsics, SourceCapture, SourceView, listing
+from vdgs.captures.formats.transforms import read_transforms
 from vdgs.captures.ground import find_ground_frame, transform_pose
-from vdgs.captures.matrixcity import pose_files, read_matrixcity
-from vdgs.captures.mega_nerf import is_mega_nerf, read_mega_nerf
-from vdgs.captures.options import CaptureOptions
 from vdgs.captures.photographs import Names, find_images, find_mask, read_header
-from vdgs.captures.source import SINGLE_FOCAL, Intrinsics, SourceCapture, SourceView, listing
 from vdgs.captures.splits import choose_splits, nearest_to_middle
-from vdgs.captures.transforms import read_transforms
 from vdgs.captures.undistortion import Photograph, undistort
 from vdgs.errors import CaptureError
+from vdgs.settings.capture import CaptureOptions
 
 #: Points farther from the cameras than this many times their spread are strays of the matching.
 FAR_POINT = 100.0

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from vdgs.errors import CaptureError
-from vdgs.memory import is_out_of_memory
+from vdgs.memory.process import is_out_of_memory
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
 #: Headers that announce more pixels than this are refused rather than decoded.

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.capture import Split, View
-from vdgs.captures.options import CaptureOptions
+from vdgs.captures.formats.source import listing
 from vdgs.captures.photographs import Names
-from vdgs.captures.source import listing
 from vdgs.errors import CaptureError
+from vdgs.settings.capture import CaptureOptions
 
 #: Lists that a capture may bring, in its root folder.
 TEST_LIST, VALIDATION_LIST = "test.txt", "validation.txt"

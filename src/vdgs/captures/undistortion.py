@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pycolmap
 
+from vdgs.captures.formats.source import Intrinsics
 from vdgs.captures.photographs import decode_mask, decode_photograph
-from vdgs.captures.source import Intrinsics
 from vdgs.errors import CaptureError
 
 JPEG_QUALITY = 95

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from rich.console import Console
 
-from vdgs.anchors import AnchorModel
 from vdgs.cameras import Camera
 from vdgs.captures.capture import View
 from vdgs.captures.images import ImageCache
@@ -18,10 +18,11 @@ from vdgs.errors import RunError
 from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.photographs import Photographs
-from vdgs.render import render, render_values
-from vdgs.run import RunFolder
-from vdgs.stages.opening import TrainedRun
-from vdgs.visibility import views_of
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.render import render, render_values
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import TrainedRun
+from vdgs.runs.visibility import visibility_of_run
 
 #: Photographs kept decoded during an evaluation, which needs one at a time.
 EVALUATION_IMAGES_BYTES = 256_000_000
@@ -81,7 +82,8 @@ def visibility_map(run: TrainedRun) -> Callable[[Camera], np.ndarray]:
 
     So the same pixels are compared between the models of a run.
     """
-    model = run.model if run.name == "coarse" else AnchorModel.load(run.folder.coarse.model)
-    cameras = [view.camera for view in run.capture.train_views]
-    counts = views_of(model.anchors.positions, cameras).float()
-    return lambda camera: render_values(model, counts, camera).numpy()
+    coarse = (
+        run if run.name == "coarse" else replace(run, model=AnchorModel.load(run.folder.coarse.model), name="coarse")
+    )
+    visibility = visibility_of_run(coarse).float()
+    return lambda camera: render_values(coarse.model, visibility, camera).numpy()

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from vdgs import files
 from vdgs.errors import VdgsError
+from vdgs.storage import files
 
 _LONGEST_NAME = 120
 

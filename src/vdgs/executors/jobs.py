@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from vdgs.run import StageFolder
+from vdgs.runs.folder import StageFolder
 
 State = Literal["queued", "running", "done", "failed", "stopped"]
 #: Readings of a status file between which the speed is measured.

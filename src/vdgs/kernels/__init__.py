@@ -21,7 +21,7 @@ Names and dimensions, fixed once for all files in this folder:
     d  photometric_loss(image [h,w,3], target uint8 [h,w,3], mask) -> Photometric(loss, l1, ssim)
        adam_rows(parameter [n,...], rows [v], gradient [v,...], moments, ...) -> finite; in place
        add_view_statistics(visible [v], source [m], opacities [m], gradient_px [m,2], ..., sums) in place
-       count_views(points [n,3], cameras) -> int32 [n];  mark_views(points [n,3], camera) -> bool [n]
+       count_visibility(points [n,3], cameras) -> int32 [n];  mark_visible(points [n,3], camera) -> bool [n]
        cell_keys, cell_centres, group_cells, group_max, contains, morton_order: the lattice of growth
 
 Constants shared by all implementations live in `constants.py`.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 #: What training, drawing and measuring call: every function of `vdgs.kernels.native`.
 OPERATIONS = (
-    "adam_rows", "add_view_statistics", "cell_centres", "cell_keys", "contains", "count_views", "cull", "decode",
-    "decode_backward_adam", "group_cells", "group_max", "mark_views", "morton_order", "photometric_loss", "project",
+    "adam_rows", "add_view_statistics", "cell_centres", "cell_keys", "contains", "count_visibility", "cull", "decode",
+    "decode_backward_adam", "group_cells", "group_max", "mark_visible", "morton_order", "photometric_loss", "project",
     "rasterise",
 )  # fmt: skip
 

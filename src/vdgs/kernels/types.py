@@ -1,11 +1,134 @@
-"""What the kernels return."""
+"""What goes into the operations and what comes out of them.
+
+Names as in `vdgs.kernels`: v visible anchors, k offsets per anchor, m splats.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float, Int32
 from torch import Tensor
+
+#: Numbers in an anchor's feature, and units in the hidden layer of every head.
+FEATURE_SIZE = 32
+HIDDEN_SIZE = 32
+
+
+@dataclass(frozen=True, eq=False)
+class HeadWeights:
+    """One MLP `w2 · relu(w1 · x + b1) + b2`, laid out as `torch.nn.Linear` does.
+
+    `input` is 35 (feature, viewing direction) or 36 (and the distance to the camera).
+    """
+
+    w1: Float[Tensor, "32 input"]
+    b1: Float[Tensor, "32"]
+    w2: Float[Tensor, "output 32"]
+    b2: Float[Tensor, "output"]
+
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The four tensors in the order of the fields."""
+        return self.w1, self.b1, self.w2, self.b2
+
+
+@dataclass(frozen=True, eq=False)
+class DecoderWeights:
+    """The three heads of the decoder: opacity (k outputs), covariance (7k), colour (3k).
+
+    An appearance embedding e of the image enters as a changed first bias of the colour head,
+    `b1 + w_e · e`, made by the caller: it is the same for every anchor of a view.
+    """
+
+    opacity: HeadWeights
+    covariance: HeadWeights
+    colour: HeadWeights
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """The twelve tensors, head by head."""
+        return (*self.opacity.tensors(), *self.covariance.tensors(), *self.colour.tensors())
+
+    @staticmethod
+    def from_tensors(tensors: tuple[Tensor, ...]) -> DecoderWeights:
+        """The inverse of `tensors`."""
+        return DecoderWeights(*(HeadWeights(*tensors[i : i + 4]) for i in (0, 4, 8)))
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> DecoderWeights:
+        """The same weights with `change` applied to each tensor."""
+        return DecoderWeights.from_tensors(tuple(change(t) for t in self.tensors()))
+
+    @staticmethod
+    def random(k: int, with_distance: bool, generator: torch.Generator) -> DecoderWeights:
+        """Weights drawn as `torch.nn.Linear` draws them: uniform within 1/sqrt(inputs)."""
+
+        def head(outputs: int) -> HeadWeights:
+            inputs = FEATURE_SIZE + 3 + int(with_distance)
+            shapes = [(HIDDEN_SIZE, inputs), (HIDDEN_SIZE,), (outputs, HIDDEN_SIZE), (outputs,)]
+            bounds = [inputs**-0.5] * 2 + [HIDDEN_SIZE**-0.5] * 2
+            draws = (
+                (2 * torch.rand(shape, generator=generator) - 1) * bound
+                for shape, bound in zip(shapes, bounds, strict=True)
+            )
+            return HeadWeights(*draws)
+
+        return DecoderWeights(head(k), head(7 * k), head(3 * k))
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """Gaussians on the image plane. Where `valid` is false, every number is zero."""
+
+    means_px: Float[Tensor, "m 2"]
+    #: Inverse of the dilated 2D covariance as (xx, xy, yy), in 1/px².
+    conics: Float[Tensor, "m 3"]
+    #: z in the camera, in world units.
+    depths: Float[Tensor, "m"]
+    valid: Bool[Tensor, "m"]
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """What an anchor model looks like from one camera, ready to be rasterised.
+
+    `source` is (index among the visible anchors)·k + offset, ascending; `volumes` are the products
+    of the three scales (world units cubed), which the loss keeps small.
+    """
+
+    means_px: Float[Tensor, "m 2"]
+    conics: Float[Tensor, "m 3"]
+    depths: Float[Tensor, "m"]
+    colours: Float[Tensor, "m 3"]
+    opacities: Float[Tensor, "m"]
+    volumes: Float[Tensor, "m"]
+    source: Int32[Tensor, "m"]
+
+
+@dataclass(frozen=True, eq=False)
+class SplatGradients:
+    """Derivatives of a loss by the splats of a view (depths have none), and what decoding needs to know of these."""
+
+    means_px: Float[Tensor, "m 2"]
+    conics: Float[Tensor, "m 3"]
+    colours: Float[Tensor, "m 3"]
+    opacities: Float[Tensor, "m"]
+    #: By the volume of each: the same number for all.
+    volume: float
+    #: The splats themselves: see `Splats`.
+    source: Int32[Tensor, "m"]
+    colour_values: Float[Tensor, "m 3"]
+    opacity_values: Float[Tensor, "m"]
+
+
+class AdamState(NamedTuple):
+    """A parameter of the anchors with its moments, shaped alike, and how fast it moves."""
+
+    parameter: Float[Tensor, "n *rest"]
+    first: Float[Tensor, "n *rest"]
+    second: Float[Tensor, "n *rest"]
+    learning_rate: float
 
 
 class Raster(NamedTuple):

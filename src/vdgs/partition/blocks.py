@@ -14,13 +14,20 @@ from typing import Any
 
 import numpy as np
 import shapely
+import torch
 from jaxtyping import Bool, Float, Int64
+from torch import Tensor
 
 from vdgs.captures.capture import GroundFrame
 from vdgs.captures.geodesy import geodetic_from_enu
 from vdgs.errors import RunError
-from vdgs.files import write_json
 from vdgs.partition.nearest import Cores
+from vdgs.storage.files import write_json
+
+
+def places_of(positions: Float[Tensor, "n 3"] | Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    """x and y of anchors as all who ask for owners give them, in float64: the same bits have the same owner."""
+    return torch.as_tensor(positions)[:, :2].double().cpu().numpy()
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from vdgs.errors import VdgsError
-from vdgs.visibility import normalised
+from vdgs.model.visibility import normalised
 
 #: Places are normalised between these quantiles and clipped: far outliers would squash the scene (choice).
 EXTENT = (0.01, 0.99)
@@ -30,14 +30,14 @@ CHUNK = 200_000
 
 
 def features_of(
-    places: Float[np.ndarray, "n 2"], views: Int64[np.ndarray, " n"], lambda_vis: float
+    places: Float[np.ndarray, "n 2"], visibility: Int64[np.ndarray, " n"], lambda_vis: float
 ) -> Float[np.ndarray, "n 3"]:
     """f_i = [x̂_i, ŷ_i, λ_vis V̂_i] (eq. 5), float64; x̂ and ŷ in [0, 1]."""
     low, high = np.quantile(places, EXTENT, axis=0)
     extent = np.where(high > low, high - low, 1.0)
     unit = np.clip((places - low) / extent, 0.0, 1.0)
     # Not 0 * V̂: without weight the visibility must leave no trace, not even -0.0.
-    third = lambda_vis * normalised(views) if lambda_vis else np.zeros(len(places))
+    third = lambda_vis * normalised(visibility) if lambda_vis else np.zeros(len(places))
     return np.column_stack([unit, third])
 
 

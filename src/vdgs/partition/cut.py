@@ -8,13 +8,13 @@ import numpy as np
 import shapely
 from jaxtyping import Float, Int
 
-from vdgs.config import PartitionConfig
 from vdgs.errors import VdgsError
-from vdgs.memory_estimate import Need, estimate
+from vdgs.memory.estimate import Need, estimate
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.boundary import cores_of, widen
 from vdgs.partition.cluster import cluster, features_of, refuse_too_many
 from vdgs.partition.plane import principal_plane
+from vdgs.settings.method import PartitionConfig
 
 #: A block that would own less than this share of the anchors of an average block is not worth training.
 LEAST_SHARE = 0.05
@@ -26,7 +26,7 @@ SEEN = 0.5
 
 
 def cut_scene(
-    positions: Float[np.ndarray, "n 3"], views: Int[np.ndarray, " n"], config: PartitionConfig, seed: int
+    positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray, " n"], config: PartitionConfig, seed: int
 ) -> tuple[Blocks, list[str]]:
     """Cut a scene into blocks by the places of its anchors and their visibility V; and warnings for people.
 
@@ -36,7 +36,7 @@ def cut_scene(
     blocks about them). Raises VdgsError if the anchors cannot be cut; ValueError if the number of blocks is still
     "auto" (`choose_block_count`).
     """
-    ground = _checked(positions, views)
+    ground = _checked(positions, visibility)
     if config.blocking and config.blocks == "auto":
         raise ValueError("the number of blocks is still 'auto': choose_block_count first")
     count = int(config.blocks) if config.blocking else 1
@@ -45,10 +45,10 @@ def cut_scene(
     if count == 1:
         return _whole(ground, config.expansion), []
     refuse_too_many(count, ground)
-    ground, views = _sorted(ground, np.asarray(views, np.int64))
+    ground, visibility = _sorted(ground, np.asarray(visibility, np.int64))
     plane = principal_plane(ground)
-    places, views = _sorted(plane.places(ground), views)
-    features = features_of(places, views, config.lambda_vis)
+    places, visibility = _sorted(plane.places(ground), visibility)
+    features = features_of(places, visibility, config.lambda_vis)
     labels = cluster(features, count, seed, config.balanced)
     cores = [core for core in cores_of(places, labels, count) if core is not None]
     cores = _worth_training(sorted(cores, key=lambda core: (core.centroid.x, core.centroid.y)), places, count)
@@ -87,22 +87,22 @@ def choose_block_count(
     return max(1, min(most, wanted, n_anchors))
 
 
-def _checked(positions: np.ndarray, views: np.ndarray) -> Float[np.ndarray, "n 2"]:
+def _checked(positions: np.ndarray, visibility: np.ndarray) -> Float[np.ndarray, "n 2"]:
     """x, y of the anchors in float64."""
     ground = np.asarray(positions, np.float64)[:, :2]
     if len(ground) == 0:
         raise VdgsError("the coarse model holds no anchors: there is nothing to cut into blocks. Train it again.")
     if not np.isfinite(ground).all():
         raise VdgsError("the coarse model holds anchors at places that are not finite numbers. Train it again.")
-    if len(views) != len(ground):
-        raise ValueError(f"{len(views)} counts of views for {len(ground)} anchors")
+    if len(visibility) != len(ground):
+        raise ValueError(f"{len(visibility)} counts of visibility for {len(ground)} anchors")
     return ground
 
 
-def _sorted(places: np.ndarray, views: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sorted(places: np.ndarray, visibility: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A canonical order, so that sums and draws do not depend on the order of the anchors."""
-    order = np.lexsort((views, places[:, 1], places[:, 0]))
-    return places[order], views[order]
+    order = np.lexsort((visibility, places[:, 1], places[:, 0]))
+    return places[order], visibility[order]
 
 
 def _whole(ground: np.ndarray, expansion: float) -> Blocks:

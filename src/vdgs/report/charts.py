@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator
 
-from vdgs.figure_parts import FAINT, INK
+from vdgs.figures.style import FAINT, INK
 from vdgs.report.pictures import Picture
 
 SIZE_IN, DPI = (4.8, 3.0), 160

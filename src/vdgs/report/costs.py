@@ -8,7 +8,7 @@ from vdgs.report.page import Html, details, paragraph, preformatted, section, ta
 from vdgs.report.reading import Record, Source
 from vdgs.report.training import block_names
 from vdgs.report.words import duration, memory
-from vdgs.run import RunFolder
+from vdgs.runs.folder import RunFolder
 
 #: Characters of config.yaml that are shown.
 LONGEST_SETTINGS = 60_000

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from vdgs.partition.figure_words import block_colour
+from vdgs.partition.figures.words import block_colour
 from vdgs.report.charts import MERGED, Curve, draw_curves
 from vdgs.report.page import Html, figure, gallery, heading, joined, paragraph, section, table
 from vdgs.report.reading import Record, Source
 from vdgs.report.words import count, decibels, figure_of, share
-from vdgs.run import RunFolder
+from vdgs.runs.folder import RunFolder
 
 #: Log lines over which the loss is smoothed: it is that of a single photograph.
 SMOOTH = 9

@@ -9,14 +9,14 @@ from pathlib import Path
 import yaml
 
 from vdgs.errors import RunError
-from vdgs.files import write_text
 from vdgs.report.costs import costs_section, settings_section
 from vdgs.report.page import Html, contents, document, escaped, joined, paragraph
 from vdgs.report.reading import Record, Source
 from vdgs.report.results import by_visibility_section, metrics_of, result_table, seams_section, verdict, views_section
 from vdgs.report.scene import assignment_section, blocks_section, visibility_section
 from vdgs.report.training import training_section
-from vdgs.run import RunFolder
+from vdgs.runs.folder import RunFolder
+from vdgs.storage.files import write_text
 
 #: name and title of the sections, for the links at the top
 CONTENTS = (

@@ -8,39 +8,32 @@ that no anchor covers would push the anchors at the boundary to fill the hole).
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-import shapely
-import torch
-from jaxtyping import Bool, Float, Int64
 from rich.console import Console
-from torch import Tensor
 
 from vdgs import __version__
-from vdgs.anchors import AnchorModel, Anchors
-from vdgs.cameras import Camera
-from vdgs.captures.capture import Capture
 from vdgs.captures.facts import capture_facts
+from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
-from vdgs.config import BlockConfig, block_training
 from vdgs.errors import RunError
-from vdgs.kernels import native as kernels
-from vdgs.partition.blocks import Blocks, load_blocks
-from vdgs.partition.saving import load_scores
-from vdgs.run import RunFolder, StageFolder
-from vdgs.run_options import WatchOptions
-from vdgs.stages.anchor_watching import continue_or_start, finish, identity, train_watched
-from vdgs.stages.coarse import camera_height, image_budget, note_without_growth, shares_for
-from vdgs.stages.opening import open_run
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.visibility import effective_count
+from vdgs.partition.blocks import Blocks
+from vdgs.partition.regions import drawn_by, holds, ramp, split_anchors
+from vdgs.runs.cut import blocks_of, views_of_block
+from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.opening import open_run
+from vdgs.settings.method import block_training
+from vdgs.settings.watching import WatchOptions
+from vdgs.storage.tensors import identity
 from vdgs.training import Stage, Surroundings, start_state
 from vdgs.training.crops import crops_of, load_or_find, mean_area, steps_for
-from vdgs.visibility import effective_count
-
-#: Cells on each side of the table of the ramp.
-RAMP_CELLS = 512
+from vdgs.training.sampling import shares_for
+from vdgs.watching.anchors import continue_or_start, finish, note_without_growth, train_watched
+from vdgs.watching.images import image_budget
 
 
 def train_block(path: Path, index: int, options: WatchOptions, console: Console) -> None:
@@ -64,24 +57,6 @@ def train_block(path: Path, index: int, options: WatchOptions, console: Console)
             _train(run, index, blocks, options, console)
 
 
-def blocks_of(run: RunFolder) -> Blocks:
-    """The blocks of a run, with cameras. Raises RunError unless they were made with the run's settings."""
-    facts, keys = run.partition_facts(), run.keys()
-    if (facts.get("key"), facts.get("assignment_key")) != (keys.partition, keys.assignment):
-        raise RunError(
-            f"{run.path}: is not cut into blocks yet, or with other settings. Run: vdgs partition {run.path}"
-        )
-    return load_blocks(run.partition / "blocks.geojson")
-
-
-def views_of_block(run: RunFolder, capture: Capture, index: int) -> list[int]:
-    """Which training views, by number, serve a block."""
-    _, _, assignment = load_scores(run.partition / "scores.npz")
-    if len(assignment.cameras) != len(capture.train_views):
-        raise RunError(f"{run.partition / 'scores.npz'}: is of another capture. Run: vdgs partition {run.path}")
-    return [int(view) for view in np.flatnonzero(assignment.cameras[:, index])]
-
-
 def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, console: Console) -> None:
     opened, folder, method = open_run(run.path, "coarse"), run.block(index), run.method()
     capture, coarse = opened.capture, opened.model
@@ -95,7 +70,7 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
         _keep_coarse(folder, replace(coarse, anchors=anchors, facts=facts), len(views), console)
         return
     config = block_training(method, len(views))
-    shares = shares_for(config, anchors, views)
+    shares = shares_for(config, anchors, [view.camera for view in views])
     began = time.monotonic()
     crops = None
     if method.block.crop != "off":
@@ -147,68 +122,3 @@ def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: C
         model=identity(folder.model),
     )  # fmt: skip
     console.print(f"[yellow]note[/] this block stays as the coarse model has it: {why}", highlight=False)
-
-
-def places(positions: Float[Tensor, "n 3"]) -> Float[np.ndarray, "n 2"]:
-    """x and y of anchors, in the precision in which places have owners."""
-    return positions[:, :2].double().numpy()
-
-
-def split_anchors(anchors: Anchors, blocks: Blocks, index: int, config: BlockConfig) -> tuple[Tensor, Tensor]:
-    """What a block moves and what it only draws, as two masks [n].
-
-    Own are the anchors that the block owns (with a ring that is not frozen: that it reaches). Around it are the ring
-    and, with `config.context`, everything else.
-    """
-    place = places(anchors.positions)
-    core, reached = blocks.owner(place) == index, blocks.reaches(index, place)
-    own = core if config.ring == "frozen" else reached
-    around = ~own if config.context else reached & ~own
-    return torch.from_numpy(own), torch.from_numpy(around)
-
-
-def drawn_by(anchors: Anchors, cameras: Sequence[Camera]) -> Bool[Tensor, " n"]:
-    """Which anchors one of the cameras may draw."""
-    drawn = torch.zeros(len(anchors), dtype=torch.bool)
-    for camera in cameras:
-        drawn[kernels.cull(anchors.positions, anchors.log_scales, camera)] = True
-    return drawn
-
-
-def holds(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor]:
-    """Which places may get new anchors: those of which the merge keeps what stands there."""
-
-    def inside(positions: Float[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
-        place = places(positions)
-        kept = blocks.owner(place) == index if config.ring == "frozen" else blocks.reaches(index, place)
-        return torch.from_numpy(kept)
-
-    return inside
-
-
-def ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor] | None:
-    """How far anchors move where the ring is a ramp: 1 wherever the block owns the place, and where another does,
-    falling linearly from the core to 0 at the widened boundary.
-
-    Read from a table over the block, since it is asked in every step.
-    """
-    if config.ring != "ramp":
-        return None
-    block = blocks.items[index]
-    low, high = np.array(block.expanded.bounds[:2]), np.array(block.expanded.bounds[2:])
-    centres = (np.indices((RAMP_CELLS, RAMP_CELLS)).reshape(2, -1).T + 0.5) / RAMP_CELLS * (high - low) + low
-    points = shapely.points(centres)
-    inwards, outwards = shapely.distance(block.core, points), shapely.distance(block.expanded.exterior, points)
-    share = np.where(shapely.contains(block.expanded, points), outwards / np.maximum(inwards + outwards, 1e-12), 0.0)
-    share = np.where(blocks.owner(centres) == index, 1.0, share)
-    table = torch.from_numpy(share.astype(np.float32).reshape(RAMP_CELLS, RAMP_CELLS))
-    origin, cell = torch.from_numpy(low), torch.from_numpy((high - low) / RAMP_CELLS)
-
-    def mobility(positions: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
-        cells: Int64[Tensor, "p 2"] = ((positions[:, :2].double() - origin) / cell).floor().long()
-        inside = ((cells >= 0) & (cells < RAMP_CELLS)).all(1)
-        cells = cells.clamp(0, RAMP_CELLS - 1)
-        # What the block moves beyond the table it owns.
-        return torch.where(inside, table[cells[:, 0], cells[:, 1]], torch.ones(()))
-
-    return mobility

@@ -2,74 +2,27 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
-from typing import Any
-
-import numpy as np
 import torch
 from rich.console import Console
 
 from vdgs import __version__
-from vdgs.anchors import AnchorModel, Anchors, initial_anchors
-from vdgs.captures.capture import Capture, View
+from vdgs.captures.capture import Capture
 from vdgs.captures.checks import check_images
-from vdgs.captures.facts import capture_facts, refuse_another_capture
+from vdgs.captures.facts import capture_facts
+from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
-from vdgs.captures.loading import load_capture
-from vdgs.captures.options import CaptureOptions
-from vdgs.config import MethodConfig, TrainConfig, to_dict, with_iterations
-from vdgs.config_checks import validate
-from vdgs.decoder import Decoder
-from vdgs.errors import VdgsError
-from vdgs.files import read_json, write_json
-from vdgs.memory import available_bytes
-from vdgs.run import RunFolder
-from vdgs.run_options import WatchOptions
-from vdgs.stages.anchor_watching import continue_or_start, finish, train_watched
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchors import Anchors
+from vdgs.model.decoder import Decoder
+from vdgs.model.start import initial_anchors
+from vdgs.runs.folder import RunFolder
+from vdgs.settings.method import TrainConfig
+from vdgs.settings.watching import WatchOptions
+from vdgs.storage.files import write_json
 from vdgs.training import Stage, TrainingState, mean_colour, start_state
-from vdgs.visibility import shares_of
-
-
-def begin_run(
-    capture_path: Path,
-    output: Path,
-    capture_options: CaptureOptions,
-    method: MethodConfig,
-    *,
-    redo: bool | None = None,
-) -> tuple[RunFolder, Capture]:
-    """Open the capture and a new run of it, or the run that is there if it was started with the same settings.
-
-    `redo` None compares the settings of the coarse stage only and refuses others; True or False is about changing
-    them (`RunFolder.change`). Raises CaptureError for a capture that cannot be used, RunError for other settings than
-    the run's, VdgsError for settings that do not work.
-    """
-    problems = validate(method)
-    if problems:
-        raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
-    capture = load_capture(capture_path, capture_options)
-    method = replace(method, training=with_iterations(method.training, len(capture.train_views)))
-    run = RunFolder(output)
-    with run.locked():
-        if run.capture_file.exists():
-            refuse_another_capture(run.capture_file, read_json(run.capture_file), capture)
-        settings = run_settings(capture_path, capture_options, method)
-        if redo is None or not run.config_file.exists():
-            run.begin(settings, ("capture", "training"))
-        else:
-            run.change(settings, redo)
-    return run, capture
-
-
-def run_settings(capture_path: Path, capture_options: CaptureOptions, method: MethodConfig) -> dict[str, Any]:
-    """What config.yaml holds: everything that the result depends on."""
-    plain = to_dict(capture_options)
-    absolute = {name: str(value.resolve()) for name, value in vars(capture_options).items() if isinstance(value, Path)}
-    capture = {"path": str(capture_path.resolve())} | plain | absolute
-    return {"capture": capture} | to_dict(method)
+from vdgs.training.sampling import shares_for
+from vdgs.watching.anchors import continue_or_start, finish, note_without_growth, train_watched
+from vdgs.watching.images import image_budget
 
 
 def train_coarse(run: RunFolder, capture: Capture, options: WatchOptions, console: Console) -> None:
@@ -94,41 +47,6 @@ def train_coarse(run: RunFolder, capture: Capture, options: WatchOptions, consol
         _train(run, capture, config, options, console)
 
 
-def note_without_growth(config: TrainConfig, console: Console, prefix: str = "--") -> None:
-    """Say so where growth would begin after it has ended; `prefix` is that of the stage's options."""
-    if config.growth.levels and config.growth.until * config.iterations < config.growth.start:
-        console.print(
-            f"[yellow]note[/] no anchor will grow: growth starts at iteration {config.growth.start} and ends at "
-            f"{config.growth.until * config.iterations:.0f}. Give more {prefix}iterations or a smaller "
-            f"{prefix}growth.start.",
-            highlight=False,
-        )
-
-
-def camera_height(capture: Capture) -> float:
-    """Median height of the training cameras above the median sparse point; at least a thousandth of their spread."""
-    centres = np.array([view.camera.position for view in capture.train_views])
-    height = float(np.median(centres[:, 2]) - np.median(capture.points[:, 2]))
-    return max(height, 1e-3 * float(np.ptp(capture.points, axis=0).max()), 1e-9)
-
-
-def shares_for(config: TrainConfig, anchors: Anchors, views: Sequence[View]) -> tuple[float, ...] | None:
-    """How often each training view is used, by the settings, for the anchors that training starts with.
-
-    Roots, because a view with few votes also costs little (`training.crops`): a mean varies least for what it costs
-    if strata are drawn in proportion to their weight over the root of their cost (Cochran, 1977, section 5.5).
-    """
-    if config.sampling == "even":
-        return None
-    votes = shares_of(anchors.positions, [view.camera for view in views])
-    return votes if config.sampling == "shares" else tuple(math.sqrt(share) for share in votes)
-
-
-def image_budget(options: WatchOptions) -> int:
-    """Bytes for decoded photographs."""
-    return int(options.image_memory_gb * 1e9) or available_bytes() // 4
-
-
 def _train(run: RunFolder, capture: Capture, config: TrainConfig, options: WatchOptions, console: Console) -> None:
     folder, views = run.coarse, capture.train_views
     # The voxel follows from the capture: recomputed when a run continues.
@@ -147,7 +65,7 @@ def _train(run: RunFolder, capture: Capture, config: TrainConfig, options: Watch
             voxel,
             camera_height(capture),
             background,
-            shares=shares_for(config, anchors, views),
+            shares=shares_for(config, anchors, [view.camera for view in views]),
         )
         state = continue_or_start(folder, stage, lambda: _start(anchors, stage), console)
         _announce(capture, state, config, console)

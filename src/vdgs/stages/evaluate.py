@@ -11,18 +11,20 @@ from typing import Any
 
 from rich.console import Console
 
-from vdgs.anchors import AnchorModel, Part
 from vdgs.cameras import Camera
 from vdgs.evaluation.of_run import Views, cached_photographs, evaluate_run, evaluation_folder
 from vdgs.evaluation.saving import write_json
 from vdgs.evaluation.seams import block_table, evaluate_blocks
-from vdgs.files import read_record
 from vdgs.kernels.types import Raster
-from vdgs.memory import forget_peak, peak_memory_bytes
-from vdgs.render import render
-from vdgs.run import RunFolder
-from vdgs.stages.block import blocks_of, split_anchors
-from vdgs.stages.opening import ModelName, TrainedRun, open_run
+from vdgs.memory.process import forget_peak, peak_memory_bytes
+from vdgs.model.anchor_model import AnchorModel, Part
+from vdgs.model.render import render
+from vdgs.partition.regions import split_anchors
+from vdgs.runs.cut import blocks_of
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import TrainedRun, open_run
+from vdgs.settings.requests import ModelName
+from vdgs.storage.files import read_record
 
 #: Blocks are held assembled among their surroundings up to so many bytes (at least one): views show them in turn.
 HELD_BYTES = 2_000_000_000

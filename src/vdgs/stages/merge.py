@@ -7,14 +7,14 @@ from pathlib import Path
 
 from rich.console import Console
 
-from vdgs.anchors import AnchorModel
 from vdgs.errors import RunError
-from vdgs.memory import forget_peak, peak_memory_bytes
-from vdgs.merging import merge
-from vdgs.run import RunFolder
-from vdgs.stages.anchor_watching import identity
-from vdgs.stages.block import blocks_of, views_of_block
-from vdgs.stages.opening import open_run
+from vdgs.memory.process import forget_peak, peak_memory_bytes
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.partition.merging import merge
+from vdgs.runs.cut import blocks_of, views_of_block
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import open_run
+from vdgs.storage.tensors import identity
 
 
 def merge_run(path: Path, incomplete: bool, console: Console) -> None:

@@ -1,6 +1,5 @@
-"""The scene cut into blocks, and cameras for each: visibility, partition, assignment (section III-B).
+"""The scene cut into blocks, and cameras for each: partition and assignment (section III-B).
 
-RUN/visibility/  visibility.json, map.png
 RUN/partition/   blocks.geojson (ground frame), blocks_wgs84.geojson (if georeferenced), scores.npz,
                  partition.json, blocks.png, block_facts.png, scores.png
 """
@@ -8,7 +7,7 @@ RUN/partition/   blocks.geojson (ground frame), blocks_wgs84.geojson (if georefe
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,24 +19,22 @@ from rich.progress import Progress
 from rich.table import Table
 
 from vdgs.cameras import Camera
-from vdgs.captures.capture import Capture
-from vdgs.config import AssignmentConfig, PartitionConfig
 from vdgs.errors import RunError
 from vdgs.evaluation.saving import write_json
-from vdgs.files import read_record
-from vdgs.memory import forget_peak, peak_memory_bytes
-from vdgs.partition import figures
-from vdgs.partition.assignment import Assignment, assign
-from vdgs.partition.assignment_tables import assignment_rows, assignment_table, explain
-from vdgs.partition.blocks import Blocks, load_blocks, save_blocks, save_blocks_wgs84
+from vdgs.memory.process import forget_peak, peak_memory_bytes
+from vdgs.partition.assignment.assign import Assignment, assign
+from vdgs.partition.assignment.saving import load_scores, save_scores
+from vdgs.partition.assignment.scores import Scores, score_matrix
+from vdgs.partition.assignment.tables import assignment_rows, assignment_table, explain
+from vdgs.partition.blocks import Blocks, load_blocks, places_of, save_blocks, save_blocks_wgs84
 from vdgs.partition.cut import choose_block_count, cut_scene
-from vdgs.partition.saving import load_scores, save_scores
-from vdgs.partition.scores import Scores, score_matrix
+from vdgs.partition.figures import maps as figures
 from vdgs.partition.strategies import STRATEGIES
-from vdgs.run import RunFolder
-from vdgs.stages.block import places
-from vdgs.stages.opening import TrainedRun, open_run
-from vdgs.visibility import imbalance
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import TrainedRun, open_run
+from vdgs.runs.visibility import keep_visibility
+from vdgs.settings.method import AssignmentConfig, PartitionConfig
+from vdgs.storage.files import read_record
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,7 @@ class _Scene:
 
     opened: TrainedRun
     positions: Float[np.ndarray, "n 3"]
-    views: Int[np.ndarray, " n"]
+    visibility: Int[np.ndarray, " n"]
     cameras: list[Camera]
 
     @staticmethod
@@ -54,29 +51,7 @@ class _Scene:
         opened = open_run(run.path, "coarse")
         cameras = [view.camera for view in opened.capture.train_views]
         positions = opened.model.anchors.positions.numpy()
-        return _Scene(opened, positions, opened.views_of_anchors().numpy(), cameras)
-
-
-def measure_visibility(run: RunFolder, console: Console) -> None:
-    """V_i of every anchor: its distribution and a map from above. Skipped where it is there for this coarse model."""
-    file, key = run.visibility / "visibility.json", run.keys().visibility
-    if read_record(file).get("key") == key:
-        console.print(f"{file}: already there; nothing to do", highlight=False)
-        return
-    with run.locked():
-        scene = _Scene.of(run)
-        facts = asdict(imbalance(scene.views))
-        run.visibility.mkdir(exist_ok=True)
-        figures.draw_visibility_map(
-            run.visibility / "map.png", scene.positions, scene.views, scene.cameras, unit(scene.opened.capture)
-        )
-        write_json(file, {"key": key, "anchors": len(scene.views), "training_views": len(scene.cameras), **facts})
-    quantiles = ", ".join(f"{share} %: {value:g}" for share, value in facts["quantiles"].items())
-    console.print(
-        f"cameras that see an anchor (V), by quantile: {quantiles}; Gini {facts['gini']:.2f}\n"
-        f"map: {run.visibility / 'map.png'}",
-        highlight=False,
-    )
+        return _Scene(opened, positions, keep_visibility(opened).numpy(), cameras)
 
 
 def partition_run(run: RunFolder, console: Console) -> None:
@@ -103,7 +78,7 @@ def partition_run(run: RunFolder, console: Console) -> None:
         assignment = assign(scores, config)
         for note in warnings + assignment.complaints:
             console.print(f"[yellow]note[/] {note}", highlight=False)
-        rows = assignment_rows(blocks, scene.positions, scene.views, assignment)
+        rows = assignment_rows(blocks, scene.positions, scene.visibility, assignment)
         _save(run.partition, scene, blocks, scores, assignment, rows)
         spatial = _spatial(scene, method.partition, method.training.seed, blocks)
         _draw(run.partition, scene, blocks, scores, assignment, method.partition, spatial)
@@ -130,27 +105,22 @@ def explain_view(run: RunFolder, view: str, console: Console) -> None:
     console.print(table)
 
 
-def unit(capture: Capture) -> str:
-    """What one unit of the ground frame is called."""
-    return "m" if capture.ground.metric else "units"
-
-
 def _cut(scene: _Scene, config: PartitionConfig, seed: int) -> tuple[Blocks, list[str]]:
     camera = scene.cameras[0]
     count = choose_block_count(
-        len(scene.views), len(scene.cameras), camera.width * camera.height, config,
+        len(scene.visibility), len(scene.cameras), camera.width * camera.height, config,
         offsets=scene.opened.model.anchors.offsets.shape[1],
     )  # fmt: skip
     if config.strategy != "visibility":
         return STRATEGIES[config.strategy].cut(scene.positions, scene.cameras, count)
-    return cut_scene(scene.positions, scene.views, replace(config, blocks=count), seed)
+    return cut_scene(scene.positions, scene.visibility, replace(config, blocks=count), seed)
 
 
 def _spatial(scene: _Scene, config: PartitionConfig, seed: int, cut: Blocks) -> Blocks:
     """The cut that place alone would give, to compare with."""
     if config.lambda_vis == 0 or len(cut) == 1:
         return cut
-    return cut_scene(scene.positions, scene.views, replace(config, blocks=len(cut), lambda_vis=0.0), seed)[0]
+    return cut_scene(scene.positions, scene.visibility, replace(config, blocks=len(cut), lambda_vis=0.0), seed)[0]
 
 
 def _kept_blocks(run: RunFolder) -> Blocks | None:
@@ -185,12 +155,12 @@ def _score(
 
 def _facts_of_cut(scene: _Scene, blocks: Blocks) -> list[dict[str, Any]]:
     """Anchors, area and visibility of each block of a cut."""
-    owner = blocks.owner(places(scene.opened.model.anchors.positions))
+    owner = blocks.owner(places_of(scene.positions))
     return [
         {
             "block": index, "anchors_core": int((owner == index).sum()), "area": float(block.core.area),
-            "mean_v": float(scene.views[owner == index].mean()) if (owner == index).any() else None,
-            "std_v": float(scene.views[owner == index].std()) if (owner == index).any() else None,
+            "mean_v": float(scene.visibility[owner == index].mean()) if (owner == index).any() else None,
+            "std_v": float(scene.visibility[owner == index].std()) if (owner == index).any() else None,
         }
         for index, block in enumerate(blocks.items)
     ]  # fmt: skip
@@ -225,11 +195,11 @@ def _draw(
     ours = config.strategy == "visibility" and config.lambda_vis > 0
     compare = spatial if ours and len(blocks) > 1 else None
     figures.draw_blocks(
-        folder / "blocks.png", scene.positions, scene.views, blocks, scene.cameras, assignment.cameras,
-        unit(scene.opened.capture), compare, how_cut(config),
+        folder / "blocks.png", scene.positions, scene.visibility, blocks, scene.cameras, assignment.cameras,
+        scene.opened.capture.ground.unit, compare, how_cut(config),
     )  # fmt: skip
     figures.draw_block_facts(
-        folder / "block_facts.png", scene.positions, scene.views, blocks, assignment.cameras,
-        unit(scene.opened.capture), compare,
+        folder / "block_facts.png", scene.positions, scene.visibility, blocks, assignment.cameras,
+        scene.opened.capture.ground.unit, compare,
     )  # fmt: skip
     figures.draw_scores(folder / "scores.png", scores.scores, assignment.cameras)

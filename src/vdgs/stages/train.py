@@ -14,12 +14,12 @@ from rich.console import Console
 from vdgs.errors import RunError, VdgsError
 from vdgs.executors.local import Job, default_jobs, run_jobs
 from vdgs.kernels.native.module import threads as threads_available
-from vdgs.memory import available_bytes
-from vdgs.memory_estimate import Need, estimate, in_gb
-from vdgs.run import RunFolder, StageFolder
-from vdgs.run_options import WatchOptions
-from vdgs.stages.block import blocks_of
-from vdgs.stages.watching import Stopped
+from vdgs.memory.estimate import Need, estimate, in_gb
+from vdgs.memory.process import available_bytes
+from vdgs.runs.cut import blocks_of
+from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.settings.watching import WatchOptions
+from vdgs.watching.watch import Stopped
 
 #: Share of a block's anchors that one photograph may see, for the estimate before a block is opened (choice).
 SEEN = 0.5

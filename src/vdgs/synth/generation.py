@@ -16,7 +16,7 @@ from vdgs import __version__
 from vdgs.cameras import Camera
 from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST
 from vdgs.errors import VdgsError
-from vdgs.files import write_text
+from vdgs.storage.files import write_text
 from vdgs.synth.colmap import write_model
 from vdgs.synth.disturbances import disturbed, exposure_gains, with_outliers
 from vdgs.synth.flight import flight_altitude, fly

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from vdgs.cameras import Camera
+from vdgs.model.visibility import imbalance
 from vdgs.synth.mesh import Mesh
-from vdgs.synth.surveying import count_views, surface_places
+from vdgs.synth.surveying import count_visibility, surface_places
 from vdgs.synth.tracing import Tracer
-from vdgs.visibility import imbalance
 
 #: Places drawn on the surface.
 _PLACES = 40_000
@@ -46,7 +46,7 @@ def survey(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places [n, 3] (m) of the surface that training truly sees, evenly by area, and V [n] of each (at least 1)."""
     places = surface_places(mesh, _REACH * half_extent, _PLACES, rng)
-    views = count_views(tracer, training, places)
+    views = count_visibility(tracer, training, places)
     seen = views > 0
     return places[seen], views[seen]
 

@@ -34,7 +34,7 @@ def true_visibility(tracer: Tracer, cameras: list[Camera], places: np.ndarray) -
     return visible
 
 
-def count_views(tracer: Tracer, cameras: list[Camera], places: np.ndarray) -> np.ndarray:
+def count_visibility(tracer: Tracer, cameras: list[Camera], places: np.ndarray) -> np.ndarray:
     """How many of the cameras truly see each place [n, 3], [n] uint16."""
     count = np.zeros(len(places), np.uint16)
     for camera in cameras:
@@ -54,7 +54,7 @@ def view_truth(tracer: Tracer, camera: Camera, training: list[Camera], step: int
     depth[met] = hits.distance[met] * (directions[met] @ camera.forward.astype(np.float32))
     count = np.zeros(len(pixels), np.uint16)
     places = camera.position + directions[met].astype(np.float64) * hits.distance[met, None]
-    count[met] = count_views(tracer, training, places)
+    count[met] = count_visibility(tracer, training, places)
     return depth.reshape(shape), count.reshape(shape)
 
 

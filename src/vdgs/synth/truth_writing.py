@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.cameras import Camera
-from vdgs.files import write_json
+from vdgs.storage.files import write_json
 from vdgs.synth.imbalance import FlightImbalance
 from vdgs.synth.sparse import SparseCloud
 from vdgs.synth.surveying import view_truth

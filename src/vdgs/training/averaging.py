@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from vdgs.anchors import TRAINED, Anchors
-from vdgs.config import TrainConfig
-from vdgs.decoder import Decoder
+from vdgs.model.anchors import TRAINED, Anchors
+from vdgs.model.decoder import Decoder
+from vdgs.settings.method import TrainConfig
 
 #: The mean is one of about so many models: enough for it, and few enough to cost no time.
 MODELS = 100

@@ -7,15 +7,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vdgs.anchors import Anchors
-from vdgs.compensation import begin_cycle, compensate, cycle_facts, low_visibility, update_cache
-from vdgs.growth import Compensated, Statistics, decide
 from vdgs.kernels import native as kernels
-from vdgs.memory import return_unused
-from vdgs.optimiser import rebuild
+from vdgs.memory.process import return_unused
+from vdgs.model.anchors import Anchors
+from vdgs.model.visibility import share_in_cycle
+from vdgs.training.compensation import begin_cycle, compensate, cycle_facts, low_visibility, update_cache
+from vdgs.training.growth import Compensated, Statistics, decide
+from vdgs.training.optimiser import rebuild
 from vdgs.training.schedule import views_in_cycle
 from vdgs.training.state import Stage, TrainingState
-from vdgs.visibility import share_in_cycle
 
 
 def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:

@@ -16,17 +16,17 @@ from torch import Tensor
 from vdgs.cameras import Camera
 from vdgs.errors import TrainingDiverged
 from vdgs.kernels import native as kernels
-from vdgs.kernels.decode_types import DecoderWeights, SplatGradients, Splats
-from vdgs.optimiser import rates_at
-from vdgs.render import decode_rows, visible_rows
-from vdgs.step import draw_view, move_anchors
+from vdgs.kernels.types import DecoderWeights, SplatGradients, Splats
+from vdgs.model.render import decode_rows, visible_rows
 from vdgs.training.averaging import Average, counts_in_mean
 from vdgs.training.background import background_at
 from vdgs.training.crops import WHOLE, crop_at
 from vdgs.training.growing import grow, reorder
+from vdgs.training.optimiser import rates_at
 from vdgs.training.schedule import downscale_at, view_at
 from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
 from vdgs.training.state import Stage, StepReport, TrainingState
+from vdgs.training.step import draw_view, move_anchors
 
 #: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
 REFERENCE_HEIGHT = 10.0

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from vdgs.config import TrainConfig
+from vdgs.settings.method import TrainConfig
 from vdgs.training.state import Stage
 
 

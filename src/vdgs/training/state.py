@@ -12,16 +12,16 @@ from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from vdgs.anchors import Anchors
 from vdgs.cameras import Camera
-from vdgs.checkpoints import SavedState
-from vdgs.compensation import Compensation
-from vdgs.config import TrainConfig
-from vdgs.decoder import Decoder
-from vdgs.growth import Statistics
-from vdgs.optimiser import Moments, Optimiser
+from vdgs.model.anchors import Anchors
+from vdgs.model.decoder import Decoder
+from vdgs.settings.method import TrainConfig
+from vdgs.storage.checkpoints import SavedState
 from vdgs.training.averaging import Average
+from vdgs.training.compensation import Compensation
 from vdgs.training.crops import Crop
+from vdgs.training.growth import Statistics
+from vdgs.training.optimiser import Moments, Optimiser
 
 
 @runtime_checkable

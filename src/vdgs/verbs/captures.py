@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
-from vdgs.captures.options import CaptureOptions
+from vdgs.settings.capture import CaptureOptions
 from vdgs.synth.options import SynthOptions
 from vdgs.verbs.shared import open_console
 
@@ -31,7 +31,7 @@ def inspect(arguments: list[str]) -> None:
     asked = tyro.cli(InspectArguments, args=arguments, prog="vdgs inspect")
     from vdgs.captures.checks import check_images
     from vdgs.captures.loading import load_capture
-    from vdgs.inspect import inspect_capture, print_report
+    from vdgs.inspection.inspect import inspect_capture, print_report
 
     capture = load_capture(asked.capture, asked.options)
     if asked.check:

@@ -17,6 +17,6 @@ class DoctorArguments:
 
 def doctor(arguments: list[str]) -> int:
     asked = tyro.cli(DoctorArguments, args=arguments, prog="vdgs doctor")
-    from vdgs.doctor import print_report
+    from vdgs.doctor.report import print_report
 
     return print_report(as_json=asked.json)

@@ -9,6 +9,7 @@ from typing import Literal
 import tyro
 from tyro.conf import Positional
 
+from vdgs.settings.requests import ModelName, RenderRequest
 from vdgs.verbs.shared import open_console, use_device, use_threads
 
 
@@ -19,7 +20,7 @@ class EvalArguments:
 
     run: Positional[Path]
     """Run folder."""
-    model: Literal["best", "coarse", "merged"] = "best"
+    model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
     views: Literal["test", "training"] = "test"
     """Which views. `training` goes into evaluation_training: what is much better there than on test views was learnt by
@@ -54,42 +55,22 @@ class ReportArguments:
 def report(arguments: list[str]) -> None:
     asked = tyro.cli(ReportArguments, args=arguments, prog="vdgs report")
     from vdgs.report import write_report
-    from vdgs.run import RunFolder
+    from vdgs.runs.folder import RunFolder
 
     open_console().print(f"report: {write_report(RunFolder(asked.run))}", highlight=False)
 
 
 @dataclass(frozen=True)
-class RenderArguments:
+class RenderArguments(RenderRequest):
     """Render a run: its test views, its training views, or a camera path; as PNG files or a video."""
 
     run: Positional[Path]
     """Run folder."""
-    output: Path
-    """Folder for PNG files, or a file that ends in .mp4."""
-    views: Literal["test", "train", "orbit", "flyover"] = "test"
-    """Which cameras; `orbit` and `flyover` are paths made from the capture."""
-    path: Path | None = None
-    """JSON file with a camera path (docs/conventions.md); overrides --views."""
-    seconds: float = 0.0
-    """Length of a camera path; 0: what its file says, or 12 seconds."""
-    fps: float = 0.0
-    """Frames per second of a camera path and of the video; 0: what its file says, or 30 (2 for separate views)."""
-    width: int = 0
-    """Image width; 0 takes that of the training views."""
-    kind: Literal["image", "depth", "visibility"] = "image"
-    """What to draw: the picture, expected depth, or the number of cameras that see each place."""
-    model: Literal["best", "coarse", "merged"] = "best"
-    """Which model; `best` is the merged one where there is one."""
-    threads: int = 0
-    """Threads of the kernels; 0 for all cores."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 
 
 def render(arguments: list[str]) -> None:
     asked = tyro.cli(RenderArguments, args=arguments, prog="vdgs render")
-    from vdgs.render_run import render_run
+    from vdgs.films.film import render_run
 
     use_device(asked.device)
     use_threads(asked.threads)

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from vdgs.config import PRESETS, MethodConfig, PresetName
+from vdgs.settings.method import MethodConfig
+from vdgs.settings.presets import PRESETS, PresetName
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from vdgs.run import RunFolder
+    from vdgs.runs.folder import RunFolder
 
 
 def named_preset(arguments: list[str]) -> PresetName:
@@ -29,7 +30,7 @@ def named_preset(arguments: list[str]) -> PresetName:
 def recorded_run(arguments: list[str], kind: type, prog: str) -> tuple[RunFolder, MethodConfig]:
     """The run that the arguments name and its settings: they are the defaults of the options, and of their help where
     the run is named."""
-    from vdgs.run import RunFolder
+    from vdgs.runs.folder import RunFolder
 
     if "-h" in arguments or "--help" in arguments:
         named = next((RunFolder(Path(a)) for a in arguments if (Path(a) / "config.yaml").is_file()), None)
@@ -40,9 +41,9 @@ def recorded_run(arguments: list[str], kind: type, prog: str) -> tuple[RunFolder
 
 def change_settings(run: RunFolder, method: MethodConfig, redo: bool) -> None:
     """Give the run other settings for later stages, if they are other."""
-    from vdgs.config import to_dict
-    from vdgs.config_checks import validate
     from vdgs.errors import VdgsError
+    from vdgs.settings.checks import validate
+    from vdgs.settings.plain import to_dict
 
     problems = validate(method)
     if problems:
@@ -66,7 +67,7 @@ def use_threads(count: int) -> None:
 
 def use_device(asked: str) -> str:
     """Decide which device computes, say so in a line, and return it. Raises VdgsError for one that cannot."""
-    from vdgs.devices import choose
+    from vdgs.kernels.devices import choose
 
     choice = choose(asked)
     open_console().print(str(choice), highlight=False)

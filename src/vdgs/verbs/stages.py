@@ -9,8 +9,8 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
-from vdgs.config import AssignmentConfig, BlockConfig, MergeConfig, PartitionConfig
-from vdgs.run_options import WatchOptions
+from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, PartitionConfig
+from vdgs.settings.watching import WatchOptions
 from vdgs.verbs.shared import change_settings, open_console, recorded_run, use_device, use_threads
 
 
@@ -24,8 +24,8 @@ class VisibilityArguments:
 
 def visibility(arguments: list[str]) -> None:
     asked = tyro.cli(VisibilityArguments, args=arguments, prog="vdgs visibility")
-    from vdgs.run import RunFolder
-    from vdgs.stages.partition import measure_visibility
+    from vdgs.runs.folder import RunFolder
+    from vdgs.stages.visibility import measure_visibility
 
     measure_visibility(RunFolder(asked.run), open_console())
 

@@ -9,18 +9,11 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
-from vdgs.captures.options import CaptureOptions
-from vdgs.config import (
-    PRESETS,
-    AssignmentConfig,
-    BlockConfig,
-    MergeConfig,
-    MethodConfig,
-    PartitionConfig,
-    PresetName,
-    TrainConfig,
-)
-from vdgs.run_options import WatchOptions
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.method import PartitionConfig, TrainConfig
+from vdgs.settings.presets import PRESETS, PresetName
+from vdgs.settings.requests import RunRequest
+from vdgs.settings.watching import WatchOptions
 from vdgs.verbs.shared import named_preset, open_console, use_device, use_threads
 
 
@@ -47,7 +40,8 @@ def coarse(arguments: list[str]) -> None:
     preset = named_preset(arguments)
     default = CoarseArguments(tyro.MISSING, tyro.MISSING, preset, training=PRESETS[preset].training)
     asked = tyro.cli(CoarseArguments, args=arguments, prog="vdgs coarse", default=default)
-    from vdgs.stages.coarse import begin_run, train_coarse
+    from vdgs.runs.beginning import begin_run
+    from vdgs.stages.coarse import train_coarse
 
     use_device(asked.device)
     use_threads(asked.threads)
@@ -57,7 +51,7 @@ def coarse(arguments: list[str]) -> None:
 
 
 @dataclass(frozen=True)
-class RunArguments:
+class RunArguments(RunRequest):
     """Do everything: coarse model, visibility, blocks, cameras, block training, merge, metrics, report.
 
     The same command continues a run that was stopped; finished stages are skipped.
@@ -65,34 +59,10 @@ class RunArguments:
 
     capture: Positional[Path]
     """Folder of the capture."""
-    output: Path
-    """Run folder; new, or the run to continue."""
-    preset: PresetName = "paper"
-    """`paper`: the paper's settings (100 000 + 50 000 iterations a block). `laptop`: a good result in minutes."""
-    redo: bool = False
-    """Allow other settings than the run has to discard what was trained with the old ones."""
-    jobs: int = 0
-    """Blocks trained at once; 0 takes what cores and memory allow."""
-    incomplete: bool = False
-    """Go on if a block fails: the coarse model stands in for it."""
-    lpips_weights: Path | None = None
-    """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
-    bins: int = 4
-    """Number of visibility quantiles by which metrics are reported."""
-    threads: int = 0
-    """Threads of the kernels; 0 for all cores. The result does not depend on it."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
-    assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
-    block: BlockConfig = field(default_factory=BlockConfig)
-    merge: MergeConfig = field(default_factory=MergeConfig)
     watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
-
-    def method(self) -> MethodConfig:
-        return MethodConfig(self.training, self.partition, self.assignment, self.block, self.merge)
 
 
 def run(arguments: list[str]) -> None:
@@ -103,7 +73,7 @@ def run(arguments: list[str]) -> None:
         assignment=settings.assignment, block=settings.block, merge=settings.merge,
     )  # fmt: skip
     asked = tyro.cli(RunArguments, args=arguments, prog="vdgs run", default=default)
-    from vdgs.stages.pipeline import run_all
+    from vdgs.pipeline import run_all
 
     device = use_device(asked.device)
     use_threads(asked.threads)

@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from vdgs.errors import VdgsError
-from vdgs.files import write_bytes
+from vdgs.storage.files import write_bytes
 
 #: Overrides the folder of compiled code.
 VARIABLE = "VDGS_CUDA_CACHE"

@@ -9,10 +9,10 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels.decode_types import FEATURE_SIZE, DecoderWeights, Splats
 from vdgs.kernels.native import module
 from vdgs.kernels.native.arguments import contiguous, packed_camera, require_rows
 from vdgs.kernels.reference.adam import check_indices
+from vdgs.kernels.types import FEATURE_SIZE, DecoderWeights, Splats
 
 
 def decode(

@@ -9,12 +9,12 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels.decode_types import AdamState, DecoderWeights, SplatGradients
 from vdgs.kernels.native import module
 from vdgs.kernels.native.arguments import contiguous, packed_camera, require_rows
 from vdgs.kernels.native.decode import check_anchors
 from vdgs.kernels.reference.adam import check_indices, check_step
 from vdgs.kernels.reference.statistics import check_sources
+from vdgs.kernels.types import AdamState, DecoderWeights, SplatGradients
 
 
 def decode_backward_adam(

@@ -9,9 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels.decode_types import Projected
 from vdgs.kernels.native import module
 from vdgs.kernels.native.arguments import contiguous, packed_camera, require_rows
+from vdgs.kernels.types import Projected
 
 
 def project(

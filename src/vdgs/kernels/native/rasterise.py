@@ -1,4 +1,4 @@
-"""Splats to a picture, in C++ on the CPU (native/cpu/rasterise.h)."""
+"""Splats to a picture, in C++ on the CPU (native/cpu/rasterise/rasterise.h)."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from vdgs.kernels.reference.loss import photometric_loss
 from vdgs.kernels.reference.project import project
 from vdgs.kernels.reference.rasterise import rasterise
 from vdgs.kernels.reference.statistics import add_view_statistics
-from vdgs.kernels.reference.views import count_views, mark_views
+from vdgs.kernels.reference.visibility import count_visibility, mark_visible
 
 __all__ = [
     "adam_rows",
@@ -17,13 +17,13 @@ __all__ = [
     "cell_centres",
     "cell_keys",
     "contains",
-    "count_views",
+    "count_visibility",
     "cull",
     "decode",
     "decode_backward_adam",
     "group_cells",
     "group_max",
-    "mark_views",
+    "mark_visible",
     "morton_order",
     "photometric_loss",
     "project",

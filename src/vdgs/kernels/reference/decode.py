@@ -8,8 +8,8 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels.constants import ALPHA_MIN
-from vdgs.kernels.decode_types import FEATURE_SIZE, DecoderWeights, HeadWeights, Splats
 from vdgs.kernels.reference.project import project_with_variances
+from vdgs.kernels.types import FEATURE_SIZE, DecoderWeights, HeadWeights, Splats
 
 
 def decode(

@@ -9,9 +9,9 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels.decode_types import AdamState, DecoderWeights, SplatGradients
 from vdgs.kernels.reference.adam import adam_rows
 from vdgs.kernels.reference.decode import decode
+from vdgs.kernels.types import AdamState, DecoderWeights, SplatGradients
 
 
 def decode_backward_adam(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from vdgs.cameras import NEAR, Camera
 from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
-from vdgs.kernels.decode_types import Projected
+from vdgs.kernels.types import Projected
 
 
 def project(

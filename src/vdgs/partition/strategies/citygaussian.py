@@ -14,10 +14,10 @@ import shapely
 from jaxtyping import Float
 
 from vdgs.cameras import Camera
-from vdgs.config import AssignmentConfig
+from vdgs.partition.assignment.scores import Scores
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.scores import Scores
 from vdgs.partition.strategies.strategy import checked_ground, grid_shape, inhabited
+from vdgs.settings.method import AssignmentConfig
 
 #: The foreground lies between these quantiles of the cameras; beyond it space is contracted (choice: the publication
 #: sets it by hand for each scene).

@@ -15,11 +15,11 @@ import shapely
 from jaxtyping import Float
 
 from vdgs.cameras import Camera
-from vdgs.config import AssignmentConfig
+from vdgs.partition.assignment.scores import Scores
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.plane import principal_plane
-from vdgs.partition.scores import Scores
 from vdgs.partition.strategies.strategy import KEPT, checked_ground, grid_shape, inhabited, stretched
+from vdgs.settings.method import AssignmentConfig
 
 #: A cell is trained this many times as large.
 WIDENED = 1.4

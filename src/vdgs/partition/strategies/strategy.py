@@ -11,10 +11,10 @@ import shapely.affinity
 from jaxtyping import Float
 
 from vdgs.cameras import Camera
-from vdgs.config import AssignmentConfig
 from vdgs.errors import VdgsError
+from vdgs.partition.assignment.scores import Scores
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.scores import Scores
+from vdgs.settings.method import AssignmentConfig
 
 #: Outliers beyond these quantiles of the anchors do not decide how large the scene is.
 KEPT = (0.01, 0.99)

@@ -14,10 +14,10 @@ import shapely
 from jaxtyping import Float
 
 from vdgs.cameras import Camera
-from vdgs.config import AssignmentConfig
+from vdgs.partition.assignment.scores import Scores
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.scores import Scores
 from vdgs.partition.strategies.strategy import KEPT, checked_ground, grid_shape, inhabited, stretched
+from vdgs.settings.method import AssignmentConfig
 
 #: Cells are widened to this many times their sides for training (section 4.1: by 20 %).
 WIDENED = 1.2

@@ -1,0 +1,119 @@
+"""What the JSON formats of the NeRF family share: reading safely, camera axes, intrinsics by key."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vdgs.captures.formats.source import Intrinsics, check_intrinsics
+from vdgs.captures.photographs import read_header
+from vdgs.errors import CaptureError
+
+#: Camera axes: OpenGL (right, up, back) from OpenCV (right, down, forward); its own inverse.
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """The object in a JSON file. Raises `CaptureError` for anything else."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from error
+    except (ValueError, RecursionError) as error:
+        raise CaptureError(f"{file}: is not JSON ({error}). Export it again.") from None
+    if not isinstance(content, dict):
+        raise CaptureError(f"{file}: must hold a JSON object.")
+    return content
+
+
+def frames_of(content: dict[str, Any], file: Path) -> list[dict[str, Any]]:
+    """The list of frames. Raises `CaptureError` if there are none."""
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise CaptureError(f"{file}: must hold a list 'frames' of posed images, and it has none.")
+    return frames
+
+
+def matrix_of(value: object, file: Path, label: str) -> np.ndarray:
+    """A matrix [3 or 4, 4] float64 from nested lists, completed to [4, 4]. Raises `CaptureError`."""
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (ValueError, TypeError, OverflowError):
+        matrix = np.zeros(0)
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
+        raise CaptureError(f"{file}: {label} needs a 4x4 matrix of finite numbers. Export it again.")
+    result = np.eye(4)
+    result[:3] = matrix[:3]
+    return result
+
+
+def number(source: dict[str, Any], key: str, file: Path) -> float | None:
+    """A finite number by key, or None where it is absent. Raises `CaptureError` for anything else."""
+    value = source.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not _finite(value):
+        raise CaptureError(f"{file}: {key!r} must be a finite number, not {str(value)[:40]!r}.")
+    return float(value)
+
+
+def _finite(value: int | float) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond any float
+        return False
+
+
+def intrinsics_of(frame: dict[str, Any], common: dict[str, Any], image: Path, file: Path) -> Intrinsics:
+    """Intrinsics of a frame, its own keys before the common ones (fl_x, fl_y, cx, cy, w, h, k1...p2).
+
+    Focal lengths may be given as camera_angle_x, y (radians). Where w and h are absent the image's own
+    size is taken. Raises `CaptureError` for missing focal lengths and for lenses that are not understood.
+    """
+    values = {**common, **{key: value for key, value in frame.items() if value is not None}}
+
+    def get(key: str, default: float | None = None) -> float | None:
+        value = number(values, key, file)
+        return default if value is None else value
+
+    width, height = get("w"), get("h")
+    if width is None or height is None:
+        header = read_header(image)
+        width, height = header.width, header.height
+    fx = get("fl_x", _focal(width, get("camera_angle_x")))
+    fy = get("fl_y", fx if get("fl_x") is not None else _focal(height, get("camera_angle_y")))
+    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
+    if fx is None or fy is None:
+        raise CaptureError(f"{file}: no focal length for {image.name} (fl_x or camera_angle_x).")
+    head = (fx, fy, get("cx", width / 2) or 0.0, get("cy", height / 2) or 0.0)
+    model, tail = _lens(str(values.get("camera_model", "OPENCV")), {k: get(k, 0.0) or 0.0 for k in _LENS}, file)
+    if not (0 < width < 1e6 and 0 < height < 1e6):
+        raise CaptureError(f"{file}: {image.name} has an image size of {width}x{height}. Mend w and h.")
+    return check_intrinsics(Intrinsics(model, (*head, *tail), int(width), int(height)), file, image.name)
+
+
+_LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def _focal(side: float, angle: float | None) -> float | None:
+    """Focal length in pixels from the field of view (radians) across a side."""
+    return side / 2 / math.tan(angle / 2) if angle is not None and 0 < angle < math.pi else None
+
+
+def _lens(model: str, k: dict[str, float], file: Path) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's model and its distortion parameters for nerfstudio's keys."""
+    if "FISHEYE" in model.upper():
+        return "OPENCV_FISHEYE", (k["k1"], k["k2"], k["k3"], k["k4"])
+    if model.upper() not in {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"}:
+        raise CaptureError(f"{file}: the camera model {model!r} is not supported; undistort to PINHOLE first.")
+    if not any(k.values()):
+        return "PINHOLE", ()
+    if k["k4"]:
+        raise CaptureError(f"{file}: the lens parameter k4 is not supported; undistort the images first.")
+    if k["k3"]:
+        return "FULL_OPENCV", (k["k1"], k["k2"], k["p1"], k["p2"], k["k3"], 0.0, 0.0, 0.0)
+    return "OPENCV", (k["k1"], k["k2"], k["p1"], k["p2"])

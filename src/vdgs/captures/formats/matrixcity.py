@@ -1,0 +1,135 @@
+"""MatrixCity's layout: poses in JSON with OpenGL camera axes, z up, images named 0000.png per block.
+
+Two forms are published. pose/<block>/ holds transforms_train.json and transforms_test.json
+(`transform_matrix`, unit 100 m, file_path relative to the dataset). train/<block>/ and test/<block>_test/
+hold one transforms.json each (`rot_mat`, `frame_index`; unit 1 m, the rotation to be multiplied by 100).
+The capture is the folder pose/<block>, or the one above train/ and test/. The same reader serves other
+transforms_train/transforms_test pairs (Blender): then the world's scale is not known.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from vdgs.captures.capture import Split
+from vdgs.captures.formats.json_poses import OPENGL_FROM_OPENCV, frames_of, intrinsics_of, matrix_of, read_json
+from vdgs.captures.formats.source import KnownWorld, SourceCapture, SourceView, duplicates, listing, rigid
+from vdgs.captures.formats.sparse_points import find_sparse_points
+from vdgs.errors import CaptureError
+from vdgs.settings.capture import CaptureOptions
+
+#: Unit of the pose files in metres.
+POSE_UNIT_M = 100.0
+#: The rotation in per-block files is this times a rotation.
+BLOCK_ROTATION = 0.01
+#: Where a block keeps its images.
+IMAGE_FOLDERS = ("", "rgb", "input", "images")
+CITY = re.compile(r"block|_city|matrix", re.IGNORECASE)
+
+
+def pose_files(root: Path) -> list[tuple[Path, Split]]:
+    """The pose files of the layout with their split; empty if the folder is of another kind."""
+    pair: list[tuple[Path, Split]] = [
+        (root / "transforms_train.json", "train"), (root / "transforms_test.json", "test"),
+    ]  # fmt: skip
+    if pair[0][0].is_file():
+        return [(file, split) for file, split in pair if file.is_file()]
+    blocks: list[tuple[Path, Split]] = [(file, "train") for file in sorted(root.glob("train/*/transforms.json"))]
+    if blocks:
+        return blocks + [(file, "test") for file in sorted(root.glob("test/*/transforms.json"))]
+    return []
+
+
+def read_matrixcity(root: Path, options: CaptureOptions) -> SourceCapture:
+    """The capture in MatrixCity's layout, its world as in the files (z up).
+
+    Points come from points3D.ply in the same world, or from a COLMAP model in sparse/. Raises
+    `CaptureError` for missing images, non-rigid poses and missing points.
+    """
+    files = pose_files(root)
+    views: list[SourceView] = []
+    scales: set[float] = set()
+    for file, split in files:
+        content = read_json(file)
+        for frame in frames_of(content, file):
+            view, scale = _read_frame(root, frame, content, file, split)
+            views.append(view)
+            scales.add(scale)
+    twice = duplicates(view.name for view in views)
+    if twice:
+        raise CaptureError(f"{root}: the same image occurs more than once in the pose files.{listing(twice)}")
+    if len(scales) > 1:
+        raise CaptureError(f"{root}: some poses are in metres and some in units of 100 m. Use one kind of pose file.")
+    poses = {view.name: view.camera_from_world for view in views}
+    points, colours = find_sparse_points(root, poses, "MatrixCity's layout")
+    world = KnownWorld(np.eye(3), 1.0, False, "z is up by the format")
+    if CITY.search(str(root)) or any(CITY.search(view.name) for view in views):
+        unit = scales.pop()
+        world = KnownWorld(np.eye(3), unit, True, f"MatrixCity: z is up, unit {unit:.0f} m")
+    one_split = {view.split for view in views} == {"train"}
+    if one_split:  # no test files: the split is ours to choose
+        views = [SourceView(v.name, v.camera_from_world, v.intrinsics, None, v.image_path) for v in views]
+    return SourceCapture("matrixcity", options.images or "", tuple(views), points, colours, world)
+
+
+def _read_frame(
+    root: Path, frame: dict[str, Any], content: dict[str, Any], file: Path, split: Split
+) -> tuple[SourceView, float]:
+    """A view, and the unit of its world in metres if the file is MatrixCity's."""
+    label = str(frame.get("file_path", frame.get("frame_index", "?")))
+    matrix = matrix_of(frame.get("transform_matrix", frame.get("rot_mat")), file, f"frame {label}")
+    norm = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
+    scaled = abs(norm / BLOCK_ROTATION - 1) < 0.01
+    if scaled:
+        matrix[:3, :3] /= BLOCK_ROTATION
+    name, image = _find_image(root, frame, file, split)
+    pose = np.linalg.inv(rigid(matrix @ OPENGL_FROM_OPENCV, file, f"frame {label}"))
+    common = {key: value for key, value in content.items() if key != "frames"}
+    intrinsics = intrinsics_of(frame, common, image, file)
+    return SourceView(name, pose, intrinsics, split, image), 1.0 if scaled else POSE_UNIT_M
+
+
+def _find_image(root: Path, frame: dict[str, Any], file: Path, split: Split) -> tuple[str, Path]:
+    """Name (as from the dataset's root) and file of a frame's image.
+
+    Published file_paths climb ("../../train/block_1/0000.png"); the climbing is dropped and the rest is
+    looked for beside the pose file, in the capture, and up to three folders above a pose/ folder.
+    """
+    path = frame.get("file_path")
+    if isinstance(path, str):
+        parts = [part for part in PurePosixPath(path.replace("\\", "/")).parts if part not in ("..", ".", "/")]
+    elif isinstance(frame.get("frame_index"), int):
+        folder = [part for part in PurePosixPath(str(frame.get("path", ""))).parts if part not in ("..", ".", "/")]
+        parts = [*folder, f"{frame['frame_index']:04d}.png"]
+    else:
+        raise CaptureError(f"{file}: a frame has neither 'file_path' nor 'frame_index'. Export the file again.")
+    if not parts or any("\0" in part for part in parts):
+        raise CaptureError(f"{file}: a frame names no image ({path!r}). Export the file again.")
+    bases = [file.parent, root]
+    if root.parent.name == "pose":
+        bases += [root.parent.parent, root.parent.parent.parent]
+    tails = [parts, [split, *parts[-2:]], parts[-1:]]
+    for tail in tails:
+        for base in bases:
+            for sub in IMAGE_FOLDERS:
+                candidate = base.joinpath(*tail[:-1], sub, tail[-1])
+                for image in (candidate, candidate.with_name(candidate.name + ".png")):
+                    if image.is_file():
+                        return _name(root, image, split), image
+    raise CaptureError(
+        f"{file}: its image {'/'.join(parts)!r} is not found below {bases[-1]}. Unpack the .tar of each "
+        "block into the "
+        "block's folder."
+    )
+
+
+def _name(root: Path, image: Path, split: Split) -> str:
+    """A name that is unique across blocks: the path below the capture, or split/block/file."""
+    if image.is_relative_to(root):
+        return image.relative_to(root).as_posix()
+    parts = [part for part in image.parts[-3:] if part not in IMAGE_FOLDERS]
+    return "/".join([split, *parts[-2:]])

@@ -1,0 +1,129 @@
+"""Mega-NeRF's layout (Mill 19, UrbanScene3D): train/ and val/ with rgbs/*.jpg and metadata/*.pt.
+
+Each metadata file holds H, W, intrinsics [fx, fy, cx, cy] (pixels) and c2w [3, 4]. The world's axes are down,
+right, back (DRB), moved by `origin_drb` and divided by `pose_scale_factor` from coordinates.pt, which its
+README gives in metres; the camera's axes are NeRF's right, up, back. The `distortion` in the files
+describes the originals: the images are already undistorted.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from vdgs.captures.capture import Split
+from vdgs.captures.formats.json_poses import OPENGL_FROM_OPENCV
+from vdgs.captures.formats.source import (
+    Intrinsics,
+    KnownWorld,
+    SourceCapture,
+    SourceView,
+    check_intrinsics,
+    listing,
+    rigid,
+)
+from vdgs.captures.formats.sparse_points import find_sparse_points
+from vdgs.captures.photographs import find_images
+from vdgs.errors import CaptureError
+from vdgs.settings.capture import CaptureOptions
+
+#: Ground axes (right, forward, up) from DRB axes.
+GROUND_FROM_DRB = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+FOLDERS: tuple[tuple[str, Split], ...] = (("train", "train"), ("val", "test"))
+
+
+def is_mega_nerf(root: Path) -> bool:
+    return (root / "train" / "metadata").is_dir()
+
+
+def read_mega_nerf(root: Path, options: CaptureOptions) -> SourceCapture:
+    """The capture in Mega-NeRF's layout; its world is that of coordinates.pt, in metres, axes DRB.
+
+    Points come from points3D.ply (in the same world) or a COLMAP model in sparse/. `options.images` names
+    another image folder than rgbs. Raises `CaptureError` for missing or damaged files.
+    """
+    file = root / "coordinates.pt"
+    coordinates = _load(file)
+    origin, scale = (
+        _array(coordinates, "origin_drb", (3,), file),
+        float(_array(coordinates, "pose_scale_factor", (), file)),
+    )
+    if not scale > 0:
+        raise CaptureError(f"{file}: pose_scale_factor {scale} must be positive.")
+    images = options.images or "rgbs"
+    views: list[SourceView] = []
+    for folder, split in FOLDERS:
+        views += _read_folder(root, folder, images, split, origin, scale)
+    poses = {view.name: view.camera_from_world for view in views}
+    points, colours = find_sparse_points(root, poses, "Mega-NeRF's layout", _aliases(root, views))
+    world = KnownWorld(GROUND_FROM_DRB, 1.0, True, "Mega-NeRF: x is down, metres by pose_scale_factor")
+    folders = tuple(root / folder / images for folder, _ in FOLDERS)
+    return SourceCapture("mega-nerf", images, tuple(views), points, colours, world, folders)
+
+
+def _read_folder(
+    root: Path, folder: str, images: str, split: Split, origin: np.ndarray, scale: float
+) -> list[SourceView]:
+    metadata = sorted((root / folder / "metadata").glob("*.pt"))
+    present = {Path(name).stem: path for name, path in find_images(root / folder / images).items()}
+    missing = [str(file) for file in metadata if file.stem not in present]
+    if missing:
+        raise CaptureError(
+            f"{root / folder / images}: {len(missing)} images named by metadata are missing. For "
+            "UrbanScene3D, copy "
+            f"the raw photographs as Mega-NeRF's README says.{listing(missing)}"
+        )
+    return [_read_view(file, present[file.stem], folder, split, origin, scale) for file in metadata]
+
+
+def _read_view(file: Path, image: Path, folder: str, split: Split, origin: np.ndarray, scale: float) -> SourceView:
+    content = _load(file)
+    fx, fy, cx, cy = (float(value) for value in _array(content, "intrinsics", (4,), file))
+    width, height = (int(_array(content, key, (), file)) for key in ("W", "H"))
+    world_from_camera = np.eye(4)
+    world_from_camera[:3] = _array(content, "c2w", (3, 4), file)
+    world_from_camera[:3, 3] = world_from_camera[:3, 3] * scale + origin
+    pose = np.linalg.inv(rigid(world_from_camera @ OPENGL_FROM_OPENCV, file, "c2w"))
+    intrinsics = check_intrinsics(Intrinsics("PINHOLE", (fx, fy, cx, cy), width, height), file, image.name)
+    return SourceView(f"{folder}/{image.name}", pose, intrinsics, split, image)
+
+
+def _load(file: Path) -> dict[str, Any]:
+    """A dictionary from a torch file; `weights_only`, so that nothing in it can run."""
+    try:
+        content = torch.load(file, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise CaptureError(f"{file}: no such file; Mega-NeRF's layout needs it.") from None
+    except Exception as error:  # its parsers raise many kinds on damaged files
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CaptureError(f"{file}: cannot be read as a torch file ({first}). Copy it again.") from None
+    if not isinstance(content, dict):
+        raise CaptureError(f"{file}: must hold a dictionary.")
+    return content
+
+
+def _array(content: dict[str, Any], key: str, shape: tuple[int, ...], file: Path) -> np.ndarray:
+    try:
+        array = torch.as_tensor(content[key]).detach().to(torch.float64).numpy().reshape(shape)
+    except (KeyError, TypeError, ValueError, RuntimeError):
+        raise CaptureError(f"{file}: needs {key!r} of shape {list(shape)}. Copy the file again.") from None
+    if not np.isfinite(array).all():
+        raise CaptureError(f"{file}: {key!r} is not a finite number. Copy the file again.")
+    return array
+
+
+def _aliases(root: Path, views: list[SourceView]) -> dict[str, str]:
+    """Original image names to ours, from mappings.txt ("DJI_0001.JPG,000000.pt")."""
+    file = root / "mappings.txt"
+    if not file.is_file():
+        return {}
+    ours = {Path(view.name).stem: view.name for view in views}
+    aliases = {}
+    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
+        original, _, metadata = line.rpartition(",")
+        if original and Path(metadata).stem in ours:
+            aliases[original.strip()] = ours[Path(metadata).stem]
+    return aliases

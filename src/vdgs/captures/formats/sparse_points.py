@@ -1,0 +1,83 @@
+"""Sparse points for formats that bring poses but no points: a PLY file or a COLMAP model beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from vdgs.captures.alignment import fit_similarity_robust, is_collinear
+from vdgs.captures.formats.colmap import count_images, find_models, read_colmap
+from vdgs.captures.formats.ply import read_point_cloud
+from vdgs.errors import CaptureError
+
+#: Names under which a point cloud in the capture's own world is looked for.
+POINT_CLOUDS = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply", "points.ply")
+#: A COLMAP model fits the poses if camera centres agree to this share of their spread (RMS).
+AGREEMENT = 0.02
+
+
+def find_sparse_points(
+    root: Path, poses: Mapping[str, np.ndarray], what: str, aliases: Mapping[str, str] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points [n, 3] float64 in the world of `poses` (camera-from-world by image name) and colours [n, 3]
+    uint8.
+
+    Taken from a PLY file in that world, else from a COLMAP model of the same photographs, which may live
+    in any world: it is brought over by the similarity between the camera centres that both have. `aliases`
+    maps names in the COLMAP model to names in `poses`. Raises `CaptureError` if there is nothing, or
+    nothing that fits.
+    """
+    for name in POINT_CLOUDS:
+        if (root / name).is_file():
+            return read_point_cloud(root / name)
+    models = find_models(root)
+    if not models:
+        raise CaptureError(
+            f"{root}: {what} brings no 3D points, from which the scene starts. Put a point cloud in the "
+            "same world "
+            f"there as {POINT_CLOUDS[0]}, or a COLMAP model of the same photographs as sparse/0 (colmap "
+            "feature_extractor, exhaustive_matcher, then mapper or point_triangulator)."
+        )
+    folder = max(models, key=count_images)
+    model = read_colmap(folder)
+    theirs = {view.name: _centre(view.camera_from_world) for view in model.views}
+    ours = {name: _centre(pose) for name, pose in poses.items()}
+    pairs = _match(list(theirs), list(ours), aliases or {})
+    source = np.array([theirs[a] for a, _ in pairs]).reshape(-1, 3)
+    target = np.array([ours[b] for _, b in pairs]).reshape(-1, 3)
+    if is_collinear(source) or is_collinear(target):
+        raise CaptureError(
+            f"{folder}: shares {len(pairs)} photographs with {what}, too few (or all on one line) to bring "
+            "its "
+            "points into the same world. Image names must agree."
+        )
+    similarity, inliers = fit_similarity_robust(source, target)
+    residual = np.linalg.norm(similarity.apply(source) - target, axis=1)[inliers]
+    spread = float(np.sqrt(target.var(axis=0).sum()))
+    rms = float(np.sqrt((residual**2).mean()))
+    if rms > AGREEMENT * spread or inliers.mean() < 0.5:
+        raise CaptureError(
+            f"{folder}: its camera positions disagree with those of {what} (RMS {rms:.3g} over a spread of "
+            f"{spread:.3g}, {inliers.sum()} of {len(pairs)} agree); it is another reconstruction or naming."
+        )
+    return similarity.apply(model.points), model.colours
+
+
+def _centre(camera_from_world: np.ndarray) -> np.ndarray:
+    return -camera_from_world[:3, :3].T @ camera_from_world[:3, 3]
+
+
+def _match(theirs: list[str], ours: list[str], aliases: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Pairs of names that mean the same photograph: by alias, by full name, else by unique stem."""
+    exact = [(aliases.get(name, name), name) for name in theirs]
+    pairs = [(name, alias) for alias, name in exact if alias in set(ours)]
+    if len(pairs) >= 3:
+        return pairs
+    stems: dict[str, list[str]] = {}
+    for name in ours:
+        stems.setdefault(PurePosixPath(name).stem.lower(), []).append(name)
+    unique = {stem: names[0] for stem, names in stems.items() if len(names) == 1}
+    by_stem = [(name, PurePosixPath(aliases.get(name, name)).stem.lower()) for name in theirs]
+    return [(name, unique[stem]) for name, stem in by_stem if stem in unique]

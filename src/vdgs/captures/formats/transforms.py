@@ -1,0 +1,130 @@
+"""nerfstudio's transforms.json: camera-to-world matrices with OpenGL camera axes (right, up, back).
+
+Poses and the point cloud named by `ply_file_path` live in the same world. Where the file says that this
+world was made from another by `applied_transform` (and `applied_scale`), that is undone: the capture's own
+world is the original one, so that georeferences hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from vdgs.captures.capture import Split
+from vdgs.captures.formats.json_poses import (
+    OPENGL_FROM_OPENCV,
+    frames_of,
+    intrinsics_of,
+    matrix_of,
+    number,
+    read_json,
+)
+from vdgs.captures.formats.ply import read_point_cloud
+from vdgs.captures.formats.source import SourceCapture, SourceView, duplicates, listing, rigid, safe_name
+from vdgs.captures.formats.sparse_points import find_sparse_points
+from vdgs.errors import CaptureError
+from vdgs.settings.capture import CaptureOptions
+
+
+def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
+    """The capture described by `root`/transforms.json.
+
+    Raises `CaptureError` for missing images, non-rigid poses, unsafe names, and where no point cloud is
+    found.
+    """
+    file = root / "transforms.json"
+    content = read_json(file)
+    frames = frames_of(content, file)
+    names = [_name(frame, file) for frame in frames]
+    folder = _common_folder(names)
+    chosen = options.images or folder
+    splits = _splits(content, file)
+    undo = _undo_applied(content, file)
+    views = []
+    for frame, name in zip(frames, names, strict=True):
+        short = name.removeprefix(folder + "/") if folder else name
+        image = _image(root / chosen / short)
+        world_from_camera = matrix_of(frame.get("transform_matrix"), file, f"frame {name!r}") @ OPENGL_FROM_OPENCV
+        pose = np.linalg.inv(undo(rigid(world_from_camera, file, f"frame {name!r}")))
+        intrinsics = intrinsics_of(frame, content, image, file)
+        mask = frame.get("mask_path")
+        mask_path = root / safe_name(str(mask), file) if mask else None
+        views.append(SourceView(short, pose, intrinsics, splits.get(name), image, mask_path))
+    twice = duplicates(view.name for view in views)
+    if twice:
+        raise CaptureError(f"{file}: the same image occurs more than once.{listing(twice)}")
+    points, colours = _points(root, content, file, views)
+    homogeneous = np.tile(np.eye(4), (len(points), 1, 1))
+    homogeneous[:, :3, 3] = points
+    moved = undo(homogeneous)[:, :3, 3]
+    return SourceCapture(
+        "transforms", chosen, tuple(views), moved, colours, image_folders=(root / chosen,) if chosen else ()
+    )
+
+
+def _name(frame: dict[str, Any], file: Path) -> str:
+    path = frame.get("file_path")
+    if not isinstance(path, str):
+        raise CaptureError(f"{file}: a frame has no 'file_path'. Export the file again.")
+    return safe_name(path, file)
+
+
+def _common_folder(names: list[str]) -> str:
+    """The first folder of all names ("images"), or nothing where they differ."""
+    first = {PurePosixPath(name).parts[0] for name in names if len(PurePosixPath(name).parts) > 1}
+    flat = any(len(PurePosixPath(name).parts) == 1 for name in names)
+    return first.pop() if len(first) == 1 and not flat else ""
+
+
+def _image(path: Path) -> Path:
+    """The image itself; file_path may come without its extension, and shrunk folders may hold another."""
+    if path.is_file():
+        return path
+    for suffix in (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG"):
+        for candidate in (path.with_name(path.name + suffix), path.with_suffix(suffix)):
+            if candidate.is_file():
+                return candidate
+    raise CaptureError(f"{path}: no such image, though transforms.json names it. Copy it there, or see --images.")
+
+
+def _splits(content: dict[str, Any], file: Path) -> dict[str, Split]:
+    """Splits by file_path where train_filenames and val_filenames or test_filenames are given."""
+    splits: dict[str, Split] = {}
+    sides: tuple[tuple[str, Split], ...] = (
+        ("train_filenames", "train"), ("val_filenames", "test"), ("test_filenames", "test"),
+    )  # fmt: skip
+    for key, side in sides:
+        names = content.get(key) or []
+        if not isinstance(names, list):
+            raise CaptureError(f"{file}: {key!r} must be a list of names.")
+        splits.update({safe_name(str(name), file): side for name in names})
+    return splits
+
+
+def _undo_applied(content: dict[str, Any], file: Path) -> Callable[[np.ndarray], np.ndarray]:
+    """A function that takes rigid world-from-camera matrices [..., 4, 4] back to the original world."""
+    applied = np.eye(4)
+    if content.get("applied_transform") is not None:
+        applied = rigid(matrix_of(content["applied_transform"], file, "applied_transform"), file, "applied_transform")
+    scale = number(content, "applied_scale", file) or 1.0
+    if not 1e-9 < scale < 1e9:
+        raise CaptureError(f"{file}: applied_scale {scale} must be a positive factor.")
+    original_from_world = np.linalg.inv(applied)
+
+    def undo(world_from_camera: np.ndarray) -> np.ndarray:
+        unscaled = world_from_camera.copy()
+        unscaled[..., :3, 3] /= scale
+        return original_from_world @ unscaled
+
+    return undo
+
+
+def _points(root: Path, content: dict[str, Any], file: Path, views: list[SourceView]) -> tuple[np.ndarray, np.ndarray]:
+    """Points in the world of the file (before `applied_transform` is undone)."""
+    ply = content.get("ply_file_path")
+    if ply is not None:
+        return read_point_cloud(root / safe_name(str(ply), file))
+    return find_sparse_points(root, {view.name: view.camera_from_world for view in views}, "transforms.json")

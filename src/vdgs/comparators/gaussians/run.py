@@ -1,0 +1,195 @@
+"""3DGS (Kerbl et al. 2023) as a comparator: trained, saved and measured like the method itself.
+
+Written from the paper's description, on this project's kernels, captures and evaluation: what differs between two
+figures is the method. The constants that the paper leaves open are those of the authors' published program. Left out
+or different:
+
+- pruning by footprint in the image (section 5.2); the prune by size in the world is there;
+- training stops at the iteration given: rates decay over that length; intervals (degree, decisions, resets) are
+  those of the settings, which `gaussian_schedule.scheduled` gives for another length than the published one;
+- views come in a new random order every epoch that is drawn from the seed, not from a running generator;
+- image formation is that of this project (docs/conventions.md): alpha at most 0.999, near plane at 0.01, extent by
+  opacity, exact gradients;
+- no exposure compensation, depth regularisation or anti-aliasing: later additions to the program, not in the paper.
+
+    OUTPUT/checkpoints/  log.jsonl  status.json  settings.json  model.safetensors
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from rich.console import Console
+
+from vdgs import __version__
+from vdgs.cameras import Camera
+from vdgs.captures.capture import Capture
+from vdgs.captures.checks import check_images
+from vdgs.captures.facts import capture_facts, refuse_another_capture
+from vdgs.captures.images import ImageCache
+from vdgs.comparators.gaussians.model import GaussiansModel
+from vdgs.comparators.gaussians.spherical_harmonics import MAX_DEGREE
+from vdgs.comparators.gaussians.training import GaussiansConfig, GaussiansStage, scene_extent
+from vdgs.comparators.gaussians.watching import continue_or_start, finish, train_watched
+from vdgs.errors import RunError, VdgsError
+from vdgs.evaluation import saving
+from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
+from vdgs.evaluation.lpips import load_lpips
+from vdgs.evaluation.of_run import cached_photographs
+from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.settings.plain import differences, to_dict
+from vdgs.settings.watching import WatchOptions
+from vdgs.storage.files import read_json, write_json
+from vdgs.training import mean_colour
+from vdgs.watching.images import image_budget
+
+#: What metrics.json calls this method.
+NAME = "3dgs"
+
+VisibilityMap = Callable[[Camera], Float[np.ndarray, "h w"]]
+
+
+def run_gaussians(
+    run: RunFolder,
+    capture: Capture,
+    config: GaussiansConfig,
+    console: Console,
+    *,
+    options: WatchOptions | None = None,
+    visibility_map: VisibilityMap | None = None,
+    lpips_weights: Path | None = None,
+) -> dict[str, Any]:
+    """Train (or continue) in RUN/gaussians and measure into RUN/evaluation. Returns what metrics.json holds.
+
+    Raises what `train_gaussians` and `evaluate_gaussians` raise.
+    """
+    folder = run.gaussians
+    with run.locked():
+        model = train_gaussians(capture, config, folder.path, console, options=options)
+        write_json(run.capture_file, capture_facts(capture))
+    return evaluate_gaussians(
+        model, capture, run.evaluation, console,
+        visibility_map=visibility_map, lpips_weights=lpips_weights, trained=folder,
+    )  # fmt: skip
+
+
+def train_gaussians(
+    capture: Capture,
+    config: GaussiansConfig,
+    output: Path,
+    console: Console,
+    *,
+    options: WatchOptions | None = None,
+) -> GaussiansModel:
+    """Train, or continue, 3DGS on the training views of a capture; if it is finished, only read the model.
+
+    Raises VdgsError for settings that do not work, RunError where `output` holds another run, CaptureError for damaged
+    photographs, Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged (last good state kept).
+    """
+    options, folder = options or WatchOptions(), StageFolder(output)
+    options.check()
+    _check(config)
+    with folder.locked():
+        _begin(folder, capture, config)
+        if folder.is_done():
+            console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
+            return GaussiansModel.load(folder.model)
+        check_images(capture)
+        views = capture.train_views
+        factors = tuple(sorted({factor for _, factor in config.resolutions}))
+        with ImageCache(views, image_budget(options), downscales=factors) as images:
+            extent, background = scene_extent([view.camera for view in views]), (0.0, 0.0, 0.0)
+            if config.background == "mean":
+                background = mean_colour(images, len(views), factors[-1])
+            stage = GaussiansStage(config, images, len(views), extent, background)
+            state = continue_or_start(folder, capture, config, console)
+            train_watched(folder, state, stage, options, console)
+        facts = {"capture": capture_facts(capture), "version": __version__, "iterations": state.iteration}
+        model = GaussiansModel(state.gaussians, stage.background, facts)
+        finish(folder, state, model, console)
+        return model
+
+
+def evaluate_gaussians(
+    model: GaussiansModel,
+    capture: Capture,
+    output: Path,
+    console: Console | None = None,
+    *,
+    visibility_map: VisibilityMap | None = None,
+    lpips_weights: Path | None = None,
+    trained: StageFolder | None = None,
+    settings: EvaluationSettings | None = None,
+) -> dict[str, Any]:
+    """Measure a model on the test views; writes the evaluation folder `output` and returns what metrics.json holds.
+
+    `visibility_map(camera)` is V per pixel, drawn with one model for all methods that are compared; without it there
+    are no figures by visibility. `trained` is where the model was trained, for its size, time and memory. Raises
+    RunError without test views or for another capture than the model's.
+    """
+    refuse_another_capture(output, model.facts.get("capture", {}), capture)
+    lpips, note = load_lpips(lpips_weights)
+    measured = MeasuredModel(model.render, visibility_map, _facts(trained))
+    with cached_photographs(capture.test_views) as photographs:
+        result = evaluate(
+            photographs, measured, output, lpips=lpips, lpips_note=note, settings=settings, console=console
+        )
+    result = {**result, "n_gaussians": len(model.gaussians)}
+    saving.write_json(output / "metrics.json", result)
+    return result
+
+
+def _facts(trained: StageFolder | None) -> ModelFacts:
+    if trained is None:
+        return ModelFacts(model=NAME)
+    status = trained.status()
+    return ModelFacts(
+        model=NAME, model_bytes=trained.model.stat().st_size,
+        train_seconds=status.get("seconds"), peak_memory_bytes=status.get("peak_memory_bytes"),
+    )  # fmt: skip
+
+
+def _check(config: GaussiansConfig) -> None:
+    """Raise VdgsError for settings that do not work."""
+    starts = [start for start, _ in config.resolutions]
+    problems = {
+        "iterations must be at least 1": config.iterations >= 1,
+        f"degree must be from 0 to {MAX_DEGREE}": 0 <= config.degree <= MAX_DEGREE,
+        "degree_interval, density.interval and density.reset_interval must be at least 1": min(
+            config.degree_interval, config.density.interval, config.density.reset_interval
+        )
+        >= 1,
+        "initial_opacity and density.reset_opacity must lie between 0 and 1": all(
+            0 < value < 1 for value in (config.initial_opacity, config.density.reset_opacity)
+        ),
+        "resolutions must begin at iteration 0 and ascend": bool(starts)
+        and starts[0] == 0
+        and starts == sorted(starts),
+        "background must be black or mean": config.background in ("black", "mean"),
+        "factors of resolutions must be at least 1": all(factor >= 1 for _, factor in config.resolutions),
+    }
+    wrong = [problem for problem, holds in problems.items() if not holds]
+    if wrong:
+        raise VdgsError("These settings of 3DGS do not work:\n  " + "\n  ".join(wrong))
+
+
+def _begin(folder: StageFolder, capture: Capture, config: GaussiansConfig) -> None:
+    """Note settings and capture of a new run, or refuse others than those of the run that is there."""
+    file = folder.path / "settings.json"
+    if not file.exists():
+        write_json(file, {"method": NAME, "settings": to_dict(config), "capture": capture_facts(capture)})
+        return
+    known = read_json(file)
+    if not isinstance(known, dict) or known.get("method") != NAME or not isinstance(known.get("settings"), dict):
+        raise RunError(f"{file}: is damaged or of another method. Choose another output folder.")
+    refuse_another_capture(file, known.get("capture") or {}, capture)
+    changed = differences(known["settings"], to_dict(config))
+    if changed:
+        raise RunError(
+            f"{file}: this run was started with other settings:\n  " + "\n  ".join(changed)
+            + "\nGive the old settings to continue it, or another output folder."
+        )  # fmt: skip

@@ -1,0 +1,36 @@
+"""The published schedule of 3DGS for another number of iterations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from vdgs.comparators.gaussians.training import GaussiansConfig
+
+#: What the schedule was published for (3DGS section 7.1).
+PUBLISHED_ITERATIONS = 30_000
+#: No interval between two decisions about density or two resets becomes shorter than the published one between
+#: decisions (choice): decisions on fewer views make several times as many Gaussians and a worse scene, and opacities
+#: must come back after a reset.
+LEAST_INTERVAL = 100
+
+
+def scheduled(iterations: int, config: GaussiansConfig | None = None, max_gaussians: int = 0) -> GaussiansConfig:
+    """`config` (default: as published) for so many iterations: warm-up, degree of colour, start and interval of density
+    control and resets of opacity move in proportion, as rates and the end of density control do anyway. Trained as
+    published for a fifth of the time, 3DGS would reset its opacities too late, and use colours that depend on the
+    direction for a part of it only. At most `max_gaussians`; 0 for no limit."""
+    config = config or GaussiansConfig()
+    scale, density = iterations / PUBLISHED_ITERATIONS, config.density
+    return replace(
+        config,
+        iterations=iterations,
+        resolutions=tuple((round(scale * start), factor) for start, factor in config.resolutions),
+        degree_interval=max(1, round(scale * config.degree_interval)),
+        density=replace(
+            density,
+            start=round(scale * density.start),
+            interval=max(LEAST_INTERVAL, round(scale * density.interval)),
+            reset_interval=max(LEAST_INTERVAL, round(scale * density.reset_interval)),
+            max_gaussians=max_gaussians,
+        ),
+    )

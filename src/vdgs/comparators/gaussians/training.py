@@ -1,0 +1,289 @@
+"""The training loop of 3DGS. As in `vdgs.training`, state is explicit and everything random is drawn from (seed,
+iteration): a run that is stopped and continued is the run that was not, bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from vdgs.cameras import Camera
+from vdgs.comparators.gaussians.density import DensityConfig, control_density, reset_logits
+from vdgs.comparators.gaussians.model import Gaussians, draw_gaussians, visible_rows
+from vdgs.errors import TrainingDiverged
+from vdgs.kernels import native as kernels
+from vdgs.storage.checkpoints import SavedState
+from vdgs.training import PSNR_INTERVAL, TrainingImages, view_at
+from vdgs.training.optimiser import Moments, rebuild
+from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
+
+
+@dataclass(frozen=True)
+class GaussianRates:
+    """Learning rates of Adam (values: the authors' program; section 5.1 of 3DGS names the schedule)."""
+
+    means: tuple[float, float] = (1.6e-4, 1.6e-6)
+    """Means, times the extent of the scene; decays exponentially from the first to the second value (section 5.1)."""
+    dc: float = 0.0025
+    """Constant colour."""
+    rest: float = 0.0025 / 20
+    """The other coefficients of colour."""
+    logits: float = 0.05
+    """Opacities before the sigmoid."""
+    log_scales: float = 0.005
+    """Logarithms of the scales."""
+    quaternions: float = 0.001
+    """Rotations."""
+
+
+@dataclass(frozen=True)
+class GaussiansConfig:
+    """3DGS (Kerbl et al. 2023). Sections are those of its paper; "program": the authors' published program."""
+
+    iterations: int = 30_000
+    """Number of steps, one photograph each (section 7.1)."""
+    seed: int = 0
+    """Everything random follows from it: on the CPU the same seed gives the same bits."""
+    resolutions: tuple[tuple[int, int], ...] = ((0, 4), (250, 2), (500, 1))
+    """From this iteration on, images are shrunk by this factor (section 7.1, "warm-up")."""
+    degree: int = 3
+    """Degree of the spherical harmonics (section 7.1: four bands)."""
+    degree_interval: int = 1000
+    """The degree starts at 0 and rises by one after so many iterations (section 7.1)."""
+    initial_opacity: float = 0.1
+    """Opacity of the Gaussians at the start (program)."""
+    ssim_weight: float = 0.2
+    """lambda: loss = (1 - lambda) L1 + lambda (1 - SSIM) (eq. 7)."""
+    background: Literal["black", "mean"] = "black"
+    """Colour behind the scene (program: black). `mean` is that of the training photographs, as this project's own
+    method has it: to tell what the method gains from what its background does (choice)."""
+    rates: GaussianRates = field(default_factory=GaussianRates)
+    """Learning rates."""
+    density: DensityConfig = field(default_factory=DensityConfig)
+    """Where Gaussians are added and removed."""
+
+
+@dataclass(frozen=True)
+class GaussiansStage:
+    """What training works on: the same for all iterations."""
+
+    config: GaussiansConfig
+    images: TrainingImages
+    image_count: int
+    #: Size of the scene in units of the ground frame (`scene_extent`).
+    extent: float
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass
+class GaussiansState:
+    """All that changes during training. `iteration` steps have been made."""
+
+    iteration: int
+    gaussians: Gaussians
+    moments: Moments
+    #: Since the last decision: sum of the norms of dL/d(mean) in NDC, and in how many views each was visible, [n].
+    gradient: Tensor
+    views: Tensor
+    #: Smoothed loss and PSNR of training views.
+    loss: float = math.nan
+    psnr: float = math.nan
+    seconds: float = 0.0
+    peak_memory_bytes: int = 0
+    #: False while a step changes tensors: one that is broken off there leaves no state that may be saved.
+    whole: bool = True
+    #: Zeros between steps, in the shape of each tensor of the Gaussians: where gradients are put. Not saved.
+    room: dict[str, Tensor] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class GaussiansReport:
+    """What one step did, for the log."""
+
+    loss: float
+    l1: float
+    ssim: float
+    visible: int
+    cloned: int | None = None
+    split: int | None = None
+    pruned: int | None = None
+
+
+def scene_extent(cameras: list[Camera]) -> float:
+    """Radius of the cameras about their mean, times 1.1 (program); at least a tiny number."""
+    centres = np.array([camera.position for camera in cameras])
+    return max(1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()), 1e-6)
+
+
+def start_state(gaussians: Gaussians) -> GaussiansState:
+    """A state before the first step. The tensors are moved in place: give copies of what must stay."""
+    n = len(gaussians)
+    return GaussiansState(0, gaussians, Moments.zeros(gaussians.tensors()), torch.zeros(n), torch.zeros(n))
+
+
+def degree_at(iteration: int, config: GaussiansConfig) -> int:
+    """Degree of the spherical harmonics at this iteration (from 0)."""
+    return min(iteration // config.degree_interval, config.degree)
+
+
+def downscale_at(iteration: int, config: GaussiansConfig) -> int:
+    """Factor by which images are shrunk at this iteration (from 0)."""
+    return [factor for start, factor in config.resolutions if iteration >= start][-1]
+
+
+def rates_at(config: GaussiansConfig, extent: float, iteration: int) -> dict[str, float]:
+    """Learning rate of each tensor of `Gaussians` at this iteration (from 0)."""
+    first, last = config.rates.means
+    means = extent * first * (last / first) ** (iteration / config.iterations)
+    return {name: getattr(config.rates, name) for name in Gaussians.__dataclass_fields__} | {"means": means}
+
+
+def train_step(state: GaussiansState, stage: GaussiansStage) -> GaussiansReport:
+    """One step: render a training view, compare, move all Gaussians, count, perhaps clone, split and prune.
+
+    Changes `state` in place. Raises TrainingDiverged if the loss or a gradient is not finite.
+    """
+    config, iteration = stage.config, state.iteration
+    downscale, degree = downscale_at(iteration, config), degree_at(iteration, config)
+    view = view_at(iteration, stage.image_count, config.seed)
+    target, mask = stage.images.get(view, downscale)
+    camera = stage.images.camera(view, downscale)
+
+    rows = visible_rows(state.gaussians, camera)
+    seen = {name: t.index_select(0, rows).requires_grad_() for name, t in state.gaussians.tensors().items()}
+    raster, means_px = draw_gaussians(Gaussians(**seen), camera, torch.tensor(stage.background), degree)
+    found = kernels.photometric_loss(raster.image, target, mask, ssim_weight=config.ssim_weight)
+    value = float(found.loss.detach())
+    if not math.isfinite(value):
+        raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
+    *gradients, of_means_px = torch.autograd.grad(found.loss, [*seen.values(), means_px], materialize_grads=True)
+    psnr = psnr_of(raster.image.detach(), target, mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
+    _make_room(state)
+    state.whole = False
+    _move(state, rows, dict(zip(seen, gradients, strict=True)), rates_at(config, stage.extent, iteration), degree)
+    state.iteration += 1
+
+    report = GaussiansReport(value, float(found.l1), float(found.ssim), len(rows))
+    if state.iteration <= config.density.until * config.iterations:
+        _count(state, rows, of_means_px, camera)
+        report = replace(report, **_control(state, stage))
+    _smooth(state, value, psnr)
+    state.whole = True
+    return report
+
+
+def _make_room(state: GaussiansState) -> None:
+    """Room for gradients, where growth has taken it away: before anything moves, since it is large."""
+    for name, tensor in state.gaussians.tensors().items():
+        if name not in state.room:
+            state.room[name] = torch.zeros_like(tensor)
+
+
+def _move(
+    state: GaussiansState, rows: Int64[Tensor, " v"], gradients: dict[str, Tensor], rates: dict[str, float], degree: int
+) -> None:
+    """One step of Adam for all Gaussians: those that the view does not show move on by their moments (program)."""
+    finite = True
+    for name, tensor in state.gaussians.tensors().items():
+        if name == "rest" and not degree:
+            continue  # gradients and moments are zero: nothing moves
+        everywhere = state.room[name].index_copy_(0, rows, gradients[name])
+        finite &= kernels.adam_rows(
+            tensor, None, everywhere, state.moments.first[name], state.moments.second[name],
+            learning_rate=rates[name], step=state.iteration + 1,
+        )  # fmt: skip
+        everywhere.index_fill_(0, rows, 0.0)
+    if not finite:
+        raise TrainingDiverged(f"A gradient is not a finite number at iteration {state.iteration + 1}.")
+
+
+def _count(state: GaussiansState, rows: Int64[Tensor, " v"], of_px: Float[Tensor, "v 2"], camera: Camera) -> None:
+    """Add the norms of the gradients of the means, in NDC: these run over [-1, 1] across the image."""
+    state.gradient[rows] += torch.hypot(of_px[:, 0] * (camera.width / 2), of_px[:, 1] * (camera.height / 2))
+    state.views[rows] += 1
+
+
+def _control(state: GaussiansState, stage: GaussiansStage) -> dict[str, Any]:
+    """Clone, split and prune, and reset opacities, where it is time. Returns what GaussiansReport says of it."""
+    config, done = stage.config.density, state.iteration
+    facts: dict[str, Any] = {}
+    if done > config.start and done % config.interval == 0:
+        generator = torch.Generator().manual_seed(stage.config.seed * 1_000_003 + done)
+        change = control_density(
+            state.gaussians, state.gradient / state.views.clamp(min=1), stage.extent, config, generator,
+            prune_large=done > config.reset_interval,
+        )  # fmt: skip
+        _apply(state, change.added, change.kept)
+        facts = {"cloned": change.cloned, "split": change.split, "pruned": change.pruned}
+    if done % config.reset_interval == 0:
+        state.gaussians.logits.copy_(reset_logits(state.gaussians.logits, config.reset_opacity))
+        state.moments.first["logits"].zero_()
+        state.moments.second["logits"].zero_()
+    return facts
+
+
+def _apply(state: GaussiansState, added: Gaussians, kept: Tensor) -> None:
+    """Append Gaussians without moments, then keep some of all; the statistics begin again."""
+    state.room = {}
+    tensors, state.gaussians = state.gaussians.tensors(), added
+    rebuild(tensors, added.tensors(), kept)
+    state.gaussians = Gaussians(**tensors)
+    state.moments.rebuild(len(added), kept)
+    state.gradient, state.views = torch.zeros(len(state.gaussians)), torch.zeros(len(state.gaussians))
+
+
+def _smooth(state: GaussiansState, loss: float, psnr: float | None) -> None:
+    state.loss = smoothed(state.loss, loss, KEEP_LOSS)
+    if psnr is not None:
+        state.psnr = smoothed(state.psnr, psnr, KEEP_PSNR)
+
+
+def train(
+    state: GaussiansState,
+    stage: GaussiansStage,
+    *,
+    stop: Callable[[], bool],
+    after_step: Callable[[GaussiansState, GaussiansReport], None],
+    prefetch: int = 4,
+) -> bool:
+    """Steps until the last iteration or until `stop()` is true. True if complete. `after_step` sees every step."""
+    config = stage.config
+    while state.iteration < config.iterations:
+        if stop():
+            return False
+        for ahead in range(state.iteration + 1, min(state.iteration + 1 + prefetch, config.iterations)):
+            stage.images.prefetch([view_at(ahead, stage.image_count, config.seed)], downscale_at(ahead, config))
+        report = train_step(state, stage)
+        after_step(state, report)
+    return True
+
+
+def to_saved(state: GaussiansState) -> SavedState:
+    """The whole state as tensors and facts."""
+    tensors = {f"gaussians.{name}": tensor for name, tensor in state.gaussians.tensors().items()}
+    tensors |= {f"first.{name}": tensor for name, tensor in state.moments.first.items()}
+    tensors |= {f"second.{name}": tensor for name, tensor in state.moments.second.items()}
+    tensors |= {"gradient": state.gradient, "views": state.views}
+    facts = {"loss": repr(state.loss), "psnr": repr(state.psnr), "seconds": state.seconds,
+             "peak_memory_bytes": state.peak_memory_bytes}  # fmt: skip
+    return SavedState(state.iteration, facts, tensors)
+
+
+def from_saved(saved: SavedState) -> GaussiansState:
+    """The inverse of `to_saved`, bit for bit. Raises KeyError or TypeError if something is missing."""
+
+    def part(prefix: str) -> dict[str, Tensor]:
+        return {k.removeprefix(prefix): v for k, v in saved.tensors.items() if k.startswith(prefix)}
+
+    return GaussiansState(
+        saved.iteration, Gaussians(**part("gaussians.")), Moments(part("first."), part("second.")),
+        saved.tensors["gradient"], saved.tensors["views"], float(saved.facts["loss"]), float(saved.facts["psnr"]),
+        float(saved.facts["seconds"]), int(saved.facts["peak_memory_bytes"]),
+    )  # fmt: skip

@@ -1,0 +1,137 @@
+"""3DGS in training under the eyes of a person: shown, logged, saved, stopped and continued.
+
+The twin of `vdgs.watching.anchors`, for another kind of state.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rich.console import Console
+
+from vdgs.captures.capture import Capture
+from vdgs.comparators.gaussians.model import GaussiansModel, initial_gaussians
+from vdgs.comparators.gaussians.training import (
+    GaussiansConfig,
+    GaussiansReport,
+    GaussiansStage,
+    GaussiansState,
+    degree_at,
+    downscale_at,
+    from_saved,
+    start_state,
+    to_saved,
+    train,
+)
+from vdgs.runs.folder import StageFolder
+from vdgs.settings.watching import WatchOptions
+from vdgs.storage.checkpoints import save_state
+from vdgs.watching.progress import LOG_INTERVAL, PLAIN_SECONDS
+from vdgs.watching.watch import Keeper, Watched, restore_or_start, watch
+
+
+def continue_or_start(
+    folder: StageFolder, capture: Capture, config: GaussiansConfig, console: Console
+) -> GaussiansState:
+    """The newest whole state in the folder, or a new one; the log ends where the state does.
+
+    Raises RunError for a state that this version cannot read.
+    """
+
+    def start() -> GaussiansState:
+        points, colours = capture.points, capture.point_colours
+        return start_state(initial_gaussians(points, colours, config.initial_opacity, config.degree))
+
+    return restore_or_start(folder, config.iterations, start, from_saved, "Choose another output folder.", console)
+
+
+def train_watched(
+    folder: StageFolder, state: GaussiansState, stage: GaussiansStage, options: WatchOptions, console: Console
+) -> None:
+    """Train to the end, showing, logging and saving on the way. Raises what `watch` raises."""
+    journal = _Journal(folder, stage.config, console)
+    training = Watched(
+        folder, state,
+        to_saved=lambda: to_saved(state),
+        facts=lambda: journal.facts(state),
+        size=lambda: f"{len(state.gaussians):,} Gaussians",
+        after_divergence="",
+        save_memory=lambda: "Set density.max_gaussians or use smaller photographs, in another output folder.",
+        whole=lambda: state.whole,
+    )  # fmt: skip
+
+    def loop(stop: Callable[[], bool]) -> bool:
+        keeper = Keeper(training, options.save_every)
+
+        def after_step(state: GaussiansState, report: GaussiansReport) -> None:
+            keeper.tick()
+            journal.step(state, report)
+            keeper.keep(training.facts)
+
+        return train(state, stage, stop=stop, after_step=after_step)
+
+    watch(training, loop)
+
+
+class _Journal:
+    """log.jsonl and a line now and then."""
+
+    def __init__(self, folder: StageFolder, config: GaussiansConfig, console: Console):
+        self._folder, self._config, self._console = folder, config, console
+        self._shown = time.monotonic()
+
+    def step(self, state: GaussiansState, report: GaussiansReport) -> None:
+        """Log and show one step."""
+        if state.iteration % LOG_INTERVAL == 0 or report.cloned is not None:
+            self._log(state, report)
+        if time.monotonic() - self._shown > PLAIN_SECONDS:
+            self._shown = time.monotonic()
+            self._console.print(
+                f"{state.iteration}/{self._config.iterations}  loss {state.loss:.4f}  PSNR {state.psnr:.2f} dB  "
+                f"{len(state.gaussians):,} Gaussians",
+                highlight=False,
+            )
+
+    def facts(self, state: GaussiansState) -> dict[str, Any]:
+        """Where training stands, for status.json."""
+        return {
+            "iteration": state.iteration, "iterations": self._config.iterations, "gaussians": len(state.gaussians),
+            "psnr_training": _number(state.psnr), "seconds": round(state.seconds, 1),
+            "peak_memory_bytes": state.peak_memory_bytes,
+        }  # fmt: skip
+
+    def _log(self, state: GaussiansState, report: GaussiansReport) -> None:
+        done = state.iteration - 1
+        record = {
+            "iteration": state.iteration, "loss": report.loss, "l1": report.l1, "ssim": report.ssim,
+            "psnr_smoothed": _number(state.psnr), "gaussians": len(state.gaussians), "visible": report.visible,
+            "downscale": downscale_at(done, self._config), "degree": degree_at(done, self._config),
+            "cloned": report.cloned, "split": report.split, "pruned": report.pruned,
+            "seconds": round(state.seconds, 3),
+        }  # fmt: skip
+        with self._folder.log.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(record) + "\n")
+
+
+def finish(folder: StageFolder, state: GaussiansState, model: GaussiansModel, console: Console) -> None:
+    """Save the model of a run that is complete, mark it done and say so."""
+    save_state(folder.checkpoints, to_saved(state))
+    model.save(folder.model)
+    folder.set_status(
+        "done", iteration=state.iteration, iterations=state.iteration, gaussians=len(state.gaussians),
+        seconds=state.seconds, psnr_training=_number(state.psnr), peak_memory_bytes=state.peak_memory_bytes,
+    )  # fmt: skip
+    console.print(
+        f"trained {state.iteration} iterations in {state.seconds:.0f} s: {len(state.gaussians):,} Gaussians, PSNR of "
+        f"training views {state.psnr:.2f} dB, peak memory {state.peak_memory_bytes / 1e9:.1f} GB\n"
+        f"model: {folder.model}",
+        highlight=False,
+    )
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value

@@ -1,0 +1,24 @@
+"""One line of the report of `vdgs doctor`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+State = Literal["ok", "note", "missing", "broken"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the report. Only an essential check that is missing or broken makes the exit code 1."""
+
+    name: str
+    state: State
+    value: str
+    #: What to do, empty where nothing need be done.
+    remedy: str = ""
+    essential: bool = False
+
+    @property
+    def works(self) -> bool:
+        return not (self.essential and self.state in ("missing", "broken"))

@@ -1,0 +1,45 @@
+"""How all figures look: ink, thin axes, titles, the colours of visibility."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+INK, FAINT, ACCENT = "#22262b", "#6c757d", "#c1121f"
+#: From hardly seen (alarming) to seen often (calm); dark enough everywhere to stand on white.
+SEEN = LinearSegmentedColormap.from_list(
+    "seen", ["#9d0208", "#dc2f02", "#f48c06", "#e9c46a", "#8ab17d", "#2a9d8f", "#1f6f8b", "#14395b"]
+)
+DPI = 120
+
+
+def titles(figure: Figure, name: str, facts: str, note: str) -> None:
+    """Three lines in the upper left corner, above 1.1 inches of free space."""
+    width, height = figure.get_size_inches()
+    figure.text(0.85 / width, 1 - 0.38 / height, name, fontsize=14, fontweight="bold", color=INK)
+    figure.text(0.85 / width, 1 - 0.68 / height, facts, fontsize=10, color=FAINT)
+    figure.text(0.85 / width, 1 - 1.0 / height, note, fontsize=9, color=FAINT)
+
+
+def placer(figure: Figure) -> Callable[[float, float, float, float], Axes]:
+    """Places axes by left, bottom, width, height in inches."""
+    width, height = figure.get_size_inches()
+
+    def place(left: float, bottom: float, across: float, up: float) -> Axes:
+        return figure.add_axes((left / width, bottom / height, across / width, up / height))
+
+    return place
+
+
+def plain(axes: Axes) -> None:
+    """Thin ink: no box, faint ticks."""
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(FAINT)
+    axes.tick_params(colors=FAINT, labelcolor=INK, labelsize=9)
+    axes.xaxis.label.set_color(INK)
+    axes.yaxis.label.set_color(INK)

@@ -1,0 +1,1 @@
+"""`vdgs inspect`: what a capture holds and how well its photographs cover the place."""

@@ -1,0 +1,87 @@
+"""A capture looked at before anyone trains: numbers as a table and as report.json, and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from vdgs.cameras import Camera
+from vdgs.captures.capture import Capture
+from vdgs.figures.sampling import sample_points
+from vdgs.inspection.figures import draw_map, draw_visibility
+from vdgs.inspection.measure import CaptureReport, length, measure
+from vdgs.model.visibility import visibility_of
+from vdgs.storage.files import write_json
+
+#: Points looked at when there are more, and fewer where there are many cameras.
+MOST_POINTS = 200_000
+LEAST_POINTS = 20_000
+MOST_PROJECTIONS = 2e8
+
+
+def inspect_capture(capture: Capture, output: Path) -> CaptureReport:
+    """Measure the capture; write report.json and two figures into the folder `output` (made if absent)."""
+    output.mkdir(parents=True, exist_ok=True)
+    few_enough = int(np.clip(MOST_PROJECTIONS / len(capture.train_views), LEAST_POINTS, MOST_POINTS))
+    points = sample_points(capture.points, few_enough)
+    visibility = _visibility(points, [view.camera for view in capture.train_views])
+    report = measure(capture, points, visibility)
+    figures = [output / "visibility_map.png", output / "visibility.png"]
+    draw_map(capture, report, points, visibility, figures[0])
+    draw_visibility(report, visibility, figures[1])
+    report = replace(report, figures=[file.name for file in figures])
+    write_json(output / "report.json", asdict(report))
+    return report
+
+
+def _visibility(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """V of points [n, 3], int64 [n]."""
+    return visibility_of(torch.from_numpy(np.ascontiguousarray(points)), cameras).numpy().astype(np.int64)
+
+
+def print_report(report: CaptureReport, console: Console | None = None) -> None:
+    """The report as a table for people."""
+    console = console or Console()
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column()
+    for label, value in _rows(report):
+        table.add_row(label, value)
+    console.print(table)
+    for warning in report.warnings:
+        console.print(f"[yellow]Warning:[/] {warning}", highlight=False)
+
+
+def _rows(report: CaptureReport) -> list[tuple[str, str]]:
+    unit = report.unit
+    sizes = ", ".join(f"{width} x {height}" for width, height in report.image_sizes[:3])
+    more = len(report.image_sizes) - 3
+    quantiles = ", ".join(f"{value:g} ({q} %)" for q, value in report.visibility_quantiles.items())
+    below = ", ".join(f"{share:.1%} by < {limit}" for limit, share in report.share_below.items())
+    low, middle, high = report.camera_height
+    rows = [
+        ("Photographs", f"{report.photographs} ({report.train} train, {report.test} test), {report.source}"),
+        (
+            "Images",
+            f"{report.images or '.'}/: {sizes}" + (f" and {more} more sizes" if more > 0 else "") + " px",
+        ),
+        ("Focal length", f"{report.focal_px:.1f} px ({report.field_of_view_deg:.0f}° across)"),
+        ("Sparse points", f"{report.points}, median spacing {length(report.point_spacing, unit)}"),
+        ("Ground frame", report.ground + ("" if report.metric else " (not metric)")),
+        ("Extent", " x ".join(f"{value:.4g}" for value in report.extent) + f" {unit} (1-99 % of the points)"),
+        ("Camera height", f"{middle:.4g} {unit} (from {low:.4g} to {high:.4g}), tilt {report.tilt_deg:.1f}°"),
+        ("Ground sample distance", f"{length(report.ground_sample_distance, unit)} per pixel"),
+        ("Cameras per point V", quantiles),
+        ("Poorly seen points", f"{below} cameras; Gini {report.visibility_gini:.2f}"),
+        ("Images in memory", f"{report.image_bytes / 2**20:.0f} MiB"),
+    ]
+    if report.origin_geo is not None:
+        latitude, longitude, altitude = report.origin_geo
+        rows.insert(5, ("Origin", f"{latitude:.7f}, {longitude:.7f}, {altitude:.1f} m"))
+    return rows

@@ -1,0 +1,124 @@
+"""The anchor model: points that carry features, from which Gaussians are decoded per view.
+
+Dimensions: n anchors, k offsets per anchor, 32 features. Positions are float32 in the ground frame.
+Equations: Scaffold-GS eqs. 3-8; VDGS section III-B.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vdgs.errors import VdgsError
+from vdgs.kernels.types import FEATURE_SIZE
+from vdgs.model.anchors import TRAINED, Anchors
+from vdgs.model.decoder import Decoder
+from vdgs.storage.files import write_atomically
+from vdgs.storage.tensors import REBUILD, checksum, read_tensors, write_tensors
+
+FORMAT = "vdgs-anchors-1"
+#: Of a model whose blocks have decoders of their own: a reader that knows of one decoder must not take it.
+FORMAT_OF_PARTS = "vdgs-anchors-2"
+
+
+@dataclass(frozen=True)
+class Part:
+    """So many anchors of a model, one after another, and the decoder that they share."""
+
+    count: int
+    decoder: Decoder
+
+
+@dataclass(frozen=True)
+class AnchorModel:
+    """A scene: anchors, what decodes them, and what is needed to use them again."""
+
+    anchors: Anchors
+    #: That of all anchors, or of the coarse stage where blocks have their own (`parts`).
+    decoder: Decoder
+    #: Edge of the voxel grid on which the anchors started, in units of the ground frame.
+    voxel: float
+    #: Colour drawn where nothing is, RGB in [0, 1].
+    background: tuple[float, float, float]
+    #: JSON-able facts that travel with the file: ground frame, capture, version.
+    facts: Mapping[str, Any]
+    #: A merged scene whose blocks trained decoders of their own: all anchors, block by block. Else empty.
+    parts: tuple[Part, ...] = ()
+
+    def spans(self) -> list[tuple[int, int, Decoder]]:
+        """Which rows of the anchors each decoder decodes: first, one past the last, decoder; ascending."""
+        bounds = np.cumsum([0, *(part.count for part in self.parts)]).tolist()
+        spans = [(a, b, part.decoder) for (a, b), part in zip(pairwise(bounds), self.parts, strict=True)]
+        return spans or [(0, len(self.anchors), self.decoder)]
+
+    def save(self, path: Path) -> None:
+        """Write one safetensors file, atomically."""
+        tensors = {f"anchors.{k}": v for k, v in self.anchors.tensors().items()}
+        for prefix, decoder in self._decoders():
+            tensors |= {prefix + name: tensor for name, tensor in decoder.tensors().items()}
+        facts: dict[str, Any] = {
+            "voxel": self.voxel, "background": self.background, "facts": dict(self.facts), "crc32": checksum(tensors),
+        }  # fmt: skip
+        if self.parts:
+            facts["parts"] = [part.count for part in self.parts]
+        # A single key: several would be written in an order that varies.
+        header = {FORMAT_OF_PARTS if self.parts else FORMAT: json.dumps(facts)}
+        write_atomically(path, lambda temporary: write_tensors(temporary, tensors, header))
+
+    @staticmethod
+    def load(path: Path) -> AnchorModel:
+        """Read a model. Raises VdgsError if the file is missing, damaged or not an anchor model."""
+        tensors, header = read_tensors(path)
+        found = next((name for name in (FORMAT, FORMAT_OF_PARTS) if name in header), None)
+        if found is None:
+            raise VdgsError(f"{path}: is not a vdgs anchor model (its header has no {FORMAT!r})")
+        try:
+            anchors = Anchors(**{n: tensors[f"anchors.{n}"] for n in ("positions", *TRAINED)})
+            known = json.loads(header[found])
+            decoder = _decoder_of(tensors, "decoder.")
+            counts = known["parts"] if found == FORMAT_OF_PARTS else []
+            parts = tuple(Part(int(n), _decoder_of(tensors, f"part.{i}.")) for i, n in enumerate(counts))
+            if known["crc32"] != checksum(tensors):
+                raise ValueError("its checksum does not agree")
+            red, green, blue = (float(value) for value in known["background"])
+            model = AnchorModel(anchors, decoder, float(known["voxel"]), (red, green, blue), known["facts"], parts)
+            model.check()
+        except (KeyError, ValueError, TypeError) as error:
+            raise VdgsError(f"{path}: is damaged or incomplete ({error}). {REBUILD}") from error
+        return model
+
+    def check(self) -> None:
+        """Raise ValueError unless shapes and types agree with each other and all numbers are finite."""
+        n, k = len(self.anchors), self.anchors.offsets.shape[1] if self.anchors.offsets.ndim == 3 else 0
+        shapes = {
+            "positions": (n, 3),
+            "features": (n, FEATURE_SIZE),
+            "offsets": (n, k, 3),
+            "log_scales": (n, 6),
+        }
+        for name, shape in shapes.items():
+            tensor = getattr(self.anchors, name)
+            if tuple(tensor.shape) != shape or tensor.dtype != torch.float32:
+                raise ValueError(f"{name} is {tensor.dtype} {tuple(tensor.shape)}, not float32 {shape}")
+            if not bool(torch.isfinite(tensor).all()):
+                raise ValueError(f"{name} holds numbers that are not finite")
+        for _, decoder in self._decoders():
+            decoder.check(k)
+        if self.parts and sum(part.count for part in self.parts) != n:
+            raise ValueError(f"its parts hold {sum(part.count for part in self.parts)} anchors, not {n}")
+
+    def _decoders(self) -> list[tuple[str, Decoder]]:
+        """Every decoder with what the names of its tensors begin with in a file."""
+        return [("decoder.", self.decoder)] + [(f"part.{i}.", part.decoder) for i, part in enumerate(self.parts)]
+
+
+def _decoder_of(tensors: Mapping[str, Tensor], prefix: str) -> Decoder:
+    return Decoder.from_tensors({n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)})

@@ -1,0 +1,39 @@
+"""What each anchor holds: place, feature, offsets, scales (Scaffold-GS section 3.2).
+
+Dimensions: n anchors, k offsets per anchor, 32 features. Positions are float32 in the ground frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+#: The tensors of an anchor that training moves, in the order in which they are saved.
+TRAINED = ("features", "offsets", "log_scales")
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """What each anchor holds. All tensors are float32 and share their first dimension."""
+
+    positions: Float[Tensor, "n 3"]
+    features: Float[Tensor, "n 32"]
+    offsets: Float[Tensor, "n k 3"]
+    log_scales: Float[Tensor, "n 6"]
+
+    def __len__(self) -> int:
+        return self.positions.shape[0]
+
+    def tensors(self) -> dict[str, Tensor]:
+        return {name: getattr(self, name) for name in ("positions", *TRAINED)}
+
+    def select(self, rows: Tensor) -> Anchors:
+        """The anchors of the given rows (indices or mask)."""
+        return Anchors(**{name: tensor[rows] for name, tensor in self.tensors().items()})
+
+    def extended(self, more: Anchors) -> Anchors:
+        """These anchors followed by others."""
+        return Anchors(**{name: torch.cat([a, more.tensors()[name]]) for name, a in self.tensors().items()})

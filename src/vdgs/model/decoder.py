@@ -1,0 +1,95 @@
+"""The decoder of all anchors, or of those of a block: three small MLPs (Scaffold-GS eqs. 5-8), and appearance.
+
+Each head has one hidden layer of 32 with ReLU. Inputs: the anchor's feature [32], the unit direction from the
+camera to the anchor [3] and, on request, their distance. An appearance embedding enters the colour head only;
+because it is the same for all anchors of a view, it amounts to a shift of the head's first bias.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vdgs.kernels.types import FEATURE_SIZE, HIDDEN_SIZE, DecoderWeights, HeadWeights
+
+HEADS = {"opacity": 1, "covariance": 7, "colour": 3}  # outputs per offset
+PARTS = ("w1", "b1", "w2", "b2")
+
+
+@dataclass(frozen=True)
+class Decoder:
+    """The parameters of the three heads and, optionally, of the appearance embedding."""
+
+    weights: DecoderWeights
+    #: One row per training image, and its map to the colour head's hidden layer; None without appearance.
+    appearance: Float[Tensor, "images a"] | None = None
+    appearance_weight: Float[Tensor, "32 a"] | None = None
+
+    @staticmethod
+    def initial(offsets: int, distance: bool, appearance: int, images: int, generator: torch.Generator) -> Decoder:
+        """Uniform in +-1/sqrt(inputs), as torch.nn.Linear; embeddings start at 0."""
+        inputs = FEATURE_SIZE + 3 + int(distance)
+        tensors: dict[str, Tensor] = {}
+        for head, per_offset in HEADS.items():
+            for layer, rows, columns in ((1, HIDDEN_SIZE, inputs), (2, offsets * per_offset, HIDDEN_SIZE)):
+                bound = columns**-0.5
+                tensors[f"{head}_w{layer}"] = _uniform((rows, columns), bound, generator)
+                tensors[f"{head}_b{layer}"] = _uniform((rows,), bound, generator)
+        if appearance:
+            tensors["appearance"] = torch.zeros(images, appearance)
+            tensors["appearance_weight"] = _uniform((HIDDEN_SIZE, appearance), appearance**-0.5, generator)
+        return Decoder.from_tensors(tensors)
+
+    @staticmethod
+    def from_tensors(tensors: Mapping[str, Tensor]) -> Decoder:
+        """The inverse of `tensors`. Raises KeyError on a missing tensor."""
+        weights = DecoderWeights(*(HeadWeights(*(tensors[f"{head}_{part}"] for part in PARTS)) for head in HEADS))
+        return Decoder(weights, tensors.get("appearance"), tensors.get("appearance_weight"))
+
+    def tensors(self) -> dict[str, Tensor]:
+        named = {f"{head}_{p}": getattr(getattr(self.weights, head), p) for head in HEADS for p in PARTS}
+        if self.appearance is not None and self.appearance_weight is not None:
+            named |= {"appearance": self.appearance, "appearance_weight": self.appearance_weight}
+        return named
+
+    def copy(self) -> Decoder:
+        """The same numbers in tensors of their own."""
+        return Decoder.from_tensors({name: tensor.detach().clone() for name, tensor in self.tensors().items()})
+
+    def for_image(self, image: int | None) -> DecoderWeights:
+        """The weights as one view sees them: with the embedding of training image `image`, or with the mean
+        embedding for a view that was not trained on (choice)."""
+        if self.appearance is None or self.appearance_weight is None:
+            return self.weights
+        embedding = self.appearance.mean(0) if image is None else self.appearance[image]
+        colour = self.weights.colour
+        return replace(self.weights, colour=replace(colour, b1=colour.b1 + self.appearance_weight @ embedding))
+
+    def check(self, offsets: int) -> None:
+        """Raise ValueError unless all shapes fit `offsets` Gaussians per anchor and all numbers are finite."""
+        inputs = self.weights.opacity.w1.shape[-1]
+        if inputs not in (FEATURE_SIZE + 3, FEATURE_SIZE + 4):
+            raise ValueError(f"the decoder takes {inputs} inputs, not 35 or 36")
+        for head, per_offset in HEADS.items():
+            outputs = offsets * per_offset
+            expected = {
+                "w1": (HIDDEN_SIZE, inputs),
+                "b1": (HIDDEN_SIZE,),
+                "w2": (outputs, HIDDEN_SIZE),
+                "b2": (outputs,),
+            }
+            for part, shape in expected.items():
+                found = tuple(getattr(getattr(self.weights, head), part).shape)
+                if found != shape:
+                    raise ValueError(f"decoder {head}_{part} has shape {found}, not {shape}")
+        for name, tensor in self.tensors().items():
+            if not bool(torch.isfinite(tensor).all()):
+                raise ValueError(f"decoder {name} holds numbers that are not finite")
+
+
+def _uniform(shape: tuple[int, ...], bound: float, generator: torch.Generator) -> Tensor:
+    return torch.empty(shape).uniform_(-bound, bound, generator=generator)

@@ -1,0 +1,111 @@
+"""From anchors and a camera to a picture: cull, decode, rasterise."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from vdgs.cameras import Camera
+from vdgs.kernels import native as kernels
+from vdgs.kernels.types import DecoderWeights, Raster, Splats
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchors import Anchors
+
+
+def decode_rows(anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera) -> Splats:
+    """Splats of the anchors of the given rows, as this camera sees them."""
+    return kernels.decode(
+        anchors.positions, anchors.features, anchors.offsets, anchors.log_scales, weights, camera, rows
+    )
+
+
+def visible_rows(anchors: Anchors, camera: Camera) -> Int64[Tensor, " v"]:
+    """Rows of the anchors that may touch a view, ascending."""
+    return kernels.cull(anchors.positions, anchors.log_scales, camera)
+
+
+def decode_view(model: AnchorModel, camera: Camera, image: int | None = None) -> tuple[Int64[Tensor, " v"], Splats]:
+    """The rows that may touch a view and what they look like, each anchor by its own decoder; `source` counts rows.
+
+    `image`: as in `render`.
+    """
+    rows = visible_rows(model.anchors, camera)
+    spans = model.spans()
+    bounds = torch.searchsorted(rows, torch.tensor([first for first, _, _ in spans] + [len(model.anchors)])).tolist()
+    shown = [
+        (first, last, decoder)
+        for (first, last), (_, _, decoder) in zip(pairwise(bounds), spans, strict=True) if first < last
+    ] or [(0, 0, model.decoder)]  # fmt: skip
+    pieces = [
+        (first, decode_rows(model.anchors, rows[first:last], decoder.for_image(image), camera))
+        for first, last, decoder in shown
+    ]
+    return rows, _joined(pieces, model.anchors.offsets.shape[1])
+
+
+def _joined(pieces: list[tuple[int, Splats]], k: int) -> Splats:
+    """Splats of consecutive rows as one, in order; each piece with the place of its first row."""
+    if len(pieces) == 1:
+        return pieces[0][1]
+    named = {
+        field.name: torch.cat([getattr(splats, field.name) for _, splats in pieces])
+        for field in fields(Splats) if field.name != "source"
+    }  # fmt: skip
+    return Splats(**named, source=torch.cat([splats.source + first * k for first, splats in pieces]))
+
+
+def draw(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:
+    """Splats to image, alpha and (on request) expected depth; differentiable."""
+    return kernels.rasterise(
+        splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths,
+        background, camera.width, camera.height, depth=depth,
+    )  # fmt: skip
+
+
+@torch.no_grad()
+def render(
+    model: AnchorModel,
+    camera: Camera,
+    *,
+    background: tuple[float, float, float] | None = None,
+    depth: bool = False,
+    image: int | None = None,
+) -> Raster:
+    """One view of a model: image [h, w, 3] (not clamped), alpha [h, w], depth [h, w] or None.
+
+    `background` replaces the model's own. `image` is the index of a training image whose appearance to use;
+    None takes the mean appearance.
+    """
+    _, splats = decode_view(model, camera, image)
+    return draw(splats, camera, torch.tensor(background or model.background), depth)
+
+
+@torch.no_grad()
+def paint(
+    model: AnchorModel, values: Float[Tensor, " n"], camera: Camera
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """A value per anchor in place of its colour, on black: the sum of the values that a pixel shows, each by its part
+    of the pixel, and alpha, the sum of the parts."""
+    rows, splats = decode_view(model, camera)
+    k = model.anchors.offsets.shape[1]
+    of_splat = values[rows][splats.source.long() // k].float()
+    painted = kernels.rasterise(
+        splats.means_px, splats.conics, of_splat[:, None].expand(-1, 3).contiguous(), splats.opacities,
+        splats.depths, torch.zeros(3), camera.width, camera.height,
+    )  # fmt: skip
+    return painted.image[..., 0], painted.alpha
+
+
+def render_values(model: AnchorModel, values: Float[Tensor, " n"], camera: Camera) -> Float[Tensor, "h w"]:
+    """A value per anchor drawn as a map: the alpha-weighted mean at each pixel, NaN where nothing is drawn.
+
+    Used for visibility maps (V at each pixel).
+    """
+    scale = float(values.max().clamp(min=1)) if len(values) else 1.0
+    painted, alpha = paint(model, values / scale, camera)
+    value = painted / alpha.clamp(min=1e-6) * scale
+    return torch.where(alpha > 0.5, value, torch.full_like(value, float("nan")))

@@ -1,0 +1,1 @@
+"""Which cameras train which block: scores, the decision, its file, its tables."""

@@ -1,0 +1,144 @@
+"""Trained blocks become one scene: every place takes its anchors from exactly one block.
+
+Merging is a selection by place: no anchor is changed, averaged or added. A block's training moves, grows and prunes
+only what its cameras see; where they see nothing, its anchors are the coarse ones still, and so is the merged scene.
+
+Symbols: V_i, the number of cameras that hold anchor i in their frustum (section III-B of the paper).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from vdgs.cameras import Camera
+from vdgs.errors import VdgsError
+from vdgs.kernels import native as kernels
+from vdgs.model.anchor_model import AnchorModel, Part
+from vdgs.model.anchors import Anchors
+from vdgs.model.decoder import Decoder
+from vdgs.partition.blocks import Blocks, places_of
+from vdgs.settings.method import MergeConfig
+
+
+def merge(
+    coarse: AnchorModel,
+    trained: Sequence[AnchorModel | None],
+    blocks: Blocks,
+    cameras_of_block: Sequence[Sequence[Camera]],
+    config: MergeConfig,
+    *,
+    allow_missing: bool = False,
+) -> tuple[AnchorModel, list[dict[str, Any]]]:
+    """One model from the trained blocks, and facts of each block: anchors trained, kept, dropped, from_coarse, and
+    unseen (kept, but in the frustum of none of the block's cameras).
+
+    A trained model holds the anchors that its block was free to move: those that it owns, and those of its ring unless
+    that was frozen. The result keeps, block after block and in their order, the anchors of each block at the places
+    that the rule gives to it. With `allow_missing` the coarse anchors stand in at places whose owner is None.
+    Memory: one copy of the merged anchors beside the trained ones.
+
+    Raises VdgsError for a missing block (unless allowed), and for a block that shows that it was not trained from
+    `coarse`: by its grid, or by other bits of a frozen decoder.
+    """
+    if not len(trained) == len(cameras_of_block) == len(blocks):
+        raise ValueError(f"{len(trained)} models and {len(cameras_of_block)} camera lists for {len(blocks)} blocks")
+    missing = [index for index, model in enumerate(trained) if model is None]
+    if missing and not allow_missing:
+        raise VdgsError(_missing_message(missing))
+    for index, model in enumerate(trained):
+        if model is not None:
+            _check_origin(index, model, coarse)
+    coarse_owner = blocks.owner(places_of(coarse.anchors.positions)) if missing else None
+    selected, pieces, facts = [], [], []
+    for index, model in enumerate(trained):
+        if model is None:
+            assert coarse_owner is not None
+            piece = coarse.anchors.select(torch.from_numpy(coarse_owner == index))
+            counts = {"trained": 0, "kept": 0, "dropped": 0, "from_coarse": len(piece)}
+        else:
+            givers = giver_of_places(model.anchors.positions, blocks, cameras_of_block, config, missing)
+            piece = model.anchors.select(torch.from_numpy(givers == index))
+            held = len(model.anchors)
+            counts = {"trained": held, "kept": len(piece), "dropped": held - len(piece), "from_coarse": 0}
+        unseen = int((kernels.count_visibility(piece.positions, cameras_of_block[index]) == 0).sum())
+        pieces.append(Part(len(piece), coarse.decoder if model is None else model.decoder))
+        selected.append(piece)
+        facts.append({"block": index, **counts, "unseen": unseen})
+    own = any(model is not None and has_own_decoder(model) for model in trained)
+    return replace(coarse, anchors=_joined(selected), parts=tuple(pieces) if own else ()), facts
+
+
+def has_own_decoder(model: AnchorModel) -> bool:
+    """Whether a block moved the decoder too, rather than anchors alone."""
+    return model.facts.get("decoder") == "own"
+
+
+def giver_of_places(
+    positions: Float[Tensor, "n 3"],
+    blocks: Blocks,
+    cameras_of_block: Sequence[Sequence[Camera]],
+    config: MergeConfig,
+    missing: Sequence[int] = (),
+) -> Int64[np.ndarray, " n"]:
+    """The block whose anchors stay at each place: a function of the place alone, so that blocks never overlap.
+
+    `owner`: the owner. `best_seen`: among the blocks that reach the place, the one whose cameras see it most; of equals
+    the owner, else the first. What a `missing` block owns stays with it, and it is given nothing more.
+    O(n) memory; `best_seen` costs a count of visibility for each block.
+    """
+    places = places_of(positions)
+    owner = blocks.owner(places)
+    if config.rule == "owner":
+        return owner
+    giver = owner.copy()
+    most = np.full(len(places), -1, np.int64)
+    # The owner is counted first and others must see strictly more: of equals it keeps the place.
+    for index in range(len(blocks)):
+        rows = np.flatnonzero(owner == index)
+        most[rows] = _visibility(positions, rows, cameras_of_block[index])
+    for index in (each for each in range(len(blocks)) if each not in missing):
+        rows = np.flatnonzero(blocks.reaches(index, places) & (owner != index) & ~np.isin(owner, missing))
+        visibility = _visibility(positions, rows, cameras_of_block[index])
+        better = visibility > most[rows]
+        giver[rows[better]], most[rows[better]] = index, visibility[better]
+    return giver
+
+
+def _visibility(positions: Float[Tensor, "n 3"], rows: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """V_i of the given rows over these cameras."""
+    return kernels.count_visibility(positions[torch.from_numpy(rows)], cameras).numpy()
+
+
+def _joined(pieces: Sequence[Anchors]) -> Anchors:
+    tensors = [piece.tensors() for piece in pieces]
+    return Anchors(**{name: torch.cat([each[name] for each in tensors]) for name in tensors[0]})
+
+
+def _check_origin(index: int, model: AnchorModel, coarse: AnchorModel) -> None:
+    """Where blocks leave the decoder as it is, other bits are another coarse model."""
+    same = has_own_decoder(model) or _bits(model.decoder) == _bits(coarse.decoder)
+    if not same or model.anchors.offsets.shape[1] != coarse.anchors.offsets.shape[1] or model.voxel != coarse.voxel:
+        raise VdgsError(
+            f"block {index} was trained from another coarse model: its decoder or its grid differs. "
+            f"Train it again: vdgs train RUN --block {index}"
+        )
+
+
+def _bits(decoder: Decoder) -> dict[str, tuple[tuple[int, ...], bytes]]:
+    return {name: (tuple(t.shape), t.detach().numpy().tobytes()) for name, t in decoder.tensors().items()}
+
+
+def _missing_message(missing: Sequence[int]) -> str:
+    which = f"block {missing[0]} is" if len(missing) == 1 else f"blocks {', '.join(map(str, missing))} are"
+    commands = "".join(f"\n  vdgs train RUN --block {index}" for index in missing)
+    return (
+        f"{which} not trained to the end. Train what is missing:{commands}\n"
+        "or merge with --incomplete: there the coarse anchors stand in."
+    )

@@ -1,0 +1,84 @@
+"""The geometry of block training: what a block moves, what it only draws, where it grows, how far its anchors move.
+
+Frozen around the core are the ring out to the widened boundary and, as context, all else that the block's cameras see
+(choice: else every pixel that no anchor covers would push the anchors at the boundary to fill the hole).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import shapely
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from vdgs.cameras import Camera
+from vdgs.kernels import native as kernels
+from vdgs.model.anchors import Anchors
+from vdgs.partition.blocks import Blocks, places_of
+from vdgs.settings.method import BlockConfig
+
+#: Cells on each side of the table of the ramp.
+RAMP_CELLS = 512
+
+
+def split_anchors(anchors: Anchors, blocks: Blocks, index: int, config: BlockConfig) -> tuple[Tensor, Tensor]:
+    """What a block moves and what it only draws, as two masks [n].
+
+    Own are the anchors that the block owns (with a ring that is not frozen: that it reaches). Around it are the ring
+    and, with `config.context`, everything else.
+    """
+    place = places_of(anchors.positions)
+    core, reached = blocks.owner(place) == index, blocks.reaches(index, place)
+    own = core if config.ring == "frozen" else reached
+    around = ~own if config.context else reached & ~own
+    return torch.from_numpy(own), torch.from_numpy(around)
+
+
+def drawn_by(anchors: Anchors, cameras: Sequence[Camera]) -> Bool[Tensor, " n"]:
+    """Which anchors one of the cameras may draw."""
+    drawn = torch.zeros(len(anchors), dtype=torch.bool)
+    for camera in cameras:
+        drawn[kernels.cull(anchors.positions, anchors.log_scales, camera)] = True
+    return drawn
+
+
+def holds(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor]:
+    """Which places may get new anchors: those of which the merge keeps what stands there."""
+
+    def inside(positions: Float[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
+        place = places_of(positions)
+        kept = blocks.owner(place) == index if config.ring == "frozen" else blocks.reaches(index, place)
+        return torch.from_numpy(kept)
+
+    return inside
+
+
+def ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor] | None:
+    """How far anchors move where the ring is a ramp: 1 wherever the block owns the place, and where another does,
+    falling linearly from the core to 0 at the widened boundary.
+
+    Read from a table over the block, since it is asked in every step.
+    """
+    if config.ring != "ramp":
+        return None
+    block = blocks.items[index]
+    low, high = np.array(block.expanded.bounds[:2]), np.array(block.expanded.bounds[2:])
+    centres = (np.indices((RAMP_CELLS, RAMP_CELLS)).reshape(2, -1).T + 0.5) / RAMP_CELLS * (high - low) + low
+    points = shapely.points(centres)
+    inwards, outwards = shapely.distance(block.core, points), shapely.distance(block.expanded.exterior, points)
+    share = np.where(shapely.contains(block.expanded, points), outwards / np.maximum(inwards + outwards, 1e-12), 0.0)
+    share = np.where(blocks.owner(centres) == index, 1.0, share)
+    table = torch.from_numpy(share.astype(np.float32).reshape(RAMP_CELLS, RAMP_CELLS))
+    origin, cell = torch.from_numpy(low), torch.from_numpy((high - low) / RAMP_CELLS)
+
+    def mobility(positions: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
+        cells: Int64[Tensor, "p 2"] = ((positions[:, :2].double() - origin) / cell).floor().long()
+        inside = ((cells >= 0) & (cells < RAMP_CELLS)).all(1)
+        cells = cells.clamp(0, RAMP_CELLS - 1)
+        # What the block moves beyond the table it owns.
+        return torch.where(inside, table[cells[:, 0], cells[:, 1]], torch.ones(()))
+
+    return mobility

@@ -1,0 +1,80 @@
+"""`vdgs run`: all stages in order, to the report. Finished stages are skipped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.console import Console
+
+from vdgs.errors import RunError, VdgsError
+from vdgs.evaluation.of_run import evaluation_folder
+from vdgs.report import write_report
+from vdgs.runs.beginning import begin_run
+from vdgs.runs.folder import RunFolder
+from vdgs.settings.requests import RunRequest
+from vdgs.stages.coarse import train_coarse
+from vdgs.stages.evaluate import evaluate_stage, is_measured
+from vdgs.stages.merge import merge_run
+from vdgs.stages.partition import partition_run
+from vdgs.stages.train import train_blocks
+from vdgs.stages.visibility import measure_visibility
+from vdgs.storage.files import read_json
+
+
+def run_all(asked: RunRequest, console: Console) -> None:
+    """Everything from a capture to a report, on a device that is chosen already (`vdgs.kernels.devices`).
+
+    Raises what the stages raise; all that was finished before stays, and the same command continues.
+    """
+    asked.watching.check()
+    if asked.jobs < 0 or asked.bins < 1:
+        raise VdgsError("--jobs must not be negative and --bins must be at least 1")
+    run, capture = begin_run(asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo)
+    _title(console, "coarse model")
+    train_coarse(run, capture, asked.watching, console)
+    measure_visibility(run, console)
+    _measure(run, "coarse", asked, console)
+    _title(console, "blocks")
+    partition_run(run, console)
+    _title(console, "block training")
+    try:
+        train_blocks(run.path, asked.watching, asked.jobs, console, asked.device)
+    except RunError as error:
+        if not asked.incomplete:
+            raise
+        console.print(f"[yellow]note[/] {error}", highlight=False)
+    _title(console, "merge and evaluation")
+    merge_run(run.path, asked.incomplete, console)
+    _measure(run, "merged", asked, console)
+    _verdict(run, console)
+    console.print(f"report: {write_report(run)}", highlight=False)
+
+
+def _title(console: Console, name: str) -> None:
+    console.print()
+    console.rule(f"[bold]{name}", align="left", style="dim")
+
+
+def _measure(run: RunFolder, which: Literal["coarse", "merged"], asked: RunRequest, console: Console) -> None:
+    """Evaluate a model unless that was done already, for this very model and in the same way."""
+    if is_measured(run, which, asked.lpips_weights, asked.bins):
+        console.print(f"{evaluation_folder(run, which)}: already measured; nothing to do", highlight=False)
+        return
+    evaluate_stage(run.path, which, asked.lpips_weights, asked.bins, console)
+
+
+def _verdict(run: RunFolder, console: Console) -> None:
+    """One line: what the blocks brought."""
+    coarse, merged = (_metrics(folder) for folder in (run.coarse.path / "evaluation", run.evaluation))
+    if coarse.get("psnr") is None or merged.get("psnr") is None:
+        return
+    console.print(
+        f"coarse {coarse['psnr']:.2f} dB → merged {merged['psnr']:.2f} dB "
+        f"({merged['psnr'] - coarse['psnr']:+.2f}); SSIM {coarse['ssim']:.3f} → {merged['ssim']:.3f}",
+        style="bold", highlight=False,
+    )  # fmt: skip
+
+
+def _metrics(folder: Path) -> dict[str, Any]:
+    return read_json(folder / "metrics.json")

@@ -1,0 +1,57 @@
+"""A run begun, or taken up again: the capture opened, its settings checked and written down."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from vdgs.captures.capture import Capture
+from vdgs.captures.facts import refuse_another_capture
+from vdgs.captures.loading import load_capture
+from vdgs.errors import VdgsError
+from vdgs.runs.folder import RunFolder
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.checks import validate
+from vdgs.settings.method import MethodConfig, with_iterations
+from vdgs.settings.plain import to_dict
+from vdgs.storage.files import read_json
+
+
+def begin_run(
+    capture_path: Path,
+    output: Path,
+    capture_options: CaptureOptions,
+    method: MethodConfig,
+    *,
+    redo: bool | None = None,
+) -> tuple[RunFolder, Capture]:
+    """Open the capture and a new run of it, or the run that is there if it was started with the same settings.
+
+    `redo` None compares the settings of the coarse stage only and refuses others; True or False is about changing
+    them (`RunFolder.change`). Raises CaptureError for a capture that cannot be used, RunError for other settings than
+    the run's, VdgsError for settings that do not work.
+    """
+    problems = validate(method)
+    if problems:
+        raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
+    capture = load_capture(capture_path, capture_options)
+    method = replace(method, training=with_iterations(method.training, len(capture.train_views)))
+    run = RunFolder(output)
+    with run.locked():
+        if run.capture_file.exists():
+            refuse_another_capture(run.capture_file, read_json(run.capture_file), capture)
+        settings = run_settings(capture_path, capture_options, method)
+        if redo is None or not run.config_file.exists():
+            run.begin(settings, ("capture", "training"))
+        else:
+            run.change(settings, redo)
+    return run, capture
+
+
+def run_settings(capture_path: Path, capture_options: CaptureOptions, method: MethodConfig) -> dict[str, Any]:
+    """What config.yaml holds: everything that the result depends on."""
+    plain = to_dict(capture_options)
+    absolute = {name: str(value.resolve()) for name, value in vars(capture_options).items() if isinstance(value, Path)}
+    capture = {"path": str(capture_path.resolve())} | plain | absolute
+    return {"capture": capture} | to_dict(method)

@@ -1,0 +1,29 @@
+"""The cut of a run, opened: its blocks, and which training views serve each."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vdgs.captures.capture import Capture
+from vdgs.errors import RunError
+from vdgs.partition.assignment.saving import load_scores
+from vdgs.partition.blocks import Blocks, load_blocks
+from vdgs.runs.folder import RunFolder
+
+
+def blocks_of(run: RunFolder) -> Blocks:
+    """The blocks of a run, with cameras. Raises RunError unless they were made with the run's settings."""
+    facts, keys = run.partition_facts(), run.keys()
+    if (facts.get("key"), facts.get("assignment_key")) != (keys.partition, keys.assignment):
+        raise RunError(
+            f"{run.path}: is not cut into blocks yet, or with other settings. Run: vdgs partition {run.path}"
+        )
+    return load_blocks(run.partition / "blocks.geojson")
+
+
+def views_of_block(run: RunFolder, capture: Capture, index: int) -> list[int]:
+    """Which training views, by number, serve a block."""
+    _, _, assignment = load_scores(run.partition / "scores.npz")
+    if len(assignment.cameras) != len(capture.train_views):
+        raise RunError(f"{run.partition / 'scores.npz'}: is of another capture. Run: vdgs partition {run.path}")
+    return [int(view) for view in np.flatnonzero(assignment.cameras[:, index])]

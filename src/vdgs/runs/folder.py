@@ -1,0 +1,304 @@
+"""The run folder: settings, states and results of one run, as files (docs/architecture.md)."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import shutil
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from vdgs import __version__
+from vdgs.errors import RunError, VdgsError
+from vdgs.runs.keys import StageKeys, stage_keys
+from vdgs.settings.method import MethodConfig
+from vdgs.settings.plain import differences, from_dict, to_dict
+from vdgs.storage.files import read_json, write_json, write_text
+
+#: The parts of config.yaml.
+SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
+
+
+@dataclass(frozen=True)
+class StageFolder:
+    """Where one stage (coarse, a block) keeps its states, log and model."""
+
+    path: Path
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def log(self) -> Path:
+        return self.path / "log.jsonl"
+
+    @property
+    def model(self) -> Path:
+        return self.path / "model.safetensors"
+
+    @property
+    def status_file(self) -> Path:
+        return self.path / "status.json"
+
+    def status(self) -> dict[str, Any]:
+        """What `set_status` wrote last; state "new" if nothing did."""
+        if not self.status_file.exists():
+            return {"state": "new"}
+        status = read_json(self.status_file)
+        if not isinstance(status, dict) or not isinstance(status.get("state"), str):
+            raise RunError(f"{self.status_file}: is damaged. Delete this file and run the same command again.")
+        return status
+
+    def set_status(self, state: str, **facts: Any) -> None:
+        """`state` is queued, running, stopped, done or failed."""
+        write_json(self.status_file, {"state": state, **facts})
+
+    @property
+    def key_file(self) -> Path:
+        return self.path / "key"
+
+    def key(self) -> str | None:
+        """For which settings (`stages/keys.py`) this folder works; None if it says nothing of it."""
+        try:
+            return self.key_file.read_text(encoding="ascii", errors="replace").strip()
+        except OSError:
+            return None
+
+    def claim(self, key: str) -> None:
+        """Let this folder work for these settings from now on; what is there for others, or for unknown ones, is
+        deleted first and the key is written last: a folder never holds what its key does not say."""
+        if self.key() == key:
+            return
+        if self.path.exists():
+            for stale in self.path.iterdir():
+                if stale.is_dir():
+                    shutil.rmtree(stale)
+                elif stale not in (self.path / ".lock", self.key_file):
+                    stale.unlink()
+        write_text(self.key_file, key + "\n")
+
+    def holds_work(self) -> bool:
+        """Something was trained here."""
+        return self.model.exists() or any(self.checkpoints.glob("*.json"))
+
+    def is_done(self, key: str | None = None) -> bool:
+        """Trained to the end, for the settings of `key` where one is given."""
+        status = self.status()
+        return status["state"] == "done" and self.model.exists() and key in (None, self.key())
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold this stage for this process; RunError if another one works on it."""
+        with _lock(self.path, fcntl.LOCK_EX):
+            yield
+
+    def cut_log(self, iteration: int) -> None:
+        """Drop log lines after `iteration` (and a half-written last one), so that a continued run repeats none."""
+        if not self.log.exists():
+            return
+        kept = []
+        for line in self.log.read_text(encoding="utf-8", errors="replace").splitlines():
+            try:
+                if json.loads(line)["iteration"] <= iteration:
+                    kept.append(line)
+            except (ValueError, KeyError, TypeError):
+                break
+        write_text(self.log, "".join(line + "\n" for line in kept))
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run on disk."""
+
+    path: Path
+
+    @property
+    def config_file(self) -> Path:
+        return self.path / "config.yaml"
+
+    @property
+    def capture_file(self) -> Path:
+        return self.path / "capture.json"
+
+    @property
+    def coarse(self) -> StageFolder:
+        return StageFolder(self.path / "coarse")
+
+    def block(self, index: int) -> StageFolder:
+        return StageFolder(self.path / "blocks" / f"{index:02d}")
+
+    def block_folders(self) -> list[StageFolder]:
+        """Those that are there, in order; a folder whose name is no number is not ours."""
+        paths = [path for path in (self.path / "blocks").glob("[0-9]*") if path.name.isdecimal()]
+        return [StageFolder(path) for path in sorted(paths, key=lambda path: int(path.name))]
+
+    @property
+    def visibility(self) -> Path:
+        return self.path / "visibility"
+
+    @property
+    def partition(self) -> Path:
+        return self.path / "partition"
+
+    def partition_facts(self) -> dict[str, Any]:
+        """What partition.json says; empty if the scene is not cut yet. RunError if the file is damaged."""
+        file = self.partition / "partition.json"
+        try:
+            facts = read_json(file) if file.exists() else {}
+        except VdgsError:
+            facts = None
+        if not isinstance(facts, dict):
+            raise RunError(f"{file}: is damaged. Cut the scene again: vdgs partition {self.path}")
+        return facts
+
+    @property
+    def merged(self) -> StageFolder:
+        return StageFolder(self.path / "merged")
+
+    @property
+    def gaussians(self) -> StageFolder:
+        """Where 3DGS keeps its model, in runs of the bench that have it in place of all other stages."""
+        return StageFolder(self.path / "gaussians")
+
+    @property
+    def evaluation(self) -> Path:
+        return self.path / "evaluation"
+
+    def begin(self, settings: dict[str, Any], checked: Sequence[str] = SECTIONS) -> None:
+        """Write the settings of a new run, or check that those of the run that is there are the same.
+
+        Only the sections named in `checked` are compared. Raises RunError with the differences if they are not the
+        same, and if the folder holds something else.
+        """
+        if self.config_file.exists():
+            old = self.settings()
+            changed = differences({s: old[s] for s in checked}, {s: settings[s] for s in checked})
+            if changed:
+                raise RunError(
+                    f"{self.config_file}: this run was started with other settings:\n  "
+                    + "\n  ".join(changed)
+                    + "\nGive the old settings to continue it, or another --output to start a new run."
+                )
+            return
+        if self.path.exists() and not self.path.is_dir():
+            raise RunError(f"{self.path}: is a file. Choose a folder for --output.")
+        strangers = (
+            [p.name for p in self.path.iterdir() if p.name != ".lock" and p.suffix != ".tmp"]
+            if self.path.exists()
+            else []
+        )
+        if strangers:
+            raise RunError(
+                f"{self.path}: holds other files ({', '.join(sorted(strangers)[:3])}) and no config.yaml. "
+                "Choose an empty or a new folder for --output."
+            )
+        self._write(settings)
+
+    def change(self, settings: dict[str, Any], redo: bool) -> list[str]:
+        """Give a run other settings; returns what changed, one line each.
+
+        Raises RunError, with the differences, if trained work depends on what changed, unless `redo` allows to
+        lose it. Stages delete what was made for other settings when they next run (`StageFolder.claim`).
+        """
+        old = self.settings()
+        changed = differences(old, settings)
+        if not changed:
+            return []
+        after = stage_keys(settings, self.coarse_identity())
+        lost = []
+        if self.coarse.holds_work() and self.coarse.key() != after.coarse:
+            lost.append("the coarse model")
+        blocks = [folder for folder in self.block_folders() if folder.holds_work() and folder.key() != after.blocks]
+        if blocks:
+            lost.append(f"{len(blocks)} blocks" if len(blocks) > 1 else "a block")
+        if lost and not redo:
+            raise RunError(
+                f"{self.config_file}: other settings than this run has:\n  " + "\n  ".join(changed)
+                + f"\nThey make {' and '.join(lost)} useless. Add --redo to train that again, give the old settings to "
+                "continue, or take another --output."
+            )  # fmt: skip
+        self._write(settings)
+        if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
+            self.coarse.claim(after.coarse)
+        return changed
+
+    def _write(self, settings: dict[str, Any]) -> None:
+        header = {"vdgs": {"version": __version__, "commit": _commit()}}
+        write_text(self.config_file, yaml.safe_dump(header | settings, sort_keys=False, allow_unicode=True))
+
+    def settings(self) -> dict[str, Any]:
+        """The settings of the run, every section whole, without the header that says which version wrote them."""
+        if not self.config_file.exists():
+            raise RunError(
+                f"{self.path}: is not a run folder (no config.yaml). Train first: vdgs run CAPTURE --output RUN"
+            )
+        try:
+            settings = yaml.safe_load(self.config_file.read_text(encoding="utf-8"))
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise RunError(f"{self.config_file}: is damaged, not valid YAML ({error})") from error
+        if not isinstance(settings, dict) or not {"capture", "training"} <= settings.keys():
+            raise RunError(f"{self.config_file}: is damaged or not of a vdgs run (no `capture` and `training`)")
+        settings.pop("vdgs", None)
+        capture = settings.pop("capture")
+        try:
+            return {"capture": capture} | to_dict(from_dict(MethodConfig, settings))
+        except (ValueError, TypeError) as error:
+            raise RunError(f"{self.config_file}: holds settings that this version does not know ({error})") from error
+
+    def method(self) -> MethodConfig:
+        """The settings of the run but for the capture."""
+        settings = self.settings()
+        settings.pop("capture")
+        return from_dict(MethodConfig, settings)
+
+    def keys(self) -> StageKeys:
+        """The key of every stage, for the settings that config.yaml holds and the coarse model that is there."""
+        return stage_keys(self.settings(), self.coarse_identity())
+
+    def coarse_identity(self) -> str | None:
+        """What tells the coarse model from any other; None while there is none."""
+        return self.coarse.status().get("model")
+
+    @contextmanager
+    def locked(self, shared: bool = False) -> Iterator[None]:
+        """Hold the run for this process, or share it with others that do (blocks are trained side by side).
+
+        RunError if another process stands in the way.
+        """
+        with _lock(self.path, fcntl.LOCK_SH if shared else fcntl.LOCK_EX):
+            yield
+
+
+@contextmanager
+def _lock(folder: Path, kind: int) -> Iterator[None]:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = (folder / ".lock").open("w")
+    except OSError as error:
+        raise RunError(f"{folder}: cannot be written ({error.strerror}). Choose another --output.") from error
+    with handle:
+        try:
+            fcntl.flock(handle, kind | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RunError(f"{folder}: another vdgs process works on this run. Wait for it or stop it.") from error
+        yield
+
+
+def _commit() -> str | None:
+    """The commit of the checkout that this package runs from; None outside a checkout of vdgs."""
+    root = Path(__file__).resolve().parents[3]
+    if not (root / ".git").exists() or not (root / "native").exists():
+        return None
+    command = ["git", "-C", str(root), "rev-parse", "HEAD"]
+    try:
+        found = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError:  # no git on this machine
+        return None
+    return found.stdout.strip() or None

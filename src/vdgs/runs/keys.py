@@ -1,0 +1,63 @@
+"""Which settings each stage of a run depends on, so that a change invalidates exactly what depends on it.
+
+Every stage has a key: a digest of its own settings and of the keys of the stages before it. A finished stage is
+skipped while its key is the one that it was finished with.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import Any
+
+#: Each stage with the sections of config.yaml that it depends on and the stages it builds on.
+DEPENDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "coarse": (("capture", "training"), ()),
+    "visibility": ((), ("coarse",)),
+    "partition": (("partition",), ("visibility",)),
+    "assignment": (("assignment",), ("partition",)),
+    "blocks": (("block",), ("assignment",)),
+    "merge": (("merge",), ("blocks",)),
+}
+
+
+#: Settings that came after runs had been made without them, with the value that leaves those runs as they are: where a
+#: setting has it, keys do not mention it, so that a newer version takes older runs for finished, as they are.
+SINCE: dict[str, dict[str, Any]] = {
+    "training": {"sampling": "even", "average": 0.0},
+    "block": {"sampling": "even", "decoder": "frozen", "average": 0.0, "crop": "off"},
+}
+
+
+@dataclass(frozen=True)
+class StageKeys:
+    """The key of every stage of a run."""
+
+    coarse: str
+    visibility: str
+    partition: str
+    assignment: str
+    blocks: str
+    merge: str
+
+
+def stage_keys(settings: dict[str, Any], coarse_model: str | None = None) -> StageKeys:
+    """Keys from the sections of config.yaml. What builds on the coarse stage also depends on the very model
+    (`coarse_model`): trained again on another machine it may differ in its last bits."""
+    keys: dict[str, str] = {}
+    for stage, (sections, before) in DEPENDS.items():
+        # Where the capture lies is not what it is: a capture that moved keeps its results.
+        own = {name: counted(name, settings[name]) for name in sections}
+        content = [own, *(keys[name] for name in before), *([coarse_model] if before == ("coarse",) else [])]
+        keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+    return StageKeys(**keys)
+
+
+def counted(section: str, settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings of a section that keys are made of: a setting that came later counts only where it changes a run."""
+    since = SINCE.get(section, {})
+    return {
+        name: value for name, value in settings.items()
+        if (section, name) != ("capture", "path") and not (name in since and value == since[name])
+    }  # fmt: skip

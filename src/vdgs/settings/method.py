@@ -1,0 +1,303 @@
+"""Every setting of training, with its meaning, its default and where that comes from.
+
+Only the standard library is imported here, so that the command line can show the settings at once.
+The defaults are the paper's (preset `paper`); `presets.py` holds the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+PartitionStrategy = Literal["visibility", "vastgaussian", "citygaussian", "dogs"]
+
+
+@dataclass(frozen=True)
+class AnchorConfig:
+    """The anchor model (Scaffold-GS, section III-B of the paper)."""
+
+    offsets: int = 10
+    """Gaussians per anchor (k)."""
+    voxel: float = 0.0
+    """Edge of the initial voxel grid in units of the ground frame; 0 takes the median nearest-neighbour distance of the
+    sparse points."""
+    outlier_distance: float = 30.0
+    """Sparse points start no anchor where their fourth neighbour is this many times farther than the median one's; 0
+    keeps all (choice: a few points deep below the ground become a backdrop that every camera sees through it)."""
+    fill_gaps: bool = True
+    """Also start anchors on ground that cameras see but that holds no sparse points: woods, water, fields (choice)."""
+    distance: bool = False
+    """Feed the distance between camera and anchor to the decoder too."""
+    appearance: int = 0
+    """Size of the appearance embedding of each training image (colour only); 0 for none."""
+    colour_start: bool = False
+    """Start the features from the colours of the sparse points instead of zeros."""
+
+
+@dataclass(frozen=True)
+class RateConfig:
+    """Learning rates of Adam; pairs decay exponentially from the first to the second value."""
+
+    offsets: tuple[float, float] = (0.01, 1e-4)
+    """Offsets, in units of the anchor's own scale (choice: not multiplied by the size of the scene)."""
+    features: tuple[float, float] = (0.0075, 0.0075)
+    """Anchor features."""
+    log_scales: tuple[float, float] = (0.007, 0.007)
+    """Logarithms of the anchor scales."""
+    opacity: tuple[float, float] = (0.002, 2e-5)
+    """Opacity decoder."""
+    covariance: tuple[float, float] = (0.004, 0.004)
+    """Covariance decoder."""
+    colour: tuple[float, float] = (0.008, 5e-5)
+    """Colour decoder."""
+    appearance: tuple[float, float] = (0.05, 5e-4)
+    """Appearance embedding."""
+
+
+@dataclass(frozen=True)
+class GrowthConfig:
+    """Where anchors are added and removed (Scaffold-GS, section 4.2 there)."""
+
+    interval: int = 100
+    """Iterations between two growth decisions."""
+    statistics_from: int = 500
+    """Iteration from which gradients and opacities are counted."""
+    start: int = 1500
+    """Iteration from which anchors grow and are pruned."""
+    until: float = 0.5
+    """Share of the iterations after which growth and pruning end."""
+    threshold: float = 2e-4
+    """Mean norm of dL/d(mean) in NDC units above which an offset asks for a new anchor."""
+    levels: int = 3
+    """Number of cell sizes tried; level i has threshold 2^i times and cells 4^i times finer."""
+    coarsest_cell: float = 16.0
+    """Edge of the coarsest cell, in voxels."""
+    gate: float = 0.4
+    """An offset is judged once it was rendered more often than this share of the interval."""
+    prune_opacity: float = 0.005
+    """An anchor goes when the opacity of its Gaussians, summed over them, averaged over the views, is below this."""
+    prune_views: float = 0.8
+    """... and it was seen more often than this share of the interval."""
+    max_anchors: int = 0
+    """No growth beyond this many anchors; 0 for no limit."""
+
+
+@dataclass(frozen=True)
+class CompensationConfig:
+    """Compensated anchor growth: gradients of places that few cameras see are remembered and added (eqs. 8-10)."""
+
+    enabled: bool = True
+    """Off: plain growth (the paper's "w/o Anchor Generation")."""
+    t_low: float = 0.20
+    """T_low: an anchor is of low visibility (the set L) when fewer than this share of the cameras of a growth cycle
+    hold it in their frustum."""
+    t_low_quantile: float = 0.0
+    """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on
+    a large scene nearly every anchor is below a fixed share)."""
+    beta_g: float = 2.0
+    """beta_g: weight of a cycle's mean gradient in the cache g. With the paper's 2, g is a sum that grows to twenty
+    times the gradients it is made of; with 1 - gamma (the preset `laptop`) it is a mean over cycles."""
+    gamma: float = 0.9
+    """gamma: decay of the cache g from cycle to cycle."""
+    gate: Literal["scaled", "literal"] = "scaled"
+    """Above how many draws an offset of low visibility is judged: `scaled` takes T_low times the gate of the others, at
+    least 2 (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
+    cap: float = 0.0
+    """Greatest value of g; 0 for none. Without it, and with beta_g = 2, a statistic that is fed steadily grows to 21
+    times its size."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """What training minimises."""
+
+    ssim_weight: float = 0.2
+    """Loss = (1 - w) L1 + w (1 - SSIM) + volume."""
+    volume_weight: float = 0.01
+    """Weight of the mean product of the three scales of the Gaussians that are drawn."""
+    background: Literal["mean", "black"] = "mean"
+    """Colour behind the scene: the mean of the training photographs (choice: what no photograph shows is then drawn
+    in a colour of the place), or black."""
+    background_noise: float = 0.2
+    """In training the background is up to this much brighter or darker in each channel, at random, fading to nothing at
+    the end: transparent ground cannot then hide before a background of its own colour (choice)."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Training of the coarse stage."""
+
+    iterations: int = 100_000
+    """Number of steps, one photograph each; 0 takes sixty for each training photograph, but at least 3000 and at
+    most 30 000 (choice: few photographs are soon learnt by heart, many need their time)."""
+    sampling: Literal["even", "shares", "roots"] = "even"
+    """How often each photograph is used. `even`: all alike (the paper). `shares`: every anchor has one vote, divided
+    among the cameras that see it, and a photograph is used in proportion to its votes: most where few others look.
+    `roots`: in proportion to the square root of its votes, which keeps more photographs in use (choice)."""
+    resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
+    """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
+    average: float = 0.0
+    """The stage ends with the mean of the models of this last share of its iterations, after growth and at full size; 0
+    for the very last model (choice)."""
+    seed: int = 0
+    """Everything random follows from it: on the CPU the same seed gives the same bits."""
+    anchors: AnchorConfig = field(default_factory=AnchorConfig)
+    """The anchor model."""
+    rates: RateConfig = field(default_factory=RateConfig)
+    """Learning rates."""
+    growth: GrowthConfig = field(default_factory=GrowthConfig)
+    """Growth and pruning of anchors."""
+    loss: LossConfig = field(default_factory=LossConfig)
+    """The loss."""
+    compensation: CompensationConfig = field(default_factory=lambda: CompensationConfig(enabled=False))
+    """Compensated growth already in this stage (choice: only blocks have it; the ablation without blocks needs it)."""
+
+
+@dataclass(frozen=True)
+class PartitionConfig:
+    """How the scene is cut into blocks (eq. 5 and what follows it)."""
+
+    strategy: PartitionStrategy = "visibility"
+    """`visibility`: by place and visibility (the paper). The others are the partitions of published methods, to compare
+    with; each cuts and chooses cameras in its own way, whatever the settings of the assignment say."""
+    blocks: int | Literal["auto"] = 8
+    """K, the number of blocks; `auto` takes as few as --block-memory-gb allows: give more to train them at once on
+    several machines."""
+    blocking: bool = True
+    """Off: one block that holds the whole scene (the paper's "w/o Blocking")."""
+    lambda_vis: float = 1.0
+    """lambda_vis: weight of visibility beside place in the clustering (paper: 0.7 to 1.3); 0 is purely spatial."""
+    balanced: bool = False
+    """Blocks of about equally many anchors (choice; plain k-means leaves them several times apart)."""
+    expansion: float = 0.4
+    """A block is widened by this share of the radius of a disc of its area."""
+    block_memory_gb: float = 4.0
+    """Memory that one block may take in training, by estimate; only `--blocks auto` looks at it."""
+
+
+@dataclass(frozen=True)
+class AssignmentConfig:
+    """Which cameras train which block (eqs. 6-7)."""
+
+    mode: Literal["coverage", "literal", "leave_one_out", "frustum"] = "coverage"
+    """`coverage`: share of the drawn pixels that the block alone draws alike (choice). `literal`: eq. 7 as printed,
+    where pixels empty in both renders count too. `leave_one_out`: 1 - SSIM of the scene without the block.
+    `frustum`: share of the block's anchors that the camera holds (needs no renders)."""
+    tau: float = 0.05
+    """tau: pixels differ when the mean absolute difference of their channels is above this (choice; not in the
+    paper)."""
+    threshold: float = 0.45
+    """Share of pixels (or, for `frustum`, of anchors) above which a camera is assigned."""
+    threshold_leave_one_out: float = 0.05
+    """The same for `leave_one_out` (peers: 0.05 to 0.12)."""
+    min_cameras: int = 100
+    """Each block is topped up with the cameras that show it best to at least this many, as far as any show it; 0 leaves
+    it as it is."""
+    longest_side_px: int = 320
+    """Size at which the renders are compared."""
+
+
+@dataclass(frozen=True)
+class BlockConfig:
+    """Training of each block from the coarse anchors of its place. Loss and seed are those of the coarse stage."""
+
+    iterations: int = 50_000
+    """Steps for each block; 0 takes fifteen for each of its photographs, at least 500 and at most 15 000 (choice)."""
+    scale_iterations: float = 1.0
+    """Factor on the steps and on the start of statistics and growth, for scenes smaller than the paper's."""
+    sampling: Literal["even", "shares", "roots"] = "even"
+    """As in the coarse stage, by the votes of the anchors that the block moves: photographs that show little of the
+    block are used little."""
+    resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
+    """Resolution schedule, as in the coarse stage."""
+    average: float = 0.0
+    """As in the coarse stage."""
+    crop: Literal["off", "steps", "pixels"] = "off"
+    """Draw only the part of each photograph in which the block has a share, and all of it in every fourth step.
+    `steps`: each step costs less; `pixels`: as many pixels are drawn as without, in up to four times more steps, so
+    that each place of the scene is drawn more often: `iterations` then counts photographs, whatever their size
+    (choice)."""
+    offset_rate: float = 0.4
+    """The rates of the coarse stage start again, those of offsets times this."""
+    scale_rate: float = 0.8
+    """... and those of log-scales times this."""
+    feature_rate: float = 1.0
+    """... and those of features times this (choice; 1 is the paper's)."""
+    background_noise: float = 0.0
+    """As in the loss of the coarse stage, but for blocks: there the ground is opaque already (choice)."""
+    decoder: Literal["frozen", "own"] = "frozen"
+    """`frozen`: as the coarse stage left it (the paper). `own`: each block trains its copy, which its anchors keep in
+    the merged scene (choice: with a frozen decoder what few cameras see is learnt by heart sooner)."""
+    ring: Literal["frozen", "ramp", "free"] = "frozen"
+    """Anchors between core and widened boundary: `frozen` are drawn and never move (choice for "gradients at the
+    boundary are suppressed"); `ramp` move less the farther out they are; `free` as those of the core."""
+    context: bool = True
+    """Draw the anchors outside the block too, frozen. Off: what the block's cameras see there is empty."""
+    growth: GrowthConfig = field(default_factory=lambda: GrowthConfig(start=1000))
+    """Growth and pruning of anchors."""
+    compensation: CompensationConfig = field(default_factory=CompensationConfig)
+    """Compensated growth (eqs. 8-10)."""
+
+
+@dataclass(frozen=True)
+class MergeConfig:
+    """How trained blocks become one scene."""
+
+    rule: Literal["owner", "best_seen"] = "owner"
+    """Whose anchors stay at a place: `owner`: those of the block whose core it is, or is nearest. `best_seen`: those of
+    the block whose cameras see it most, among the blocks that reach it (needs --block.ring ramp or free)."""
+
+
+@dataclass(frozen=True)
+class MethodConfig:
+    """Everything that the result of a run depends on, but for the capture."""
+
+    training: TrainConfig = field(default_factory=TrainConfig)
+    """The coarse stage."""
+    partition: PartitionConfig = field(default_factory=PartitionConfig)
+    """The cut into blocks."""
+    assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
+    """Cameras of each block."""
+    block: BlockConfig = field(default_factory=BlockConfig)
+    """Block training."""
+    merge: MergeConfig = field(default_factory=MergeConfig)
+    """The merge."""
+
+
+#: How `iterations = 0` follows from the number of training photographs: steps for each, least, most.
+COARSE_STEPS, BLOCK_STEPS = (60, 3_000, 30_000), (15, 500, 15_000)
+
+
+def with_iterations(config: TrainConfig, training_views: int) -> TrainConfig:
+    """The settings with `iterations = 0` replaced by what the number of training photographs asks for."""
+    return replace(config, iterations=config.iterations or _steps(training_views, *COARSE_STEPS))
+
+
+def block_training(config: MethodConfig, views: int) -> TrainConfig:
+    """The settings of the training loop for one block with so many photographs."""
+    block, scale = config.block, config.block.scale_iterations
+    rates = config.training.rates
+    return replace(
+        config.training,
+        iterations=max(1, round(scale * (block.iterations or _steps(views, *BLOCK_STEPS)))),
+        sampling=block.sampling,
+        average=block.average,
+        resolutions=block.resolutions,
+        rates=replace(
+            rates,
+            offsets=(block.offset_rate * rates.offsets[0], block.offset_rate * rates.offsets[1]),
+            log_scales=(block.scale_rate * rates.log_scales[0], block.scale_rate * rates.log_scales[1]),
+            features=(block.feature_rate * rates.features[0], block.feature_rate * rates.features[1]),
+        ),
+        growth=replace(
+            block.growth,
+            statistics_from=round(scale * block.growth.statistics_from),
+            start=round(scale * block.growth.start),
+        ),
+        loss=replace(config.training.loss, background_noise=block.background_noise),
+        compensation=block.compensation,
+    )
+
+
+def _steps(views: int, per_view: int, least: int, most: int) -> int:
+    return min(max(per_view * views, least), most)

@@ -1,0 +1,80 @@
+"""What a command is asked to do, as plain objects: the rooms that do the work need not know the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
+from vdgs.settings.presets import PresetName
+from vdgs.settings.watching import WatchOptions
+
+#: `best` is the merged model where there is one for the run's settings, else the coarse one.
+ModelName = Literal["best", "coarse", "merged"]
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """Everything from a capture to a report (`vdgs run`)."""
+
+    capture: Path
+    """Folder of the capture."""
+    output: Path
+    """Run folder; new, or the run to continue."""
+    preset: PresetName = "paper"
+    """`paper`: the paper's settings (100 000 + 50 000 iterations a block). `laptop`: a good result in minutes."""
+    redo: bool = False
+    """Allow other settings than the run has to discard what was trained with the old ones."""
+    jobs: int = 0
+    """Blocks trained at once; 0 takes what cores and memory allow."""
+    incomplete: bool = False
+    """Go on if a block fails: the coarse model stands in for it."""
+    lpips_weights: Path | None = None
+    """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
+    bins: int = 4
+    """Number of visibility quantiles by which metrics are reported."""
+    threads: int = 0
+    """Threads of the kernels; 0 for all cores. The result does not depend on it."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
+    options: CaptureOptions = field(default_factory=CaptureOptions)
+    training: TrainConfig = field(default_factory=TrainConfig)
+    partition: PartitionConfig = field(default_factory=PartitionConfig)
+    assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
+    block: BlockConfig = field(default_factory=BlockConfig)
+    merge: MergeConfig = field(default_factory=MergeConfig)
+    watching: WatchOptions = field(default_factory=WatchOptions)
+
+    def method(self) -> MethodConfig:
+        """The settings that the result depends on."""
+        return MethodConfig(self.training, self.partition, self.assignment, self.block, self.merge)
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """Views of a run, or a camera path, as PNG files or a film (`vdgs render`)."""
+
+    run: Path
+    """Run folder."""
+    output: Path
+    """Folder for PNG files, or a file that ends in .mp4."""
+    views: Literal["test", "train", "orbit", "flyover"] = "test"
+    """Which cameras; `orbit` and `flyover` are paths made from the capture."""
+    path: Path | None = None
+    """JSON file with a camera path (docs/conventions.md); overrides --views."""
+    seconds: float = 0.0
+    """Length of a camera path; 0: what its file says, or 12 seconds."""
+    fps: float = 0.0
+    """Frames per second of a camera path and of the video; 0: what its file says, or 30 (2 for separate views)."""
+    width: int = 0
+    """Image width; 0 takes that of the training views."""
+    kind: Literal["image", "depth", "visibility"] = "image"
+    """What to draw: the picture, expected depth, or the number of cameras that see each place."""
+    model: ModelName = "best"
+    """Which model; `best` is the merged one where there is one."""
+    threads: int = 0
+    """Threads of the kernels; 0 for all cores."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""

@@ -1,0 +1,41 @@
+"""How many training cameras see each anchor of the coarse model (section III-B), as numbers and as a map.
+
+RUN/visibility/  visibility.safetensors (V of every anchor), visibility.json (its distribution), map.png
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+from rich.console import Console
+
+from vdgs.model.visibility import imbalance
+from vdgs.partition.figures import maps as figures
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import open_run
+from vdgs.runs.visibility import keep_visibility
+from vdgs.storage.files import read_record, write_json
+
+
+def measure_visibility(run: RunFolder, console: Console) -> None:
+    """V_i of every anchor: its distribution and a map from above. Skipped where it is there for this coarse model."""
+    file, key = run.visibility / "visibility.json", run.keys().visibility
+    if read_record(file).get("key") == key:
+        console.print(f"{file}: already there; nothing to do", highlight=False)
+        return
+    with run.locked():
+        opened = open_run(run.path, "coarse")
+        visibility = keep_visibility(opened).numpy()
+        cameras = [view.camera for view in opened.capture.train_views]
+        facts = asdict(imbalance(visibility))
+        figures.draw_visibility_map(
+            run.visibility / "map.png", opened.model.anchors.positions.numpy(), visibility, cameras,
+            opened.capture.ground.unit,
+        )  # fmt: skip
+        write_json(file, {"key": key, "anchors": len(visibility), "training_views": len(cameras), **facts})
+    quantiles = ", ".join(f"{share} %: {value:g}" for share, value in facts["quantiles"].items())
+    console.print(
+        f"cameras that see an anchor (V), by quantile: {quantiles}; Gini {facts['gini']:.2f}\n"
+        f"map: {run.visibility / 'map.png'}",
+        highlight=False,
+    )

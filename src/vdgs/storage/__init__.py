@@ -1,0 +1,1 @@
+"""Files that are whole or absent: text and JSON, tensors, saved states."""

@@ -1,0 +1,117 @@
+"""Tensors in and out of safetensors files without a second copy of them in memory.
+
+The library serialises all tensors into one piece of bytes first, and parses files from one: as much memory again as
+training holds for its anchors. Here one tensor at a time goes between its own memory and the file. The bytes written
+are those that `safetensors.torch.save_file` writes.
+
+The format: length of the header (8 bytes, little endian), the header (JSON, padded with spaces to a multiple of 8
+bytes), then the tensors, one behind the other.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor
+
+from vdgs.errors import VdgsError
+
+#: The types that are written, in the order in which the format's library lays tensors out: wide ones first.
+DTYPES = {
+    "I64": torch.int64, "F64": torch.float64, "F32": torch.float32, "I32": torch.int32, "U8": torch.uint8,
+    "BOOL": torch.bool,
+}  # fmt: skip
+_NAMES = {dtype: name for name, dtype in DTYPES.items()}
+_PIECE = 1 << 20
+#: What to do about a model that cannot be used.
+REBUILD = "Delete it and run the command that trained it again: it is rebuilt from the last saved state."
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
+    """Write tensors on the CPU, with at most one extra copy of a tensor that is not contiguous.
+
+    Raises OSError if the disk refuses (what was written so far stays: see `files.write_atomically`), TypeError for a
+    type outside DTYPES.
+    """
+    for name, tensor in tensors.items():
+        if tensor.dtype not in _NAMES:
+            raise TypeError(f"{name} is {tensor.dtype}; only {', '.join(DTYPES)} can be written")
+    rank = list(DTYPES.values()).index
+    names = sorted(tensors, key=lambda name: (rank(tensors[name].dtype), name))
+    entries: dict[str, Any] = {"__metadata__": dict(metadata)} if metadata else {}
+    end = 0
+    for name in names:
+        begin, end = end, end + tensors[name].nbytes
+        entries[name] = {
+            "dtype": _NAMES[tensors[name].dtype], "shape": list(tensors[name].shape), "data_offsets": [begin, end],
+        }  # fmt: skip
+    header = json.dumps(entries, separators=(",", ":"), ensure_ascii=False).encode()
+    header += b" " * (-len(header) % 8)
+    with path.open("wb") as file:
+        file.write(len(header).to_bytes(8, "little") + header)
+        for name in names:
+            file.write(_bytes_of(tensors[name].detach().contiguous()))
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """All tensors and the header of a safetensors file; VdgsError if it cannot be read."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata() or {})  # noqa: SIM118
+    except FileNotFoundError as error:
+        raise VdgsError(f"{path}: is not there. Train first, or point to the right run.") from error
+    except (OSError, SafetensorError, ValueError) as error:
+        raise VdgsError(f"{path}: cannot be read ({error}). {REBUILD}") from error
+
+
+def read_whole(path: Path) -> dict[str, Tensor]:
+    """All tensors of a file that `write_tensors` wrote, each read into memory of its own.
+
+    Meant for files whose checksum is known to agree: raises OSError, ValueError or KeyError for others.
+    """
+    with path.open("rb") as file:
+        entries = json.loads(file.read(int.from_bytes(file.read(8), "little")))
+        entries.pop("__metadata__", None)
+        tensors = {}
+        for name, entry in sorted(entries.items(), key=lambda item: item[1]["data_offsets"]):
+            tensor = torch.empty(entry["shape"], dtype=DTYPES[entry["dtype"]])
+            begin, end = entry["data_offsets"]
+            if end - begin != tensor.nbytes or file.readinto(_bytes_of(tensor)) != tensor.nbytes:
+                raise ValueError(f"{name} has not the {tensor.nbytes} bytes of its shape")
+            tensors[name] = tensor
+    return tensors
+
+
+def size_and_checksum(path: Path) -> tuple[int, int]:
+    """Bytes and CRC-32 of a file, read piece by piece: states are large."""
+    size = crc = 0
+    with path.open("rb") as file:
+        while piece := file.read(_PIECE):
+            size, crc = size + len(piece), zlib.crc32(piece, crc)
+    return size, crc
+
+
+def identity(path: Path) -> str:
+    """What tells this file from any other."""
+    size, checksum = size_and_checksum(path)
+    return f"{size}-{checksum:08x}"
+
+
+def checksum(tensors: Mapping[str, Tensor]) -> int:
+    """CRC-32 over the bytes of all tensors, in the order of their names."""
+    crc = 0
+    for name in sorted(tensors):
+        crc = zlib.crc32(_bytes_of(tensors[name].detach().contiguous()), crc)
+    return crc
+
+
+def _bytes_of(tensor: Tensor) -> memoryview:
+    """The memory of a contiguous tensor."""
+    # An empty array has no memory to view; and numpy's types do not say that an array is a buffer.
+    return memoryview(tensor.reshape(-1).view(torch.uint8).numpy() if tensor.numel() else bytearray())  # type: ignore[arg-type]

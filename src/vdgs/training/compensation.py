@@ -1,0 +1,155 @@
+"""Compensated anchor growth: gradients of places that few cameras see are remembered and added (VDGS section IV-C).
+
+Dimensions: n anchors, k offsets. A growth cycle is what lies between two growth decisions. At its end, in this order:
+
+    low, threshold = low_visibility(share, config)                           # eq. 8's c_k -> the set L, eq. 9
+    update_cache(compensation, statistics, low, config)                      # g_k, eq. 10
+    change = compensate(compensation, low, threshold, growth, config)
+    decision = decide(..., compensated=change)                               # grows; resets what was judged
+    compensation = compensation.extended(len(decision.added)).select(kept)   # with anchors and statistics
+    begin_cycle(compensation, statistics)                                    # the next cycle counts from here
+
+c_k belongs to the source anchor, hence L is a set of anchors; g_k belongs to the offset.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from vdgs.settings.method import CompensationConfig, GrowthConfig
+from vdgs.training.growth import Compensated, Decision, Statistics
+
+#: An offset of low visibility is judged only when it was drawn more often than this (choice).
+LEAST_GATE = 2.0
+
+
+@dataclass
+class Compensation:
+    """What is remembered of each offset from cycle to cycle (float32).
+
+    Growth statistics carry over from cycle to cycle until they are judged. What they were when the cycle began is
+    kept beside them: the sums of the cycle alone are then a difference, and no step has more to count.
+    """
+
+    #: The cache g_k, a gradient norm in NDC units.
+    cache: Float[Tensor, "n k"]
+    #: `Statistics.gradient` and `.drawn` when the cycle began.
+    gradient_before: Float[Tensor, "n k"]
+    drawn_before: Float[Tensor, "n k"]
+
+    @staticmethod
+    def zeros(n: int, k: int) -> Compensation:
+        return Compensation(torch.zeros(n, k), torch.zeros(n, k), torch.zeros(n, k))
+
+    def tensors(self) -> dict[str, Tensor]:
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+    def select(self, rows: Tensor) -> Compensation:
+        """Those of the given anchors (indices or mask)."""
+        return Compensation(**{name: tensor[rows] for name, tensor in self.tensors().items()})
+
+    def extended(self, count: int) -> Compensation:
+        """The same, followed by `count` anchors without history."""
+        return Compensation(
+            **{name: torch.cat([t, t.new_zeros(count, t.shape[1])]) for name, t in self.tensors().items()}
+        )
+
+
+def low_visibility(share: Float[Tensor, " n"], config: CompensationConfig) -> tuple[Bool[Tensor, " n"], float]:
+    """The set L = {c_k < T_low} of anchors, and the T_low used.
+
+    `share` is c_k: the share in [0, 1] of the cycle's cameras whose frustum holds the anchor. With `t_low_quantile`
+    above 0, T_low is that quantile of the shares above 0, and 0 where there are none (L is then empty).
+    """
+    threshold = config.t_low
+    if config.t_low_quantile > 0:
+        some = share[share > 0]
+        # Not torch.quantile, which refuses more than 16 million numbers.
+        threshold = float(np.quantile(some.numpy(), config.t_low_quantile)) if len(some) else 0.0
+    return share < threshold, threshold
+
+
+def begin_cycle(compensation: Compensation, statistics: Statistics) -> None:
+    """From here on the statistics count for the next cycle. To be called after the resets of a decision.
+
+    Raises ValueError if the two do not describe the same offsets.
+    """
+    _check_aligned(compensation, statistics)
+    compensation.gradient_before.copy_(statistics.gradient)
+    compensation.drawn_before.copy_(statistics.drawn)
+
+
+def cycle_gradient(compensation: Compensation, statistics: Statistics) -> Float[Tensor, "n k"]:
+    """The mean gradient norm of each offset over the times it was drawn in this cycle; 0 where it was not."""
+    _check_aligned(compensation, statistics)
+    times = (statistics.drawn - compensation.drawn_before).clamp_(min=1)
+    return (statistics.gradient - compensation.gradient_before).div_(times)
+
+
+def update_cache(
+    compensation: Compensation, statistics: Statistics, low: Bool[Tensor, " n"], config: CompensationConfig
+) -> None:
+    """End of a cycle, in place (eq. 10): g_k <- gamma g_k + beta_g times the cycle's mean gradient for k in L.
+
+    The others only decay, so that what was poorly seen once is not compensated for ever. At most `cap`, where there
+    is one. To be called before the decision, which resets statistics.
+    """
+    fed = cycle_gradient(compensation, statistics).mul_(config.beta_g).mul_(low[:, None])
+    # Two operations: one fused multiply-add would round differently where vector and remainder code differ.
+    compensation.cache.mul_(config.gamma).add_(fed)
+    if config.cap > 0:
+        compensation.cache.clamp_(max=config.cap)
+
+
+def compensate(
+    compensation: Compensation,
+    low: Bool[Tensor, " n"],
+    threshold: float,
+    growth: GrowthConfig,
+    config: CompensationConfig,
+) -> Compensated:
+    """What this cycle's decision adds to the mean gradients, and from when on it judges offsets of L.
+
+    Gate `scaled` (choice): T_low times the plain gate, but at least twice and never more than the plain gate.
+    `threshold` is the T_low that `low_visibility` used.
+    """
+    plain = growth.gate * growth.interval
+    gate = plain if config.gate == "literal" else min(plain, max(LEAST_GATE, threshold * plain))
+    return Compensated(compensation.cache * low[:, None], low, gate)
+
+
+def cycle_facts(
+    compensated: Compensated, threshold: float, decision: Decision, config: CompensationConfig
+) -> dict[str, Any]:
+    """JSON-able facts of one cycle for the log.
+
+    `low_share`: share of the anchors that are of low visibility; `t_low`: the threshold used; `mean_cache`,
+    `max_cache`: g over the offsets of L (null where L is empty), `capped`: how many of them are at the cap;
+    `grown_low`, `grown_other`: new anchors in cells with a parent in L, and the others; `pruned`: anchors removed.
+    """
+    low, offsets = int(compensated.low.sum()), compensated.added.shape[1]
+    added = compensated.added.numpy()  # numpy sums in one order for any number of threads
+    return {
+        "low_share": low / max(len(compensated.low), 1),
+        "t_low": threshold,
+        "mean_cache": float(added.sum(dtype=np.float64)) / (low * offsets) if low else None,
+        "max_cache": float(added.max()) if low else None,
+        "capped": int((added >= config.cap).sum()) if config.cap > 0 else 0,
+        "grown_low": decision.grown_low,
+        "grown_other": decision.grown_other,
+        "pruned": decision.pruned,
+    }
+
+
+def _check_aligned(compensation: Compensation, statistics: Statistics) -> None:
+    if compensation.cache.shape != statistics.drawn.shape:
+        raise ValueError(
+            f"compensation is kept of {list(compensation.cache.shape)} offsets, "
+            f"statistics of {list(statistics.drawn.shape)}"
+        )

@@ -1,0 +1,121 @@
+"""A training step by hand: a view drawn, and the way back from its image to the anchors.
+
+Autograd would hold a copy of the anchors in view and gradients beside all that they belong to. By hand, anchors are
+read where they stand, gradients of splats take the place of what is no longer needed, and an anchor moves as soon as
+its gradient is known. The bits are those of autograd through `decode` and `rasterise`, with Adam after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int32, Int64
+from torch import Tensor
+
+from vdgs.cameras import Camera
+from vdgs.kernels import native as kernels
+from vdgs.kernels.native.rasterise import Drawing, rasterise_by_hand
+from vdgs.kernels.types import DecoderWeights, SplatGradients, Splats
+from vdgs.model.anchors import TRAINED, Anchors
+from vdgs.training.optimiser import Optimiser
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingView:
+    """A picture for training, and what the way back needs of the m splats of the anchors that are trained."""
+
+    image: Float[Tensor, "h w 3"]
+    source: Int32[Tensor, " m"]
+    colours: Float[Tensor, "m 3"]
+    opacities: Float[Tensor, " m"]
+    #: Mean volume of the splats; NaN if there are none.
+    volume: Float[Tensor, ""]
+    drawing: Drawing
+    #: What the gradients of means_px and conics, of these splats and then of those around them, may overwrite.
+    room: tuple[Tensor, Tensor]
+
+    @torch.no_grad()
+    def backward(self, image: Float[Tensor, "h w 3"], volume_weight: float) -> SplatGradients:
+        """Gradients of a loss: `image` by the picture, `volume_weight` by the mean volume. Call it once."""
+        m = len(self.source)
+        means_px, conics, colours, opacities, *_ = self.drawing.backward(image, over=self.room)
+        # In float32, as autograd divides.
+        volume = float(torch.tensor(volume_weight) / m) if m else 0.0
+        return SplatGradients(
+            means_px[:m], conics[:m], colours[:m], opacities[:m], volume, self.source, self.colours, self.opacities
+        )
+
+
+@torch.no_grad()
+def draw_view(
+    splats: Splats, camera: Camera, background: Float[Tensor, "3"], around: Splats | None = None
+) -> TrainingView:
+    """Draw the splats of trained anchors with those `around` them. The tensors of `splats` are the view's from now on:
+    their memory is used again."""
+
+    def both(name: str) -> Tensor:
+        own: Tensor = getattr(splats, name)
+        return own if around is None else torch.cat([own, getattr(around, name)])
+
+    means_px, conics = both("means_px"), both("conics")
+    raster, drawing = rasterise_by_hand(
+        means_px, conics, both("colours"), both("opacities"), both("depths"), background,
+        width=camera.width, height=camera.height,
+    )  # fmt: skip
+    return TrainingView(
+        raster.image, splats.source, splats.colours, splats.opacities, splats.volumes.mean(), drawing,
+        (means_px, conics),
+    )  # fmt: skip
+
+
+def move_anchors(
+    anchors: Anchors,
+    rows: Int64[Tensor, " v"],
+    gradients: SplatGradients,
+    weights: DecoderWeights,
+    camera: Camera,
+    optimiser: Optimiser,
+    rates: dict[str, float],
+    step: int,
+    mobility: Callable[[Tensor], Tensor] | None = None,
+) -> bool:
+    """Move the anchors of the given rows in place, and leave the decoder's gradients in its `.grad`.
+
+    `weights` are the decoder's as the view saw them, `step` counts from 1; `mobility` as in `training.Stage`.
+    False: a gradient is not finite, and some anchors may have moved while others have not.
+    """
+    slow = None if mobility is None else _SlowAnchors.of(anchors, rows, mobility)
+    states = optimiser.anchor_states(anchors, rates)
+    finite, of_weights = kernels.decode_backward_adam(
+        anchors.positions, states, weights, camera, rows, gradients, step=step
+    )
+    if slow is not None:
+        slow.hold_back(anchors)
+    if of_weights is not None:
+        # A first bias that carries an appearance is made of other tensors: autograd knows of which.
+        torch.autograd.backward(weights.tensors(), of_weights)
+    return finite
+
+
+@dataclass(frozen=True)
+class _SlowAnchors:
+    """Those visible anchors that make less than a full step, as they were before it."""
+
+    rows: Int64[Tensor, " s"]
+    share: Float[Tensor, " s"]
+    before: Anchors
+
+    @staticmethod
+    def of(anchors: Anchors, rows: Tensor, mobility: Callable[[Tensor], Tensor]) -> _SlowAnchors:
+        share = mobility(anchors.positions[rows])
+        slow = share < 1
+        return _SlowAnchors(rows[slow], share[slow], anchors.select(rows[slow]))
+
+    def hold_back(self, anchors: Anchors) -> None:
+        """Take back the rest of the step, in place."""
+        for name in TRAINED:
+            before, tensor = getattr(self.before, name), getattr(anchors, name)
+            part = self.share.reshape(-1, *[1] * (before.ndim - 1))
+            tensor[self.rows] = before + part * (tensor[self.rows] - before)

@@ -1,0 +1,1 @@
+"""Training under the eyes of a person: shown, logged, saved, stopped and continued."""
