@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from native_choice import every_instruction_set, on_threads, using
 from vdgs.kernels.native import adam as native
 from vdgs.kernels.reference import adam as reference
-from vdgs.training.optimiser import rebuild
 
 BOTH = pytest.mark.parametrize("implementation", [reference, native])
 
@@ -189,19 +188,3 @@ def test_unsuitable_arguments_are_refused(implementation):
     ]:
         with pytest.raises(error):
             step(**changes)
-
-
-@pytest.mark.parametrize("pruned", [0, 3])
-@pytest.mark.parametrize("added", [0, 4])
-def test_rebuilding_keeps_rows_of_old_and_new_and_lets_old_tensors_go(pruned, added):
-    generator = torch.Generator().manual_seed(pruned + added)
-    before = {"a": torch.randn(10, 2, 3, generator=generator), "b": torch.randn(10, generator=generator)}
-    more = {name: torch.randn(added, *t.shape[1:], generator=generator) for name, t in before.items()}
-    kept = torch.ones(10 + added, dtype=torch.bool)
-    kept[torch.randperm(10 + added, generator=generator)[:pruned]] = False
-    order = torch.randperm(10 + added, generator=generator)
-    for rows in (kept, order):
-        tensors = dict(before)
-        rebuild(tensors, more, rows)
-        for name, tensor in tensors.items():
-            assert torch.equal(tensor, torch.cat([before[name], more[name]])[rows])

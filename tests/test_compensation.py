@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vdgs.kernels.types import Statistics
 from vdgs.model.anchors import Anchors
 from vdgs.settings.method import CompensationConfig, GrowthConfig
 from vdgs.training.compensation import (
@@ -21,7 +22,8 @@ from vdgs.training.compensation import (
     low_visibility,
     update_cache,
 )
-from vdgs.training.growth import Statistics, decide
+from vdgs.training.growth import decide
+from vdgs.training.per_anchor import remap_rows
 
 K = 3
 PAPER = CompensationConfig()
@@ -68,12 +70,19 @@ def simulate(config: CompensationConfig | None, seed: int, cycles: int = 4, grow
             update_cache(memory, statistics, low, config)
             change = compensate(memory, low, threshold, growth, config)
         decision = decide(anchors, statistics, 1.0, growth, g, compensated=change)
-        count = len(decision.added)
-        kept = torch.cat([decision.kept, torch.ones(count, dtype=torch.bool)])
+        kept = torch.cat([decision.kept, torch.ones(len(decision.added), dtype=torch.bool)])
         anchors = anchors.extended(decision.added).select(kept)
-        statistics, memory = statistics.extended(count).select(kept), memory.extended(count).select(kept)
+        statistics, memory = Statistics(**remapped(statistics, kept)), Compensation(**remapped(memory, kept))
         begin_cycle(memory, statistics)
     return anchors, statistics, memory
+
+
+def remapped(kept_per_anchor: Statistics | Compensation, kept: torch.Tensor) -> dict[str, torch.Tensor]:
+    """As training keeps them beside the anchors: new rows are zero."""
+    group = kept_per_anchor.tensors()
+    count = len(kept) - len(next(iter(group.values())))
+    remap_rows(group, {name: tensor.new_zeros(count, *tensor.shape[1:]) for name, tensor in group.items()}, kept)
+    return group
 
 
 def bits(anchors: Anchors, statistics: Statistics) -> list[bytes]:
@@ -277,14 +286,6 @@ def test_facts_without_low_visibility_are_null():
     assert facts["mean_cache"] is None
     assert facts["low_share"] == 0
     assert not any(isinstance(value, float) and math.isnan(value) for value in facts.values())
-
-
-def test_select_and_extend_keep_rows_together():
-    memory = Compensation(*(torch.arange(12.0).reshape(4, 3) + 100 * i for i in range(3)))
-    moved = memory.extended(2).select(torch.tensor([5, 2, 0]))
-    for i, tensor in enumerate(moved.tensors().values()):
-        expected = torch.stack([torch.zeros(3), torch.arange(6.0, 9) + 100 * i, torch.arange(0.0, 3) + 100 * i])
-        assert torch.equal(tensor, expected)
 
 
 def test_statistics_of_other_anchors_are_refused():

@@ -35,7 +35,7 @@ def test_the_list_of_operations_is_what_there_is():
 
 
 def test_today_the_processor_does_everything():
-    assert choose("auto") == Choice("cpu", "1 of 16 operations run on GPUs so far")
+    assert choose("auto") == Choice("cpu", "1 of 17 operations run on GPUs so far")
     assert choose("cpu").device == "cpu"
     assert str(choose("cpu")) == "device: cpu (as asked for)"
 
@@ -118,9 +118,9 @@ def test_doctor_says_what_there_is(monkeypatch: pytest.MonkeyPatch, tmp_path):
     lines = {check.name: check for check in doctor_cuda.looks()}
     assert lines["CUDA card 0"].value == "A card, 24.0 GB, compute capability 8.6; driver for CUDA 12.8"
     assert lines["NVRTC"].value == "13.0, from the wheel nvidia-cuda-nvrtc: /somewhere/libnvrtc.so.13"
-    assert lines["CUDA kernels"].value.startswith("1 of 16 operations: photometric_loss; compiled code in")
+    assert lines["CUDA kernels"].value.startswith("1 of 17 operations: photometric_loss; compiled code in")
     assert lines["CUDA kernels"].value.endswith("1 entries")
-    assert lines["--device auto"].value.startswith("cpu: 1 of 16 operations")
+    assert lines["--device auto"].value.startswith("cpu: 1 of 17 operations")
     assert all(check.works for check in lines.values())
 
 

@@ -6,6 +6,7 @@ import torch
 import vdgs.kernels.native.statistics as native
 import vdgs.kernels.reference.statistics as reference
 from native_choice import every_instruction_set, on_threads, using
+from vdgs.kernels.types import Statistics
 
 
 def view(seed: int, n: int = 3000, k: int = 7):
@@ -22,12 +23,12 @@ def view(seed: int, n: int = 3000, k: int = 7):
 def test_native_equals_twin(instructions, seed):
     inputs, sums = view(seed)
     expected = [s.clone() for s in sums]
-    reference.add_view_statistics(*inputs, *expected)
+    reference.add_view_statistics(Statistics(*expected), *inputs)
     results = []
     for threads in (1, 2, 3):
         ours = [s.clone() for s in sums]
         with using(instructions), on_threads(threads):
-            native.add_view_statistics(*inputs, *ours)
+            native.add_view_statistics(Statistics(*ours), *inputs)
         results.append(ours)
     for ours in results:
         for mine, twin, first in zip(ours, expected, results[0], strict=True):
@@ -39,7 +40,7 @@ def test_native_equals_twin(instructions, seed):
 def test_nothing_drawn_counts_only_the_visible(room):
     sums = [torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4), torch.zeros(4)]
     nothing = torch.zeros(0, dtype=torch.int32)
-    room.add_view_statistics(torch.tensor([1, 3]), nothing, torch.zeros(0), torch.zeros(0, 2), 8, 8, *sums)
+    room.add_view_statistics(Statistics(*sums), torch.tensor([1, 3]), nothing, torch.zeros(0), torch.zeros(0, 2), 8, 8)
     assert [float(s.sum()) for s in sums] == [0, 0, 0, 2]
 
 
@@ -48,5 +49,7 @@ def test_a_source_beyond_the_visible_is_refused(room):
     sums = [torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4), torch.zeros(4)]
     source = torch.tensor([0, 6], dtype=torch.int32)
     with pytest.raises(IndexError):
-        room.add_view_statistics(torch.tensor([1, 3]), source, torch.zeros(2), torch.zeros(2, 2), 8, 8, *sums)
+        room.add_view_statistics(
+            Statistics(*sums), torch.tensor([1, 3]), source, torch.zeros(2), torch.zeros(2, 2), 8, 8
+        )
     assert float(sums[3].sum()) == 0

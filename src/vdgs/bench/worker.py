@@ -146,13 +146,11 @@ def take_coarse(source: Path, target: Path) -> None:
 
 def work(job: Job) -> None:
     """All stages of a job, noting how long each took; the record says done only at the end."""
-    import torch
     from rich.console import Console
 
-    from vdgs.kernels.native.module import set_threads
+    from vdgs.kernels import set_threads
 
     set_threads(job.threads)
-    torch.set_num_threads(job.threads)
     working = _Working(job, *_opened(job), Console(soft_wrap=True))
     record = _record(job)
     write_json(job.output / RECORD, record)  # what an interrupted run leaves is not what it was before

@@ -82,8 +82,9 @@ def visibility_map(run: TrainedRun) -> Callable[[Camera], np.ndarray]:
 
     So the same pixels are compared between the models of a run.
     """
-    coarse = (
-        run if run.name == "coarse" else replace(run, model=AnchorModel.load(run.folder.coarse.model), name="coarse")
-    )
+    coarse = run
+    if run.name != "coarse":
+        model = AnchorModel.load(run.folder.coarse.model).to(run.device)
+        coarse = replace(run, model=model, name="coarse")
     visibility = visibility_of_run(coarse).float()
-    return lambda camera: render_values(coarse.model, visibility, camera).numpy()
+    return lambda camera: render_values(coarse.model, visibility, camera).cpu().numpy()

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels import native as kernels
+from vdgs.kernels import choose
 
 #: Percentiles and limits by which visibility is described.
 QUANTILES = (5, 25, 50, 75, 95)
@@ -42,7 +42,7 @@ def visibility_of(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) ->
 
     Raises TypeError or ValueError unless positions are float32 or float64 [n, 3].
     """
-    return kernels.count_visibility(positions, cameras)
+    return choose(positions.device).count_visibility(positions, cameras)
 
 
 def votes_of(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> tuple[float, ...]:

@@ -19,10 +19,10 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
-from vdgs.kernels import native as kernels
 from vdgs.model.anchor_model import AnchorModel, Part
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
+from vdgs.model.visibility import visibility_of
 from vdgs.partition.blocks import Blocks, places_of
 from vdgs.settings.method import MergeConfig
 
@@ -67,7 +67,7 @@ def merge(
             piece = model.anchors.select(torch.from_numpy(givers == index))
             held = len(model.anchors)
             counts = {"trained": held, "kept": len(piece), "dropped": held - len(piece), "from_coarse": 0}
-        unseen = int((kernels.count_visibility(piece.positions, cameras_of_block[index]) == 0).sum())
+        unseen = int((visibility_of(piece.positions, cameras_of_block[index]) == 0).sum())
         pieces.append(Part(len(piece), coarse.decoder if model is None else model.decoder))
         selected.append(piece)
         facts.append({"block": index, **counts, "unseen": unseen})
@@ -113,7 +113,7 @@ def giver_of_places(
 
 def _visibility(positions: Float[Tensor, "n 3"], rows: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """V_i of the given rows over these cameras."""
-    return kernels.count_visibility(positions[torch.from_numpy(rows)], cameras).numpy()
+    return visibility_of(positions[torch.from_numpy(rows)], cameras).numpy()
 
 
 def _joined(pieces: Sequence[Anchors]) -> Anchors:

@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels import native as kernels
 from vdgs.model.anchors import Anchors
+from vdgs.model.render import visible_rows
 from vdgs.partition.blocks import Blocks, places_of
 from vdgs.settings.method import BlockConfig
 
@@ -34,14 +34,15 @@ def split_anchors(anchors: Anchors, blocks: Blocks, index: int, config: BlockCon
     core, reached = blocks.owner(place) == index, blocks.reaches(index, place)
     own = core if config.ring == "frozen" else reached
     around = ~own if config.context else reached & ~own
-    return torch.from_numpy(own), torch.from_numpy(around)
+    device = anchors.positions.device
+    return torch.from_numpy(own).to(device), torch.from_numpy(around).to(device)
 
 
 def drawn_by(anchors: Anchors, cameras: Sequence[Camera]) -> Bool[Tensor, " n"]:
     """Which anchors one of the cameras may draw."""
-    drawn = torch.zeros(len(anchors), dtype=torch.bool)
+    drawn = torch.zeros_like(anchors.positions[:, 0], dtype=torch.bool)
     for camera in cameras:
-        drawn[kernels.cull(anchors.positions, anchors.log_scales, camera)] = True
+        drawn[visible_rows(anchors, camera)] = True
     return drawn
 
 
@@ -51,7 +52,7 @@ def holds(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor],
     def inside(positions: Float[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
         place = places_of(positions)
         kept = blocks.owner(place) == index if config.ring == "frozen" else blocks.reaches(index, place)
-        return torch.from_numpy(kept)
+        return torch.from_numpy(kept).to(positions.device)
 
     return inside
 

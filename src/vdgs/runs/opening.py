@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import refuse_another_capture
 from vdgs.captures.loading import load_capture
@@ -28,9 +30,17 @@ class TrainedRun:
     name: str
     status: dict[str, Any]
 
+    @property
+    def device(self) -> torch.device:
+        """Where the model is."""
+        return self.model.anchors.positions.device
 
-def open_run(path: Path, which: ModelName = "best") -> TrainedRun:
-    """Open a run. Raises RunError if it is none or not trained, CaptureError if its photographs are gone."""
+
+def open_run(path: Path, which: ModelName = "best", device: torch.device | str = "cpu") -> TrainedRun:
+    """Open a run, its model on a device.
+
+    Raises RunError if it is none or not trained, CaptureError if its photographs are gone.
+    """
     folder = RunFolder(path)
     capture = open_capture(folder)
     name = which
@@ -49,7 +59,7 @@ def open_run(path: Path, which: ModelName = "best") -> TrainedRun:
             f"{path}: has no {name} model of its settings yet (state: {stage.status()['state']}). Run {verb} (again): "
             "training continues from the last saved state."
         )
-    model = AnchorModel.load(stage.model)
+    model = AnchorModel.load(stage.model).to(torch.device(device))
     refuse_another_capture(stage.model, model.facts.get("capture", {}), capture)
     return TrainedRun(folder, capture, model, stage.model, name, stage.status())
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import torch
 from rich.console import Console
 
 from vdgs import __version__
@@ -36,8 +37,8 @@ from vdgs.watching.anchors import continue_or_start, finish, note_without_growth
 from vdgs.watching.images import image_budget
 
 
-def train_block(path: Path, index: int, options: WatchOptions, console: Console) -> None:
-    """Train, or continue, one block of a run; nothing if it is finished.
+def train_block(path: Path, index: int, options: WatchOptions, console: Console, device: str = "cpu") -> None:
+    """Train, or continue, one block of a run on a device; nothing if it is finished.
 
     Works beside other blocks of the run, in this or in other processes. Raises RunError if the run is not cut into
     blocks or has no such block, and what training raises (see `train_watched`).
@@ -54,11 +55,13 @@ def train_block(path: Path, index: int, options: WatchOptions, console: Console)
                 console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
                 return
             folder.claim(key)
-            _train(run, index, blocks, options, console)
+            _train(run, index, blocks, options, console, torch.device(device))
 
 
-def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, console: Console) -> None:
-    opened, folder, method = open_run(run.path, "coarse"), run.block(index), run.method()
+def _train(
+    run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, console: Console, device: torch.device
+) -> None:
+    opened, folder, method = open_run(run.path, "coarse", device), run.block(index), run.method()
     capture, coarse = opened.capture, opened.model
     chosen = views_of_block(run, capture, index)
     views = [capture.train_views[i] for i in chosen]
@@ -84,8 +87,9 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
     with ImageCache(views, image_budget(options), downscales=factors) as images:
         stage = Stage(
-            config, images, len(views), coarse.voxel, camera_height(capture), coarse.background,
-            frozen_decoder=method.block.decoder == "frozen", surroundings=Surroundings(surroundings, coarse.decoder),
+            config, images, len(views), coarse.voxel, camera_height(capture), kind="block",
+            background=coarse.background, device=device, frozen_decoder=method.block.decoder == "frozen",
+            surroundings=Surroundings(surroundings, coarse.decoder),
             may_hold=holds(blocks, index, method.block), mobility=ramp(blocks, index, method.block),
             appearance_of=chosen, shares=shares, crops=crops,
         )  # fmt: skip

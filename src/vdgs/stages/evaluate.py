@@ -31,10 +31,16 @@ HELD_BYTES = 2_000_000_000
 
 
 def evaluate_stage(
-    path: Path, which: ModelName, lpips_weights: Path | None, bins: int, console: Console, views: Views = "test"
+    path: Path,
+    which: ModelName,
+    lpips_weights: Path | None,
+    bins: int,
+    console: Console,
+    views: Views = "test",
+    device: str = "cpu",
 ) -> None:
     """Measure a model of a run; of the merged one, on test views, also block by block and at the seams."""
-    opened = open_run(path, which)
+    opened = open_run(path, which, device)
     output = evaluation_folder(opened.folder, opened.name, views)
     _forget(output)
     forget_peak()
@@ -70,7 +76,7 @@ def _forget(output: Path) -> None:
 
 def _evaluate_blocks(opened: TrainedRun) -> dict[str, Any]:
     run = opened.folder
-    coarse, blocks = AnchorModel.load(run.coarse.model), blocks_of(run)
+    coarse, blocks = AnchorModel.load(run.coarse.model).to(opened.device), blocks_of(run)
     alone = BlocksAlone(run, coarse)
     with cached_photographs(opened.capture.test_views) as photographs:
         return evaluate_blocks(
@@ -106,7 +112,7 @@ class BlocksAlone:
 
     def assembled(self, index: int) -> AnchorModel:
         """A block's own anchors and what stood around them in its training, each with its decoder."""
-        own = AnchorModel.load(self._run.block(index).model)
+        own = AnchorModel.load(self._run.block(index).model).to(self._coarse.anchors.positions.device)
         around = self._coarse.anchors.select(self._around[index])
         parts = Part(len(own.anchors), own.decoder), Part(len(around), self._coarse.decoder)
         return replace(own, anchors=own.anchors.extended(around), parts=parts)

@@ -47,15 +47,15 @@ class _Scene:
     cameras: list[Camera]
 
     @staticmethod
-    def of(run: RunFolder) -> _Scene:
-        opened = open_run(run.path, "coarse")
+    def of(run: RunFolder, device: str) -> _Scene:
+        opened = open_run(run.path, "coarse", device)
         cameras = [view.camera for view in opened.capture.train_views]
-        positions = opened.model.anchors.positions.numpy()
+        positions = opened.model.anchors.positions.cpu().numpy()
         return _Scene(opened, positions, keep_visibility(opened).numpy(), cameras)
 
 
-def partition_run(run: RunFolder, console: Console) -> None:
-    """Cut the scene of a run and assign its cameras; what is there for the same settings is kept.
+def partition_run(run: RunFolder, console: Console, device: str = "cpu") -> None:
+    """Cut the scene of a run and assign its cameras, drawing on a device; what is there for the same settings is kept.
 
     Raises RunError without a coarse model.
     """
@@ -66,7 +66,7 @@ def partition_run(run: RunFolder, console: Console) -> None:
         return
     with run.locked():
         forget_peak()
-        began, method, scene = time.monotonic(), run.method(), _Scene.of(run)
+        began, method, scene = time.monotonic(), run.method(), _Scene.of(run, device)
         if kept is not None:
             blocks, warnings = kept, list(before.get("warnings", []))
         else:

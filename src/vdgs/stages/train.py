@@ -13,7 +13,7 @@ from rich.console import Console
 
 from vdgs.errors import RunError, VdgsError
 from vdgs.executors.local import Job, default_jobs, run_jobs
-from vdgs.kernels.native.module import threads as threads_available
+from vdgs.kernels import threads as threads_available
 from vdgs.memory.estimate import Need, estimate, in_gb
 from vdgs.memory.process import available_bytes
 from vdgs.runs.cut import blocks_of

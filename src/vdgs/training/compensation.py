@@ -6,7 +6,7 @@ Dimensions: n anchors, k offsets. A growth cycle is what lies between two growth
     update_cache(compensation, statistics, low, config)                      # g_k, eq. 10
     change = compensate(compensation, low, threshold, growth, config)
     decision = decide(..., compensated=change)                               # grows; resets what was judged
-    compensation = compensation.extended(len(decision.added)).select(kept)   # with anchors and statistics
+    remap(state, ...)                                                        # with all that is kept per anchor
     begin_cycle(compensation, statistics)                                    # the next cycle counts from here
 
 c_k belongs to the source anchor, hence L is a set of anchors; g_k belongs to the offset.
@@ -22,8 +22,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vdgs.kernels.types import Statistics
 from vdgs.settings.method import CompensationConfig, GrowthConfig
-from vdgs.training.growth import Compensated, Decision, Statistics
+from vdgs.training.growth import Compensated, Decision
 
 #: An offset of low visibility is judged only when it was drawn more often than this (choice).
 LEAST_GATE = 2.0
@@ -44,21 +45,11 @@ class Compensation:
     drawn_before: Float[Tensor, "n k"]
 
     @staticmethod
-    def zeros(n: int, k: int) -> Compensation:
-        return Compensation(torch.zeros(n, k), torch.zeros(n, k), torch.zeros(n, k))
+    def zeros(n: int, k: int, device: torch.device | None = None) -> Compensation:
+        return Compensation(*(torch.zeros(n, k, device=device) for _ in range(3)))
 
     def tensors(self) -> dict[str, Tensor]:
         return {item.name: getattr(self, item.name) for item in fields(self)}
-
-    def select(self, rows: Tensor) -> Compensation:
-        """Those of the given anchors (indices or mask)."""
-        return Compensation(**{name: tensor[rows] for name, tensor in self.tensors().items()})
-
-    def extended(self, count: int) -> Compensation:
-        """The same, followed by `count` anchors without history."""
-        return Compensation(
-            **{name: torch.cat([t, t.new_zeros(count, t.shape[1])]) for name, t in self.tensors().items()}
-        )
 
 
 def low_visibility(share: Float[Tensor, " n"], config: CompensationConfig) -> tuple[Bool[Tensor, " n"], float]:
@@ -71,7 +62,7 @@ def low_visibility(share: Float[Tensor, " n"], config: CompensationConfig) -> tu
     if config.t_low_quantile > 0:
         some = share[share > 0]
         # Not torch.quantile, which refuses more than 16 million numbers.
-        threshold = float(np.quantile(some.numpy(), config.t_low_quantile)) if len(some) else 0.0
+        threshold = float(np.quantile(some.cpu().numpy(), config.t_low_quantile)) if len(some) else 0.0
     return share < threshold, threshold
 
 
@@ -134,7 +125,7 @@ def cycle_facts(
     `grown_low`, `grown_other`: new anchors in cells with a parent in L, and the others; `pruned`: anchors removed.
     """
     low, offsets = int(compensated.low.sum()), compensated.added.shape[1]
-    added = compensated.added.numpy()  # numpy sums in one order for any number of threads
+    added = compensated.added.cpu().numpy()  # numpy sums in one order for any number of threads
     return {
         "low_share": low / max(len(compensated.low), 1),
         "t_low": threshold,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -39,9 +39,9 @@ def eval(arguments: list[str]) -> None:
     asked = tyro.cli(EvalArguments, args=arguments, prog="vdgs eval")
     from vdgs.stages.evaluate import evaluate_stage
 
-    use_device(asked.device)
+    device = use_device(asked.device)
     use_threads(asked.threads)
-    evaluate_stage(asked.run, asked.model, asked.lpips_weights, asked.bins, open_console(), asked.views)
+    evaluate_stage(asked.run, asked.model, asked.lpips_weights, asked.bins, open_console(), asked.views, device)
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,6 @@ def render(arguments: list[str]) -> None:
     asked = tyro.cli(RenderArguments, args=arguments, prog="vdgs render")
     from vdgs.films.film import render_run
 
-    use_device(asked.device)
+    device = use_device(asked.device)
     use_threads(asked.threads)
-    render_run(asked, open_console())
+    render_run(replace(asked, device=device), open_console())

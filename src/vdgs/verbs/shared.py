@@ -56,13 +56,9 @@ def change_settings(run: RunFolder, method: MethodConfig, redo: bool) -> None:
 
 
 def use_threads(count: int) -> None:
-    import torch
+    from vdgs.kernels import set_threads, threads
 
-    from vdgs.kernels.native.module import set_threads, threads
-
-    if count > 0:
-        set_threads(count)
-    torch.set_num_threads(max(1, threads()))
+    set_threads(count if count > 0 else threads())
 
 
 def use_device(asked: str) -> str:

@@ -16,7 +16,7 @@ from vdgs.settings.watching import WatchOptions
 from vdgs.storage.checkpoints import save_state
 from vdgs.storage.tensors import identity
 from vdgs.training import Stage, StepReport, TrainingState, from_saved, to_saved, train
-from vdgs.watching.memory_notes import after_failure, announce, kind_of, need_of
+from vdgs.watching.memory_notes import after_failure, announce, need_of
 from vdgs.watching.progress import TrainingProgress
 from vdgs.watching.watch import Keeper, Watched, restore_or_start, watch
 
@@ -48,7 +48,7 @@ def train_watched(
 
     Says first how much memory it will take. Raises what `watch` raises.
     """
-    kind, need = kind_of(stage), need_of(state, stage)
+    kind, need = stage.kind, need_of(state, stage)
     announce(need, kind, console)
     training = Watched(
         folder, state,

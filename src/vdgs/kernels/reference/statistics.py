@@ -6,18 +6,17 @@ import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
+from vdgs.kernels.types import Statistics
+
 
 def add_view_statistics(
+    statistics: Statistics,
     visible: Int64[Tensor, "v"],
     source: Int32[Tensor, "m"],
     opacities: Float[Tensor, "m"],
     gradient_px: Float[Tensor, "m 2"],
     width: int,
     height: int,
-    gradient: Float[Tensor, "n k"],
-    drawn: Float[Tensor, "n k"],
-    opacity: Float[Tensor, "n"],
-    seen: Float[Tensor, "n"],
 ) -> None:
     """Add one view to the sums that growth decides by (Scaffold-GS section 4.2), in place.
 
@@ -26,15 +25,15 @@ def add_view_statistics(
     width/2 and height/2. Each drawn offset gains its norm and a count, each visible anchor the opacity of its
     splats and a count. Raises IndexError for a source beyond the visible anchors, before any change.
     """
-    k = gradient.shape[1]
+    k = statistics.gradient.shape[1]
     check_sources(source, visible, k)
     row = source.long()
     slot = visible[row // k] * k + row % k
     norm = torch.hypot(gradient_px[:, 0] * (width / 2), gradient_px[:, 1] * (height / 2))
-    gradient.view(-1)[slot] += norm
-    drawn.view(-1)[slot] += 1
-    opacity[visible] += torch.zeros(len(visible)).index_add_(0, row // k, opacities)
-    seen[visible] += 1
+    statistics.gradient.view(-1)[slot] += norm
+    statistics.drawn.view(-1)[slot] += 1
+    statistics.opacity[visible] += opacities.new_zeros(len(visible)).index_add_(0, row // k, opacities)
+    statistics.seen[visible] += 1
 
 
 def check_sources(source: Tensor, visible: Tensor, k: int) -> None:
