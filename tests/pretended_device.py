@@ -2,7 +2,7 @@
 
 Torch's own fake tensors cannot do this here: without a CUDA build, autograd on a fake `cuda` tensor ends the process.
 So the device is a mark on the memory of a tensor. Code under test reads it as `tensor.device`; every operation, those
-of the backward pass included, is checked as a card would check it: all tensors but numbers (no dimension) on one device.
+of the backward pass included, is checked as a card would check it: all tensors but single numbers on one device.
 """
 
 from __future__ import annotations
