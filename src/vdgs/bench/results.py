@@ -10,9 +10,9 @@ from typing import Any
 from vdgs.bench.definitions import EXPLICIT
 from vdgs.bench.measure import GROUPS_FILE, evaluated
 from vdgs.bench.plan import Plan, PlannedRun
-from vdgs.bench.processes import Ended
 from vdgs.bench.worker import RECORD
 from vdgs.errors import VdgsError
+from vdgs.executors.executor import Outcome
 from vdgs.runs.folder import RunFolder
 from vdgs.storage.files import read_json
 
@@ -40,7 +40,7 @@ class Result:
     seen_by: str = ""
 
 
-def gather(plan: Plan, output: Path, ended: Mapping[str, Ended]) -> list[Result]:
+def gather(plan: Plan, output: Path, ended: Mapping[str, Outcome]) -> list[Result]:
     """The results of every (scene, method, seed) of a plan, from its run folders."""
     results = []
     for (scene, method, seed), run in plan.answers.items():

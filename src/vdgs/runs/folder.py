@@ -99,6 +99,14 @@ class StageFolder:
         with _lock(self.path, fcntl.LOCK_EX):
             yield
 
+    def is_held(self) -> bool:
+        """Another process works on this stage. A folder that cannot be written is held by none."""
+        try:
+            with self.locked():
+                return False
+        except RunError as error:
+            return isinstance(error.__cause__, BlockingIOError)
+
     def cut_log(self, iteration: int) -> None:
         """Drop log lines after `iteration` (and a half-written last one), so that a continued run repeats none."""
         if not self.log.exists():
