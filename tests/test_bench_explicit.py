@@ -18,11 +18,10 @@ from vdgs.bench.results import Result
 from vdgs.comparators.gaussians import watching as gaussian_watching
 from vdgs.comparators.gaussians.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS, scheduled
 from vdgs.comparators.gaussians.training import GaussiansConfig
-from vdgs.errors import RunError
+from vdgs.errors import RunError, Stopped
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
 from vdgs.settings.method import MethodConfig
-from vdgs.watching.watch import Stopped
 
 
 def test_the_published_length_has_the_published_schedule():

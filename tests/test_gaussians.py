@@ -22,12 +22,11 @@ from vdgs.comparators.gaussians.training import (
     GaussiansConfig,
     train,
 )
-from vdgs.errors import RunError, VdgsError
+from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.evaluate import EvaluationSettings
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.watching import WatchOptions
-from vdgs.watching.watch import Stopped
 
 DENSITY = DensityConfig(start=15, interval=10, until=0.5, dense=0.08, reset_interval=40)
 SHORT = GaussiansConfig(iterations=60, resolutions=((0, 2), (30, 1)), density=DENSITY)

@@ -34,7 +34,7 @@ from vdgs.bench.verdict import verdict
 from vdgs.bench.worker import RECORD, Job
 from vdgs.bench.writing import latex, markdown, tidy_csv
 from vdgs.captures.loading import load_capture
-from vdgs.errors import VdgsError
+from vdgs.errors import Stopped, VdgsError
 from vdgs.evaluation.saving import write_json
 from vdgs.executors.executor import Outcome, Task
 from vdgs.executors.lines import Lines
@@ -46,7 +46,6 @@ from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.plain import differences, to_dict
 from vdgs.storage.files import read_json, write_text
 from vdgs.synth import SynthOptions, generate
-from vdgs.watching.watch import Stopped
 
 
 @dataclass(frozen=True)

@@ -10,17 +10,17 @@ import shlex
 import shutil
 import signal
 import subprocess
-import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.executors.executor import EndState, Listener, Outcome, Task
 from vdgs.executors.output import explanation, last_lines
 from vdgs.executors.parent import PARENT
+from vdgs.interrupts import stop_requests
 from vdgs.runs.folder import StageFolder
 
 #: Exit codes of the command line (cli.py).
@@ -48,7 +48,7 @@ class LocalExecutor:
 
     def run(self, tasks: Sequence[Task], listener: Listener) -> list[Outcome]:
         """As `Executor.run`."""
-        with _stop_requests() as asked:
+        with stop_requests(hangup=True) as asked:
             crew = _Crew([_Work(task) for task in tasks], self, listener)
             try:
                 while not crew.step(asked):
@@ -247,21 +247,3 @@ def _without_words(task: Task, code: int) -> str:
         if shutil.disk_usage(folder).free < FULL_BYTES:
             return f"{folder}: the disk is full. Free some space, then run the same command again."
     return f"{_name(code)}, without a message"
-
-
-@contextmanager
-def _stop_requests() -> Iterator[list[int]]:
-    """The signals that asked to stop, in their order. Elsewhere than in the main thread Python allows no handlers."""
-    asked: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield asked
-        return
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup means it
-        numbers.append(signal.SIGHUP)
-    before = {number: signal.signal(number, lambda number, _frame: asked.append(number)) for number in numbers}
-    try:
-        yield asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

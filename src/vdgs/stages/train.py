@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from vdgs.errors import RunError, VdgsError
+from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.executors.blocks import BlockCommand, default_jobs, run_blocks
 from vdgs.executors.local import LocalExecutor
 from vdgs.kernels.native.module import threads as threads_available
@@ -19,7 +19,6 @@ from vdgs.memory.process import available_bytes
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.settings.watching import WatchOptions
-from vdgs.watching.watch import Stopped
 
 #: Share of a block's anchors that one photograph may see, for the estimate before a block is opened (choice).
 SEEN = 0.5

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import re
-import signal
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import cv2
 from rich.console import Console
 
-from vdgs.errors import RunError, TrainingDiverged, VdgsError
+from vdgs.errors import RunError, Stopped, TrainingDiverged, VdgsError
+from vdgs.interrupts import stop_requests
 from vdgs.memory.process import is_out_of_memory, peak_memory_bytes, return_unused
 from vdgs.runs.folder import StageFolder
 from vdgs.storage.checkpoints import SavedState, discard_after, load_newest, save_state
@@ -23,12 +22,6 @@ from vdgs.storage.checkpoints import SavedState, discard_after, load_newest, sav
 MEMORY_ERRORS = (MemoryError, RuntimeError, OSError, cv2.error)
 #: Seconds between two notes of the progress in status.json.
 STATUS_SECONDS = 2.0
-
-
-class Stopped(VdgsError):
-    """Training was asked to stop; its state is saved."""
-
-    stopped = True
 
 
 class WatchedState(Protocol):
@@ -105,9 +98,9 @@ def watch(training: Watched, loop: Callable[[Callable[[], bool]], bool]) -> None
     """
     folder, state = training.folder, training.state
     try:
-        with stop_requests() as stop:
+        with stop_requests(second_interrupts=True) as asked:
             folder.set_status("running", **training.facts())
-            complete = loop(stop)
+            complete = loop(lambda: bool(asked))
     except TrainingDiverged as error:
         folder.set_status("failed", iteration=state.iteration, why=str(error))
         raise TrainingDiverged(f"{error} {_kept(folder)} {training.after_divergence}".rstrip()) from error
@@ -188,21 +181,3 @@ def _wanted(error: BaseException) -> str:
     """How much was asked for in vain, where the error says so."""
     asked = re.search(r"allocate ([\d.]+) (bytes|[KMG]iB)", str(error))
     return f" ({asked.group(1)} {asked.group(2)} more could not be had)" if asked else ""
-
-
-@contextmanager
-def stop_requests() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and SIGTERM ask to stop after the current step; a second Ctrl-C interrupts at once."""
-    asked: list[int] = []
-
-    def ask(signum: int, _frame: object) -> None:
-        if asked and signum == signal.SIGINT:
-            raise KeyboardInterrupt
-        asked.append(signum)
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(asked)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
