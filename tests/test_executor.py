@@ -114,7 +114,7 @@ def test_a_crash_that_comes_back_fails_and_leaves_no_running_status(tmp_path):
     assert "exit code 77" in outcome.why
     assert "last words" in text
     status = StageFolder(tmp_path / "00").status()
-    assert (status["state"], status["iteration"]) == ("failed", 7)
+    assert (status.state, status.iteration) == ("failed", 7)
 
 
 def test_an_explained_failure_is_not_repeated_and_stops_no_other(tmp_path):
@@ -296,7 +296,7 @@ def test_a_request_to_stop_reaches_each_job_once(tmp_path, number):
         process.send_signal(number)  # a scheduler that asks twice: still once, and no kill
     outcomes = outcomes_of(process)
     assert [o[:2] for o in outcomes] == [["stopped", 1], ["stopped", 1], ["stopped", 0]]
-    assert [made.folder.status()["state"] for made in jobs[:2]] == ["stopped"] * 2
+    assert [made.folder.status().state for made in jobs[:2]] == ["stopped"] * 2
     assert [(made.folder.path / "terms").read_text() for made in jobs[:2]] == ["TERM "] * 2
     assert not jobs[2].folder.path.exists() or not jobs[2].output.exists()
 
@@ -311,7 +311,7 @@ def test_a_second_interrupt_kills(tmp_path):
     outcomes = outcomes_of(process)
     assert [o[0] for o in outcomes] == ["stopped", "stopped"]
     assert all("SIGKILL" in o[2] for o in outcomes)
-    assert jobs[0].folder.status()["state"] == "stopped"  # it could not write that itself
+    assert jobs[0].folder.status().state == "stopped"  # it could not write that itself
 
 
 def test_a_job_ends_with_a_driver_that_was_killed(tmp_path):
@@ -327,7 +327,7 @@ def test_a_job_ends_with_a_driver_that_was_killed(tmp_path):
     process.kill()
     process.communicate()
     for made in jobs:
-        wait_until(lambda made=made: made.folder.status()["state"] == "stopped")
+        wait_until(lambda made=made: made.folder.status().state == "stopped")
         assert (made.folder.path / "terms").read_text() == "TERM "
 
 

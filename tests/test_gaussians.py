@@ -56,7 +56,7 @@ def test_a_run_leaves_model_log_and_figures(trained):
     assert written["psnr"] > 12
     assert written["by_visibility"][0]["lower"] == written["by_visibility"][-1]["upper"] == 3.0
     model = GaussiansModel.load(trained.folder.model)
-    assert written["n_gaussians"] == len(model.gaussians) == trained.folder.status()["gaussians"]
+    assert written["n_gaussians"] == len(model.gaussians) == trained.folder.status().gaussians
     lines = [json.loads(line) for line in trained.folder.log.read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [20, 30, 50]
     assert lines[-1]["loss"] < 0.7 * lines[0]["loss"]
@@ -77,7 +77,7 @@ def test_a_stopped_run_continues_from_its_last_state(trained, capture, tmp_path,
     monkeypatch.setattr(gaussian_watching, "train", stopped)
     with pytest.raises(Stopped, match="37"):
         comparator.train_gaussians(capture, SHORT, tmp_path, QUIET, options=WatchOptions(save_every=10))
-    assert StageFolder(tmp_path).status()["state"] == "stopped"
+    assert StageFolder(tmp_path).status().state == "stopped"
     monkeypatch.undo()
     comparator.train_gaussians(capture, SHORT, tmp_path, QUIET)
     assert StageFolder(tmp_path).model.read_bytes() == trained.folder.model.read_bytes()

@@ -8,6 +8,7 @@ import pytest
 from vdgs.errors import RunError
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.keys import SINCE, stage_keys
+from vdgs.runs.status import Status
 from vdgs.settings.checks import validate
 from vdgs.settings.method import BlockConfig, GrowthConfig, MethodConfig, TrainConfig, with_iterations
 from vdgs.settings.plain import differences, from_dict, to_dict
@@ -102,13 +103,13 @@ def test_a_stage_deletes_what_was_made_for_other_settings_and_nothing_else(tmp_p
     folder = StageFolder(tmp_path / "stage")
     folder.claim("a")
     folder.model.write_bytes(b"model")
-    folder.set_status("done", iteration=3)
+    folder.set_status(Status("done", iteration=3))
     folder.claim("a")
     assert folder.is_done("a")
     assert not folder.is_done("b")
     folder.claim("b")
     assert not folder.model.exists()
-    assert folder.status() == {"state": "new"}
+    assert folder.status() == Status("new")
     assert folder.key() == "b"
 
 
@@ -116,7 +117,7 @@ def test_work_of_unknown_settings_is_not_taken_over(tmp_path):
     folder = StageFolder(tmp_path / "stage")
     folder.claim("a")
     folder.model.write_bytes(b"model")
-    folder.set_status("done")
+    folder.set_status(Status("done"))
     folder.status_file.unlink()  # as the message about a damaged one advises: the key stays known
     folder.claim("a")
     assert folder.model.exists()

@@ -43,8 +43,8 @@ def evaluate_run(
         model=run.name,
         n_anchors=len(run.model.anchors),
         model_bytes=run.model_path.stat().st_size,
-        train_seconds=run.status.get("seconds"),
-        peak_memory_bytes=run.status.get("peak_memory_bytes"),
+        train_seconds=run.status.seconds,
+        peak_memory_bytes=run.status.peak_memory_bytes,
     )
     model = MeasuredModel(lambda camera: render(run.model, camera), visibility_map(run), facts)
     chosen = run.capture.test_views if views == "test" else run.capture.train_views

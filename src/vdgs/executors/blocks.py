@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -113,9 +113,8 @@ def _note_end(folder: StageFolder, outcome: Outcome) -> None:
     # Not if another process has taken over, nor if the file is damaged.
     with suppress(VdgsError, OSError, ValueError), folder.locked():
         status = folder.status()
-        if status["state"] not in (outcome.state, "done"):
-            facts = {name: fact for name, fact in status.items() if name not in ("state", "why")}
-            folder.set_status(outcome.state, **facts, why=outcome.why)
+        if status.state not in (outcome.state, "done"):
+            folder.set_status(replace(status, state=outcome.state, why=outcome.why))
 
 
 def _summarise(blocks: Sequence[BlockCommand], outcomes: list[Outcome], console: Console) -> None:

@@ -28,7 +28,10 @@ class Figures:
 
 
 def read_figures(status_file: Path) -> Figures | None:
-    """The figures in a status file; None if it is missing or damaged. Never raises: a table is not worth a run."""
+    """The figures in a status file; None if it is missing or damaged.
+
+    Never raises, unlike `StageFolder.status`: a table is not worth a run.
+    """
     try:
         status = json.loads(status_file.read_bytes())
     except (OSError, ValueError, RecursionError):

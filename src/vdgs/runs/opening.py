@@ -12,6 +12,7 @@ from vdgs.captures.loading import load_capture
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.runs.folder import RunFolder
+from vdgs.runs.status import Status
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.requests import ModelName
 
@@ -26,7 +27,7 @@ class TrainedRun:
     model_path: Path
     #: Which model it is, "coarse" or "merged", and the status of the stage that made it.
     name: str
-    status: dict[str, Any]
+    status: Status
 
 
 def open_run(path: Path, which: ModelName = "best") -> TrainedRun:
@@ -46,7 +47,7 @@ def open_run(path: Path, which: ModelName = "best") -> TrainedRun:
             )
         verb = "vdgs merge RUN" if name == "merged" else "the same `vdgs coarse` or `vdgs run` command"
         raise RunError(
-            f"{path}: has no {name} model of its settings yet (state: {stage.status()['state']}). Run {verb} (again): "
+            f"{path}: has no {name} model of its settings yet (state: {stage.status().state}). Run {verb} (again): "
             "training continues from the last saved state."
         )
     model = AnchorModel.load(stage.model)

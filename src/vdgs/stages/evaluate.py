@@ -58,7 +58,7 @@ def is_measured(run: RunFolder, name: str, lpips_weights: Path | None, bins: int
 
 def _record_of(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> dict[str, Any]:
     stage = run.merged if name == "merged" else run.coarse
-    return {"model": stage.status().get("model"), "lpips_weights": str(lpips_weights), "bins": bins}
+    return {"model": stage.status().model, "lpips_weights": str(lpips_weights), "bins": bins}
 
 
 def _forget(output: Path) -> None:

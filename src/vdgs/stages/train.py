@@ -18,6 +18,7 @@ from vdgs.memory.estimate import Need, estimate, in_gb
 from vdgs.memory.process import available_bytes
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.status import Status
 from vdgs.settings.watching import WatchOptions
 
 #: Share of a block's anchors that one photograph may see, for the estimate before a block is opened (choice).
@@ -92,7 +93,7 @@ def _queue(folder: StageFolder, key: str) -> None:
     with suppress(RunError), folder.locked():
         folder.claim(key)
         if not folder.is_done(key):
-            folder.set_status("queued")
+            folder.set_status(Status("queued"))
 
 
 def _remove_beyond(run: RunFolder, count: int, console: Console) -> None:
@@ -106,7 +107,7 @@ def _remove_beyond(run: RunFolder, count: int, console: Console) -> None:
 def _block_bytes(run: RunFolder) -> int:
     """Memory by estimate that the largest block needs for the program, its anchors once they have grown, and those
     around it. Photographs have a budget of their own."""
-    method, anchors = run.method(), [each["anchors_core"] for each in run.partition_facts()["blocks"]]
+    method, anchors = run.method(), [each.anchors_core for each in run.partition_record().blocks]
     need = Need(
         anchors=max(anchors), max_anchors=method.block.growth.max_anchors, offsets=method.training.anchors.offsets,
         seen=SEEN, pixels=0, images_bytes=0, surroundings=sum(anchors) - max(anchors),

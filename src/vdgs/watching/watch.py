@@ -6,8 +6,8 @@ import re
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
 import cv2
 from rich.console import Console
@@ -16,6 +16,7 @@ from vdgs.errors import RunError, Stopped, TrainingDiverged, VdgsError
 from vdgs.interrupts import stop_requests
 from vdgs.memory.process import is_out_of_memory, peak_memory_bytes, return_unused
 from vdgs.runs.folder import StageFolder
+from vdgs.runs.status import Status
 from vdgs.storage.checkpoints import SavedState, discard_after, load_newest, save_state
 
 #: As what missing memory arrives, among others (`is_out_of_memory`): from Python and C++, torch, the system, OpenCV.
@@ -43,8 +44,8 @@ class Watched:
     state: WatchedState
     #: The whole state as it is saved.
     to_saved: Callable[[], SavedState]
-    #: Where training stands, for status.json.
-    facts: Callable[[], dict[str, Any]]
+    #: Where training stands.
+    status: Callable[[], Status]
     #: How large the model is, in words ("12,000 anchors").
     size: Callable[[], str]
     #: What a person may do about a loss that diverges, and about missing memory.
@@ -99,27 +100,27 @@ def watch(training: Watched, loop: Callable[[Callable[[], bool]], bool]) -> None
     folder, state = training.folder, training.state
     try:
         with stop_requests(second_interrupts=True) as asked:
-            folder.set_status("running", **training.facts())
+            folder.set_status(training.status())
             complete = loop(lambda: bool(asked))
     except TrainingDiverged as error:
-        folder.set_status("failed", iteration=state.iteration, why=str(error))
+        folder.set_status(Status("failed", iteration=state.iteration, why=str(error)))
         raise TrainingDiverged(f"{error} {_kept(folder)} {training.after_divergence}".rstrip()) from error
     except MEMORY_ERRORS as error:
         if not is_out_of_memory(error):
             raise
         traceback.clear_frames(error.__traceback__)  # they hold the pictures and splats of the step that failed
         kept = _rescue(training)
-        folder.set_status("failed", iteration=state.iteration, why="out of memory")
+        folder.set_status(Status("failed", iteration=state.iteration, why="out of memory"))
         raise VdgsError(
             f"{folder.path}: out of memory with {training.size()}{_wanted(error)}. {kept} {training.save_memory()}"
         ) from error
     except VdgsError as error:  # a photograph that is gone, a full disk: every step so far is whole
-        folder.set_status("failed", iteration=state.iteration, why=str(error))
+        folder.set_status(Status("failed", iteration=state.iteration, why=str(error)))
         training.save()
         raise
     if not complete:
         training.save()
-        folder.set_status("stopped", **training.facts())
+        folder.set_status(replace(training.status(), state="stopped"))
         raise Stopped(f"Stopped at iteration {state.iteration}; saved. The same command continues.")
 
 
@@ -137,8 +138,8 @@ class Keeper:
         state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
         self._last = now
 
-    def keep(self, facts: Callable[[], dict[str, Any]], flush_log: Callable[[], None] | None = None) -> None:
-        """Save the state and note `facts` in status.json, each where it is time.
+    def keep(self, status: Callable[[], Status], flush_log: Callable[[], None] | None = None) -> None:
+        """Save the state and write the `status`, each where it is time.
 
         The log is flushed before the state is saved: a run that continues there must not miss lines of it.
         """
@@ -150,7 +151,7 @@ class Keeper:
             training.save()
         if time.monotonic() - self._noted > STATUS_SECONDS:
             self._noted = time.monotonic()
-            training.folder.set_status("running", **facts())
+            training.folder.set_status(status())
 
 
 def _kept(folder: StageFolder) -> str:

@@ -149,7 +149,7 @@ def _facts(trained: StageFolder | None) -> ModelFacts:
     status = trained.status()
     return ModelFacts(
         model=NAME, model_bytes=trained.model.stat().st_size,
-        train_seconds=status.get("seconds"), peak_memory_bytes=status.get("peak_memory_bytes"),
+        train_seconds=status.seconds, peak_memory_bytes=status.peak_memory_bytes,
     )  # fmt: skip
 
 
