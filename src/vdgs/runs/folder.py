@@ -78,9 +78,12 @@ class StageFolder:
         except OSError:
             return None
 
-    def claim(self, key: str) -> None:
-        """Let this folder work for these settings from now on; what is there for others, or for unknown ones, is
-        deleted first and the key is written last: a folder never holds what its key does not say."""
+    def discard_unless(self, key: str) -> None:
+        """Delete what is here unless it was made for these settings, and let the folder work for them from now on.
+
+        What was made for other or unknown settings goes first and the key is written last: a folder never holds what
+        its key does not say.
+        """
         if self.key() == key:
             return
         if self.path.exists():
@@ -113,7 +116,7 @@ class StageFolder:
         except RunError as error:
             return isinstance(error.__cause__, BlockingIOError)
 
-    def cut_log(self, iteration: int) -> None:
+    def truncate_log(self, iteration: int) -> None:
         """Drop log lines after `iteration` (and a half-written last one), so that a continued run repeats none."""
         if not self.log.exists():
             return
@@ -212,11 +215,11 @@ class RunFolder:
             )
         self._write(settings)
 
-    def change(self, settings: dict[str, Any], redo: bool) -> list[str]:
+    def change_settings(self, settings: dict[str, Any], redo: bool) -> list[str]:
         """Give a run other settings; returns what changed, one line each.
 
         Raises RunError, with the differences, if trained work depends on what changed, unless `redo` allows to
-        lose it. Stages delete what was made for other settings when they next run (`StageFolder.claim`).
+        lose it. Stages delete what was made for other settings when they next run (`StageFolder.discard_unless`).
         """
         old = self.settings()
         changed = differences(old, settings)
@@ -237,7 +240,7 @@ class RunFolder:
             )  # fmt: skip
         self._write(settings)
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
-            self.coarse.claim(after.coarse)
+            self.coarse.discard_unless(after.coarse)
         return changed
 
     def _write(self, settings: dict[str, Any]) -> None:

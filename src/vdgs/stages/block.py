@@ -54,7 +54,7 @@ def train_block(path: Path, index: int, options: WatchOptions, console: Console)
             if folder.is_done(key):
                 console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
                 return
-            folder.claim(key)
+            folder.discard_unless(key)
             _train(run, index, blocks, options, console)
 
 

@@ -43,7 +43,7 @@ def train_coarse(run: RunFolder, capture: Capture, options: WatchOptions, consol
         config = run.method().training
         note_without_growth(config, console)
         write_json(run.capture_file, capture_facts(capture))
-        folder.claim(key)
+        folder.discard_unless(key)
         _train(run, capture, config, options, console)
 
 

@@ -43,7 +43,7 @@ def merge_run(path: Path, incomplete: bool, console: Console) -> None:
         ]
         trained = [AnchorModel.load(run.block(i).model) if whole else None for i, whole in enumerate(done)]
         merged, became = merge(coarse, trained, blocks, cameras, run.method().merge, allow_missing=incomplete)
-        run.merged.claim(key)
+        run.merged.discard_unless(key)
         merged.save(run.merged.model)
         trained_in = [run.block(i).status() for i, whole in enumerate(done) if whole]
         stages = [opened.status, *trained_in]

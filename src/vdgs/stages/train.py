@@ -61,7 +61,7 @@ def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console,
             )
         began = time.monotonic()
         for index in left:
-            _queue(run.block(index), key)
+            _mark_queued(run.block(index), key)
         commands = [_command(run, index, threads, budget / at_once, options, device) for index in left]
         outcomes = run_blocks(commands, LocalExecutor(at_once), console)
     if any(outcome.state == "stopped" for outcome in outcomes):
@@ -88,10 +88,13 @@ def _command(
     return BlockCommand(index, run.block(index), command)
 
 
-def _queue(folder: StageFolder, key: str) -> None:
-    """Let a block wait for its turn, unless another process trains it already (its status is then its own)."""
+def _mark_queued(folder: StageFolder, key: str) -> None:
+    """Let a block say that it waits for its turn, and hold no work of other settings.
+
+    Not if another process trains it already: its status is then its own.
+    """
     with suppress(RunError), folder.locked():
-        folder.claim(key)
+        folder.discard_unless(key)
         if not folder.is_done(key):
             folder.set_status(Status("queued"))
 

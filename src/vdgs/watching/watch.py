@@ -87,7 +87,7 @@ def restore_or_start(
             raise RunError(f"{folder.checkpoints}: is at iteration {state.iteration}, beyond {iterations}.")
         discard_after(folder.checkpoints, state.iteration)
         console.print(f"continuing at iteration {state.iteration}")
-    folder.cut_log(state.iteration)
+    folder.truncate_log(state.iteration)
     return state
 
 
