@@ -20,7 +20,7 @@ class RunError(VdgsError):
 
 
 class TrainingDiverged(VdgsError):
-    """The loss or a parameter is no longer a finite number; the last good state is kept on disk."""
+    """The loss or a parameter is no longer a finite number; the last good checkpoint is kept."""
 
 
 class Stopped(VdgsError):

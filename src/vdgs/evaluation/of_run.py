@@ -27,7 +27,7 @@ from vdgs.runs.visibility import visibility_of_run
 #: Photographs kept decoded during an evaluation, which needs one at a time.
 EVALUATION_IMAGES_BYTES = 256_000_000
 
-#: What to measure on. Training views say what a model has learnt by heart: good there and not on the test views.
+#: What to measure on. A model that is good on training views and not on test views overfits.
 Views = Literal["test", "training"]
 
 

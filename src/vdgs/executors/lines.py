@@ -20,7 +20,7 @@ class Lines(Listener):
         self.say(f"{task.name}: waiting for another process that works on it", "yellow")
 
     def crashed(self, task: Task, how: str, attempts_left: int) -> None:
-        text = f"{task.name}: crashed by {how}; continues from its last saved state, attempts left: {attempts_left}"
+        text = f"{task.name}: crashed by {how}; continues from its last checkpoint, attempts left: {attempts_left}"
         self.say(text, "yellow")
 
     def stopping(self, tasks: Sequence[Task]) -> None:

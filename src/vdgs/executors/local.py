@@ -191,7 +191,7 @@ class _Crew:
         elif code in EXPLAINED:
             self._end(work, "failed", why or _without_words(work.task, code))
         elif self._stopping:
-            self._end(work, "stopped", f"ended by {_name(code)}; continues from its last saved state")
+            self._end(work, "stopped", f"ended by {_name(code)}; continues from its last checkpoint")
         else:
             self._crashed(work, code, why)
 

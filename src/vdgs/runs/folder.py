@@ -30,7 +30,7 @@ SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
 
 @dataclass(frozen=True)
 class StageFolder:
-    """Where one stage (coarse, a block) keeps its states, log and model."""
+    """Where one stage (coarse, a block) keeps its checkpoints, log and model."""
 
     path: Path
 

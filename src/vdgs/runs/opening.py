@@ -48,7 +48,7 @@ def open_run(path: Path, which: ModelName = "best") -> TrainedRun:
         verb = "vdgs merge RUN" if name == "merged" else "the same `vdgs coarse` or `vdgs run` command"
         raise RunError(
             f"{path}: has no {name} model of its settings yet (state: {stage.status().state}). Run {verb} (again): "
-            "training continues from the last saved state."
+            "training continues from the last checkpoint."
         )
     model = AnchorModel.load(stage.model)
     refuse_another_capture(stage.model, model.facts.get("capture", {}), capture)

@@ -1,4 +1,4 @@
-"""Anchors in training under the eyes of a person: what the coarse stage and a block show, log and advise."""
+"""Training of anchors, watched: what the coarse stage and a block show, log and advise."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ AFTER_DIVERGENCE = {
 def continue_or_start(
     folder: StageFolder, stage: Stage, start: Callable[[], TrainingState], console: Console
 ) -> TrainingState:
-    """The newest whole state in the folder, or a new one; the log ends where the state does.
+    """The state of the newest whole checkpoint, or a new one; the log ends where the state does.
 
     Raises RunError for a state that this version cannot read or that is beyond the last iteration.
     """

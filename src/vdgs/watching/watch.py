@@ -1,4 +1,4 @@
-"""Training under the eyes of a person: logged, saved, stopped and continued. The same for every kind of state."""
+"""Training that is watched: logged, checkpointed, stopped and continued. The same for every kind of state."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def restore_or_start(
     advice: str,
     console: Console,
 ) -> State:
-    """The newest whole state in the folder, or a new one; the log ends where the state does.
+    """The state of the newest whole checkpoint, or a new one; the log ends where the state does.
 
     Raises RunError, with `advice`, for a state that this version cannot read, and for one beyond the last iteration.
     """
@@ -76,7 +76,7 @@ def restore_or_start(
         console.print(f"[yellow]note[/] {complaint}")
     if saved is None:
         if complaints:
-            console.print("[yellow]note[/] no saved state is whole: starting again from the first iteration")
+            console.print("[yellow]note[/] no checkpoint is whole: starting again from the first iteration")
         state = start()
     else:
         try:
@@ -125,7 +125,7 @@ def watch(training: Watched, loop: Callable[[Callable[[], bool]], bool]) -> None
 
 
 class Keeper:
-    """After every step: the state's account of time and memory (across interruptions), saved states, status.json."""
+    """After every step: the state's account of time and memory (across interruptions), checkpoints, status.json."""
 
     def __init__(self, training: Watched, save_every: int):
         self._training, self._save_every = training, save_every
@@ -141,7 +141,7 @@ class Keeper:
     def keep(self, status: Callable[[], Status], flush_log: Callable[[], None] | None = None) -> None:
         """Save the state and write the `status`, each where it is time.
 
-        The log is flushed before the state is saved: a run that continues there must not miss lines of it.
+        The log is flushed before the checkpoint is written: a run that continues there must not miss lines of it.
         """
         training = self._training
         if training.state.iteration % self._save_every == 0:
@@ -157,8 +157,8 @@ class Keeper:
 def _kept(folder: StageFolder) -> str:
     kept, _ = load_newest(folder.checkpoints)
     if kept is None:
-        return "No state was saved yet."
-    return f"The state of iteration {kept.iteration} is kept in {folder.checkpoints}."
+        return "There is no checkpoint yet."
+    return f"The checkpoint of iteration {kept.iteration} is kept in {folder.checkpoints}."
 
 
 def _rescue(training: Watched) -> str:
@@ -171,11 +171,11 @@ def _rescue(training: Watched) -> str:
         except (VdgsError, *MEMORY_ERRORS):
             pass  # what was saved before is still there
         else:
-            return f"The state of iteration {training.state.iteration} is saved in {folder.checkpoints}."
+            return f"The checkpoint of iteration {training.state.iteration} is saved in {folder.checkpoints}."
     try:
         return _kept(folder)
     except MEMORY_ERRORS:
-        return f"States that were saved before are kept in {folder.checkpoints}."
+        return f"Earlier checkpoints are kept in {folder.checkpoints}."
 
 
 def _wanted(error: BaseException) -> str:

@@ -1,4 +1,4 @@
-"""3DGS in training under the eyes of a person: shown, logged, saved, stopped and continued.
+"""Training of 3DGS, watched: shown, logged, checkpointed, stopped and continued.
 
 The twin of `vdgs.watching.anchors`, for another kind of state.
 """
@@ -37,7 +37,7 @@ from vdgs.watching.watch import Keeper, Watched, restore_or_start, watch
 def continue_or_start(
     folder: StageFolder, capture: Capture, config: GaussiansConfig, console: Console
 ) -> GaussiansState:
-    """The newest whole state in the folder, or a new one; the log ends where the state does.
+    """The state of the newest whole checkpoint, or a new one; the log ends where the state does.
 
     Raises RunError for a state that this version cannot read.
     """
