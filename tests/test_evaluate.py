@@ -22,6 +22,7 @@ from vdgs.evaluation import metrics, pictures, saving
 from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import Lpips, LpipsScores
 from vdgs.evaluation.photographs import Photographs
+from vdgs.storage.files import jsonable, write_json
 
 NAMES = ["a/b.jpg", "c/b.jpg", "a/b.png", "plain.jpg"]
 
@@ -199,9 +200,12 @@ def test_readable_file_names():
     assert saving.file_stems(names) == ["a__b", "c__b", "a__b_png", "A__B_JPG", "DJI_0018"]
 
 
-def test_json_has_no_nan():
+def test_json_has_no_nan(tmp_path):
     value = {"a": [np.float32("nan"), math.inf, np.int64(3)], "b": (None, "x", True)}
-    assert saving.jsonable(value) == {"a": [None, None, 3], "b": [None, "x", True]}
+    assert jsonable(value) == {"a": [None, None, 3], "b": [None, "x", True]}
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "strict.json", value["a"][1:2])
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_colour_map_grows_with_the_error():

@@ -35,7 +35,6 @@ from vdgs.bench.worker import RECORD, Job
 from vdgs.bench.writing import latex, markdown, tidy_csv
 from vdgs.captures.loading import load_capture
 from vdgs.errors import Stopped, VdgsError
-from vdgs.evaluation.saving import write_json
 from vdgs.executors.executor import Outcome, Task
 from vdgs.executors.lines import Lines
 from vdgs.executors.local import LocalExecutor
@@ -44,7 +43,7 @@ from vdgs.runs.folder import RunFolder
 from vdgs.runs.keys import counted
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.plain import differences, to_dict
-from vdgs.storage.files import read_json, write_text
+from vdgs.storage.files import jsonable, read_json, write_json, write_text
 from vdgs.synth import SynthOptions, generate
 
 
@@ -271,12 +270,12 @@ def _write(plan: Plan, results: list[Result], settings: BenchSettings, console: 
     output.mkdir(exist_ok=True)
     write_json(
         output / "results.json",
-        {
+        jsonable({
             "table": plan.table.name, "title": plan.table.title, "seeds": plan.seeds,
             "budgets": {name: vars(budget) | {"total": budget.total} for name, budget in plan.budgets.items()},
             "choices": vars(settings.choices), "results": as_json(results),
             "verdict": [vars(line) for line in lines],
-        },
+        }),
     )  # fmt: skip
     text = "\n".join(map(str, lines)) or "This table asks no question."
     drawn = draw_groups(output / "groups.png", plan, results)

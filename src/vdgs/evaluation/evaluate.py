@@ -33,6 +33,7 @@ from vdgs.evaluation.colour import correct_colours
 from vdgs.evaluation.lpips import MIN_SIDE_PX, Lpips
 from vdgs.evaluation.photographs import Photographs
 from vdgs.evaluation.tables import metrics_table
+from vdgs.storage.files import jsonable, write_json
 
 RAW = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")
 CORRECTED = tuple(f"{name}_cc" for name in RAW)
@@ -308,7 +309,7 @@ def _summary(
         settings.title.replace(" ", "_"): len(rows),
         "notes": notes,
     }
-    return saving.jsonable(result)
+    return jsonable(result)
 
 
 def _write(output: Path, result: Mapping[str, Any], gathered: _Gathered, title: str) -> None:
@@ -319,5 +320,5 @@ def _write(output: Path, result: Mapping[str, Any], gathered: _Gathered, title: 
         ssim = "SSIM –" if result["ssim"] is None else f"SSIM {result['ssim']:.3f}"
         sheet = pictures.contact_sheet(gathered.cells, f"{shown} {title} · {psnr} · {ssim}")
         saving.write_png(output / "contact_sheet.png", np.asarray(sheet))
-    saving.write_json(output / "per_view.json", gathered.rows)
-    saving.write_json(output / "metrics.json", result)  # last: where it stands, the rest is complete
+    write_json(output / "per_view.json", jsonable(gathered.rows))
+    write_json(output / "metrics.json", result)  # last: where it stands, the rest is complete

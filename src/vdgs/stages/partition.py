@@ -20,7 +20,6 @@ from rich.table import Table
 
 from vdgs.cameras import Camera
 from vdgs.errors import RunError
-from vdgs.evaluation.saving import write_json
 from vdgs.memory.process import forget_peak, peak_memory_bytes
 from vdgs.partition.assignment.assign import Assignment, assign
 from vdgs.partition.assignment.saving import load_scores, save_scores
@@ -35,6 +34,7 @@ from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.runs.visibility import keep_visibility
 from vdgs.settings.method import AssignmentConfig, PartitionConfig
+from vdgs.storage.files import write_json
 from vdgs.storage.records import plain
 
 
