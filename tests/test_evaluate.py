@@ -21,7 +21,7 @@ from vdgs.errors import CaptureError, RunError, TrainingDiverged
 from vdgs.evaluation import metrics, pictures, saving
 from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import Lpips, LpipsScores
-from vdgs.evaluation.photographs import Photographs
+from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.storage.files import jsonable, write_json
 
 NAMES = ["a/b.jpg", "c/b.jpg", "a/b.png", "plain.jpg"]
@@ -34,7 +34,7 @@ class City:
         rng = np.random.default_rng(0)
         self.views = [view(name, shift=float(i)) for i, name in enumerate(NAMES)]
         self.photographs = [photograph(rng) for _ in NAMES]
-        self.taken = Photographs(self.views, self.load_image)
+        self.taken = ReferenceViews(self.views, self.load_image)
         self.renders = [noisy(each, rng, 0.02 * (i + 1)) for i, each in enumerate(self.photographs)]
 
     def load_image(self, which):
@@ -113,7 +113,7 @@ def test_masks_are_respected(city: City, tmp_path: Path):
     mask[:, :32] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     masked = view(NAMES[0], mask=tmp_path / "mask.png")
-    result = evaluate(Photographs([masked], city.load_image), MeasuredModel(city.render), tmp_path / "out")
+    result = evaluate(ReferenceViews([masked], city.load_image), MeasuredModel(city.render), tmp_path / "out")
     left = metrics.psnr(city.renders[0][:, :32], city.photographs[0][:, :32])
     assert result["psnr"] == pytest.approx(left, abs=1e-9)
     assert read(tmp_path / "out" / "per_view.json")[0]["kept_pixels"] == 48 * 32
@@ -237,7 +237,7 @@ def test_on_photographs(tmp_path: Path):
         index = round(camera.camera_from_world[0, 3])
         return as_render(noisy(cv2.GaussianBlur(photographs[index], (0, 0), 1.0), rng, 0.01))
 
-    taken = Photographs(views, lambda v: photographs[int(v.name[0])])
+    taken = ReferenceViews(views, lambda v: photographs[int(v.name[0])])
     result = evaluate(taken, MeasuredModel(render), tmp_path)
     assert 20 < result["psnr"] < 40
     assert result["psnr_cc"] >= result["psnr"]

@@ -31,7 +31,7 @@ from vdgs.evaluation import metrics, pictures, saving
 from vdgs.evaluation.by_visibility import QUANTILE_BINS, VisibilityHistogram, mean_or_none, view_bins
 from vdgs.evaluation.colour import correct_colours
 from vdgs.evaluation.lpips import MIN_SIDE_PX, Lpips
-from vdgs.evaluation.photographs import Photographs
+from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.tables import metrics_table
 from vdgs.storage.files import jsonable, write_json
 
@@ -92,7 +92,7 @@ class EvaluationSettings:
 class _Inputs:
     """What every view is measured with."""
 
-    photographs: Photographs
+    photographs: ReferenceViews
     model: MeasuredModel
     lpips: Lpips | None
     settings: EvaluationSettings
@@ -119,7 +119,7 @@ class _Pair:
 
 
 def evaluate(
-    photographs: Photographs,
+    photographs: ReferenceViews,
     model: MeasuredModel,
     output: Path,
     *,
@@ -187,7 +187,7 @@ def _evaluate_view(view: View, stem: str, on_sheet: bool, inputs: _Inputs, gathe
 
 
 def _photograph(
-    view: View, photographs: Photographs
+    view: View, photographs: ReferenceViews
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
     reference, mask = photographs.load_image(view), photographs.load_mask(view)
     wanted = (view.camera.height, view.camera.width)

@@ -34,7 +34,7 @@ from vdgs.evaluation.by_block import (
     label_map,
 )
 from vdgs.evaluation.metrics import masked_mean, psnr_of, squared_error, to_8bit
-from vdgs.evaluation.photographs import Photographs
+from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.tables import shown
 from vdgs.kernels.types import Raster
 from vdgs.partition.blocks import Blocks
@@ -71,7 +71,7 @@ class SeamView:
 class _Inputs:
     """Where the images of a view come from."""
 
-    photographs: Photographs
+    photographs: ReferenceViews
     render_coarse: Callable[[Camera], Raster]
     render_merged: Callable[[Camera], Raster]
     render_block: Callable[[int, Camera], Raster | None]
@@ -89,7 +89,7 @@ class _Gathered:
 
 
 def evaluate_blocks(
-    photographs: Photographs,
+    photographs: ReferenceViews,
     render_coarse: Callable[[Camera], Raster],
     render_merged: Callable[[Camera], Raster],
     render_block: Callable[[int, Camera], Raster | None],

@@ -25,7 +25,7 @@ def read_mask(view: View) -> Bool[np.ndarray, "h w"] | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Photographs:
+class ReferenceViews:
     """Test views, and how to load their photographs and masks (true = keep; None: all of it counts)."""
 
     views: Sequence[View]
