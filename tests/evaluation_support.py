@@ -13,6 +13,7 @@ import torch
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import View
+from vdgs.captures.photographs import decode_mask
 
 
 def photograph(rng: np.random.Generator, height: int = 48, width: int = 64) -> np.ndarray:
@@ -32,6 +33,11 @@ def view(name: str, width: int = 64, height: int = 48, shift: float = 0.0, mask:
     pose[0, 3] = shift
     camera = Camera(pose, 60.0, 60.0, width / 2, height / 2, width, height)
     return View(name, camera, Path("images") / name, mask, "test")
+
+
+def load_mask(view: View) -> np.ndarray | None:
+    camera = view.camera
+    return None if view.mask_path is None else decode_mask(view.mask_path, camera.width, camera.height)
 
 
 def as_render(image: np.ndarray) -> SimpleNamespace:

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from evaluation_support import as_render, noisy, photograph, real_photographs, view
+from evaluation_support import as_render, load_mask, noisy, photograph, real_photographs, view
 from vdgs.errors import CaptureError, RunError, TrainingDiverged
 from vdgs.evaluation import metrics, pictures, saving
 from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
@@ -34,7 +34,7 @@ class City:
         rng = np.random.default_rng(0)
         self.views = [view(name, shift=float(i)) for i, name in enumerate(NAMES)]
         self.photographs = [photograph(rng) for _ in NAMES]
-        self.taken = ReferenceViews(self.views, self.load_image)
+        self.taken = ReferenceViews(self.views, self.load_image, load_mask)
         self.renders = [noisy(each, rng, 0.02 * (i + 1)) for i, each in enumerate(self.photographs)]
 
     def load_image(self, which):
@@ -113,7 +113,7 @@ def test_masks_are_respected(city: City, tmp_path: Path):
     mask[:, :32] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     masked = view(NAMES[0], mask=tmp_path / "mask.png")
-    result = evaluate(ReferenceViews([masked], city.load_image), MeasuredModel(city.render), tmp_path / "out")
+    result = evaluate(replace(city.taken, views=[masked]), MeasuredModel(city.render), tmp_path / "out")
     left = metrics.psnr(city.renders[0][:, :32], city.photographs[0][:, :32])
     assert result["psnr"] == pytest.approx(left, abs=1e-9)
     assert read(tmp_path / "out" / "per_view.json")[0]["kept_pixels"] == 48 * 32
@@ -237,7 +237,7 @@ def test_on_photographs(tmp_path: Path):
         index = round(camera.camera_from_world[0, 3])
         return as_render(noisy(cv2.GaussianBlur(photographs[index], (0, 0), 1.0), rng, 0.01))
 
-    taken = ReferenceViews(views, lambda v: photographs[int(v.name[0])])
+    taken = ReferenceViews(views, lambda v: photographs[int(v.name[0])], load_mask)
     result = evaluate(taken, MeasuredModel(render), tmp_path)
     assert 20 < result["psnr"] < 40
     assert result["psnr_cc"] >= result["psnr"]
