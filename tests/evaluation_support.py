@@ -14,6 +14,7 @@ import torch
 from vdgs.cameras import Camera
 from vdgs.captures.capture import View
 from vdgs.captures.photographs import decode_mask
+from vdgs.evaluation import metrics
 
 
 def photograph(rng: np.random.Generator, height: int = 48, width: int = 64) -> np.ndarray:
@@ -38,6 +39,16 @@ def view(name: str, width: int = 64, height: int = 48, shift: float = 0.0, mask:
 def load_mask(view: View) -> np.ndarray | None:
     camera = view.camera
     return None if view.mask_path is None else decode_mask(view.mask_path, camera.width, camera.height)
+
+
+def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """PSNR in dB over all kept pixels and channels, as an evaluation puts it together."""
+    return metrics.psnr_of(metrics.masked_mean(metrics.squared_error(image, reference), mask))
+
+
+def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Mean SSIM over the kept pixels, likewise."""
+    return metrics.masked_mean(metrics.ssim_map(image, reference, mask), mask)
 
 
 def as_render(image: np.ndarray) -> SimpleNamespace:

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from evaluation_support import as_render, load_mask, noisy, photograph, real_photographs, view
+from evaluation_support import as_render, load_mask, noisy, photograph, psnr, real_photographs, ssim, view
 from vdgs.errors import CaptureError, RunError, TrainingDiverged
 from vdgs.evaluation import metrics, pictures, saving
 from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
@@ -70,8 +70,8 @@ def test_what_is_written_is_what_was_measured(city: City, tmp_path: Path):
     assert [row["name"] for row in rows] == NAMES
     for row, reference in zip(rows, city.photographs, strict=True):
         saved = cv2.imread(str(tmp_path / row["render"]))[..., ::-1]
-        assert row["psnr"] == metrics.psnr(saved, reference)
-        assert row["ssim"] == pytest.approx(metrics.ssim(saved, reference), abs=1e-12)
+        assert row["psnr"] == psnr(saved, reference)
+        assert row["ssim"] == pytest.approx(ssim(saved, reference), abs=1e-12)
         assert row["psnr_cc"] > row["psnr"] - 0.01
         assert (tmp_path / "comparisons" / Path(row["render"]).name).is_file()
     assert result["psnr"] == pytest.approx(np.mean([row["psnr"] for row in rows]))
@@ -114,7 +114,7 @@ def test_masks_are_respected(city: City, tmp_path: Path):
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     masked = view(NAMES[0], mask=tmp_path / "mask.png")
     result = evaluate(replace(city.taken, views=[masked]), MeasuredModel(city.render), tmp_path / "out")
-    left = metrics.psnr(city.renders[0][:, :32], city.photographs[0][:, :32])
+    left = psnr(city.renders[0][:, :32], city.photographs[0][:, :32])
     assert result["psnr"] == pytest.approx(left, abs=1e-9)
     assert read(tmp_path / "out" / "per_view.json")[0]["kept_pixels"] == 48 * 32
 

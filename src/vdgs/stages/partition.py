@@ -101,7 +101,7 @@ def explain_view(run: RunFolder, view: str, console: Console) -> None:
     table = Table(box=box.SIMPLE_HEAD, title=view, title_justify="left")
     for heading in ("block", "score", "anchors held", "why"):
         table.add_column(heading, justify="left" if heading == "why" else "right")
-    for row in explain(names, scores, assignment, view=view):
+    for row in explain(names, scores, assignment, view):
         table.add_row(str(row.block), f"{row.score:.3f}", f"{row.held:,}", row.why)
     console.print(table)
 

@@ -21,40 +21,25 @@ from vdgs.partition.records import AssignedBlock
 class Reason:
     """How well a view shows a block, and why it was assigned to it or not."""
 
-    view: str
     block: int
     score: float
-    covered: float | None
-    """None where it was not measured."""
     held: int
+    """Anchors of the block that the view holds."""
     why: str
     """A phrase."""
 
 
-def explain(
-    names: Sequence[str], scores: Scores, assignment: Assignment, *, view: str | None = None, block: int | None = None
-) -> list[Reason]:
-    """Why views were chosen, or not: each pair, the assigned ones first, then by falling score.
+def explain(names: Sequence[str], scores: Scores, assignment: Assignment, view: str) -> list[Reason]:
+    """Why a view was chosen for each block, or not: those that it serves first, then by falling score.
 
-    `view` and `block` narrow the answer. Raises RunError for a view or a block that is not there.
+    Raises RunError for a view that is not there.
     """
-    if view is not None and view not in names:
+    if view not in names:
         raise RunError(f"There is no training view {view!r}. Views are named as in the capture, such as {names[0]!r}.")
-    if block is not None and not 0 <= block < len(scores.anchors):
-        raise RunError(f"There is no block {block}; blocks are numbered 0 to {len(scores.anchors) - 1}.")
+    c = names.index(view)
     rows = [
-        Reason(
-            view=names[c],
-            block=b,
-            score=float(scores.scores[c, b]),
-            covered=None if np.isnan(scores.covered[c, b]) else float(scores.covered[c, b]),
-            held=int(scores.held[c, b]),
-            why=WHY[assignment.why[c, b]],
-        )
-        for c in range(len(names))
-        if view in (None, names[c])
+        Reason(b, float(scores.scores[c, b]), int(scores.held[c, b]), WHY[assignment.why[c, b]])
         for b in range(len(scores.anchors))
-        if block in (None, b)
     ]
     return sorted(rows, key=lambda row: (row.why == WHY[0], -row.score))
 
