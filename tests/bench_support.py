@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
@@ -11,16 +12,21 @@ from rich.console import Console
 from captures_support import tiny_scene, write_colmap
 from vdgs.bench.bench import BenchSettings, run_bench
 from vdgs.bench.plan import Choices
-from vdgs.bench.processes import Ended, Task
 from vdgs.bench.results import Result
 from vdgs.bench.worker import Job, work
+from vdgs.executors.executor import Listener, Outcome, Task
 
 
-def run_here(tasks: Sequence[Task], _at_once: int, _tell: Callable[..., None]) -> dict[str, Ended]:
-    """As `run_tasks`, but in this process: starting others would take most of the time."""
-    for task in tasks:
-        work(Job.read(task.file))
-    return {task.name: Ended(task.name, "done") for task in tasks}
+@dataclass(frozen=True)
+class InThisProcess:
+    """An executor without processes: starting them would take most of the time."""
+
+    at_once: int
+
+    def run(self, tasks: Sequence[Task], _listener: Listener) -> list[Outcome]:
+        for task in tasks:
+            work(Job.read(Path(task.command[-1])))
+        return [Outcome(task.name, "done") for task in tasks]
 
 
 def write_data(folder: Path) -> None:

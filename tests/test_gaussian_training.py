@@ -134,7 +134,7 @@ def test_where_memory_runs_out_before_anything_moves_no_step_is_lost(where, unbr
     folder = StageFolder(tmp_path / "gaussians")
     with monkeypatch.context() as scarcity:
         memory_runs_out(scarcity, where, 38)
-        with pytest.raises(VdgsError, match=r"out of memory with .* The state of iteration 37 is saved in"):
+        with pytest.raises(VdgsError, match=r"out of memory with .* The checkpoint of iteration 37 is saved in"):
             watched(folder)
     assert bits(watched(folder)) == bits(unbroken)
 
@@ -142,7 +142,7 @@ def test_where_memory_runs_out_before_anything_moves_no_step_is_lost(where, unbr
 def test_where_memory_runs_out_within_a_step_nothing_half_moved_is_saved(tmp_path, monkeypatch):
     folder = StageFolder(tmp_path / "gaussians")
     memory_runs_out(monkeypatch, "adam_rows", 38 * 5, room=native)  # four of the tensors have moved, or three
-    with pytest.raises(VdgsError, match="No state was saved yet"):
+    with pytest.raises(VdgsError, match="There is no checkpoint yet"):
         watched(folder)
 
 

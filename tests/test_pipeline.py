@@ -83,14 +83,14 @@ def test_blocks_draw_parts_of_photographs_and_the_pixels_that_were_asked_for(unb
     shutil.copytree(unbroken, tmp_path / "run", ignore=shutil.ignore_patterns(".lock"))
     for index, folder in enumerate(RunFolder(unbroken).block_folders()):
         status, cameras = folder.status(), load_scores(unbroken / "partition" / "scores.npz")[2].cameras
-        assert status["iteration"] > 260
-        assert status["photographs"] == pytest.approx(250, abs=1)
+        assert status.iteration > 260
+        assert status.photographs == pytest.approx(250, abs=1)
         assert len(json.loads((folder.path / "crops.json").read_text())["crops"]) == cameras[:, index].sum()
     done = vdgs("run", capture, "--output", tmp_path / "run", *SETTINGS, "--block.crop", "steps", "--redo")
     assert done.returncode == 0, done.stderr + done.stdout
     for folder in RunFolder(tmp_path / "run").block_folders():
-        assert folder.status()["iteration"] == 250
-        assert folder.status()["photographs"] < 240
+        assert folder.status().iteration == 250
+        assert folder.status().photographs < 240
     assert model(tmp_path / "run") != model(unbroken)
 
 

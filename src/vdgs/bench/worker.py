@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vdgs.errors import VdgsError
+from vdgs.errors import Stopped, VdgsError
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import from_dict
 from vdgs.storage.files import read_json, write_json
@@ -196,7 +196,7 @@ def main(arguments: list[str]) -> int:
         work(Job.read(Path(arguments[0])))
     except VdgsError as error:
         print(f"vdgs bench: {error}", file=sys.stderr)
-        return 130 if getattr(error, "stopped", False) else 1
+        return 130 if isinstance(error, Stopped) else 1
     except KeyboardInterrupt:
         return 130
     return 0

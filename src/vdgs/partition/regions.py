@@ -58,7 +58,7 @@ def holds(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor],
 
 
 def ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor] | None:
-    """How far anchors move where the ring is a ramp: 1 wherever the block owns the place, and where another does,
+    """The learning-rate mask of a ring that is a ramp: 1 wherever the block owns the place, and where another does,
     falling linearly from the core to 0 at the widened boundary.
 
     Read from a table over the block, since it is asked in every step.
@@ -75,11 +75,11 @@ def ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], 
     table = torch.from_numpy(share.astype(np.float32).reshape(RAMP_CELLS, RAMP_CELLS))
     origin, cell = torch.from_numpy(low), torch.from_numpy((high - low) / RAMP_CELLS)
 
-    def mobility(positions: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
+    def rate_mask(positions: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
         cells: Int64[Tensor, "p 2"] = ((positions[:, :2].double() - origin) / cell).floor().long()
         inside = ((cells >= 0) & (cells < RAMP_CELLS)).all(1)
         cells = cells.clamp(0, RAMP_CELLS - 1)
         # What the block moves beyond the table it owns.
         return torch.where(inside, table[cells[:, 0], cells[:, 1]], torch.ones(()))
 
-    return mobility
+    return rate_mask

@@ -14,6 +14,7 @@ from vdgs.captures.loading import load_capture
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.runs.folder import RunFolder
+from vdgs.runs.status import Status
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.requests import ModelName
 
@@ -28,7 +29,7 @@ class TrainedRun:
     model_path: Path
     #: Which model it is, "coarse" or "merged", and the status of the stage that made it.
     name: str
-    status: dict[str, Any]
+    status: Status
 
     @property
     def device(self) -> torch.device:
@@ -56,8 +57,8 @@ def open_run(path: Path, which: ModelName = "best", device: torch.device | str =
             )
         verb = "vdgs merge RUN" if name == "merged" else "the same `vdgs coarse` or `vdgs run` command"
         raise RunError(
-            f"{path}: has no {name} model of its settings yet (state: {stage.status()['state']}). Run {verb} (again): "
-            "training continues from the last saved state."
+            f"{path}: has no {name} model of its settings yet (state: {stage.status().state}). Run {verb} (again): "
+            "training continues from the last checkpoint."
         )
     model = AnchorModel.load(stage.model).to(torch.device(device))
     refuse_another_capture(stage.model, model.facts.get("capture", {}), capture)

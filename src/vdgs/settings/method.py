@@ -129,7 +129,7 @@ class TrainConfig:
 
     iterations: int = 100_000
     """Number of steps, one photograph each; 0 takes sixty for each training photograph, but at least 3000 and at
-    most 30 000 (choice: few photographs are soon learnt by heart, many need their time)."""
+    most 30 000 (choice: with few photographs a model soon overfits, many need their time)."""
     sampling: Literal["even", "shares", "roots"] = "even"
     """How often each photograph is used. `even`: all alike (the paper). `shares`: every anchor has one vote, divided
     among the cameras that see it, and a photograph is used in proportion to its votes: most where few others look.
@@ -227,10 +227,11 @@ class BlockConfig:
     """As in the loss of the coarse stage, but for blocks: there the ground is opaque already (choice)."""
     decoder: Literal["frozen", "own"] = "frozen"
     """`frozen`: as the coarse stage left it (the paper). `own`: each block trains its copy, which its anchors keep in
-    the merged scene (choice: with a frozen decoder what few cameras see is learnt by heart sooner)."""
+    the merged scene (choice: with a frozen decoder blocks overfit sooner where few cameras see them)."""
     ring: Literal["frozen", "ramp", "free"] = "frozen"
     """Anchors between core and widened boundary: `frozen` are drawn and never move (choice for "gradients at the
-    boundary are suppressed"); `ramp` move less the farther out they are; `free` as those of the core."""
+    boundary are suppressed"); `ramp`: their learning rate falls linearly to zero at the widened boundary; `free`
+    move as those of the core."""
     context: bool = True
     """Draw the anchors outside the block too, frozen. Off: what the block's cameras see there is empty."""
     growth: GrowthConfig = field(default_factory=lambda: GrowthConfig(start=1000))

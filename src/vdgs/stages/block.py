@@ -27,6 +27,7 @@ from vdgs.partition.regions import drawn_by, holds, ramp, split_anchors
 from vdgs.runs.cut import blocks_of, views_of_block
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.opening import open_run
+from vdgs.runs.status import Status
 from vdgs.settings.method import block_training
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.tensors import identity
@@ -54,7 +55,7 @@ def train_block(path: Path, index: int, options: WatchOptions, console: Console,
             if folder.is_done(key):
                 console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
                 return
-            folder.claim(key)
+            folder.discard_unless(key)
             _train(run, index, blocks, options, console, torch.device(device))
 
 
@@ -121,8 +122,9 @@ def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: C
     """A block that cannot be trained keeps what the coarse model has there, and says why."""
     why = "no camera sees it" if not views else "it holds no anchor"
     model.save(folder.model)
-    folder.set_status(
+    status = Status(
         "done", iteration=0, iterations=0, anchors=len(model.anchors), seconds=0.0, why=why,
         model=identity(folder.model),
     )  # fmt: skip
+    folder.set_status(status)
     console.print(f"[yellow]note[/] this block stays as the coarse model has it: {why}", highlight=False)

@@ -45,7 +45,7 @@ def train_coarse(
         config = run.method().training
         note_without_growth(config, console)
         write_json(run.capture_file, capture_facts(capture))
-        folder.claim(key)
+        folder.discard_unless(key)
         _train(run, capture, config, options, console, torch.device(device))
 
 

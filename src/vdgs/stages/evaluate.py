@@ -13,7 +13,6 @@ from rich.console import Console
 
 from vdgs.cameras import Camera
 from vdgs.evaluation.of_run import Views, cached_photographs, evaluate_run, evaluation_folder
-from vdgs.evaluation.saving import write_json
 from vdgs.evaluation.seams import block_table, evaluate_blocks
 from vdgs.kernels.types import Raster
 from vdgs.memory.process import forget_peak, peak_memory_bytes
@@ -24,7 +23,7 @@ from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.settings.requests import ModelName
-from vdgs.storage.files import read_record
+from vdgs.storage.files import read_record, write_json
 
 #: Blocks are held assembled among their surroundings up to so many bytes (at least one): views show them in turn.
 HELD_BYTES = 2_000_000_000
@@ -64,7 +63,7 @@ def is_measured(run: RunFolder, name: str, lpips_weights: Path | None, bins: int
 
 def _record_of(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> dict[str, Any]:
     stage = run.merged if name == "merged" else run.coarse
-    return {"model": stage.status().get("model"), "lpips_weights": str(lpips_weights), "bins": bins}
+    return {"model": stage.status().model, "lpips_weights": str(lpips_weights), "bins": bins}
 
 
 def _forget(output: Path) -> None:

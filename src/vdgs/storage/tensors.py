@@ -30,7 +30,7 @@ DTYPES = {
 _NAMES = {dtype: name for name, dtype in DTYPES.items()}
 _PIECE = 1 << 20
 #: What to do about a model that cannot be used.
-REBUILD = "Delete it and run the command that trained it again: it is rebuilt from the last saved state."
+REBUILD = "Delete it and run the command that trained it again: it is rebuilt from the last checkpoint."
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:

@@ -1,4 +1,4 @@
-"""A training step by hand: a view drawn, and the way back from its image to the anchors.
+"""A training step by hand: a view drawn, and the backward pass from its image to the anchors.
 
 Autograd would hold a copy of the anchors in view and gradients beside all that they belong to. By hand, anchors are
 read where they stand, gradients of splats take the place of what is no longer needed, and an anchor moves as soon as
@@ -23,7 +23,7 @@ from vdgs.model.render import joined
 
 @dataclass(frozen=True, eq=False)
 class TrainingView:
-    """A picture for training, and what the way back needs of the m splats of the anchors that are trained."""
+    """A picture for training, and what the backward pass needs of the m splats of the anchors that are trained."""
 
     image: Float[Tensor, "h w 3"]
     source: Int32[Tensor, " m"]
@@ -75,8 +75,8 @@ def move_anchors(
     """Move the anchors of the given rows in place, and leave the decoder's gradients in its `.grad`.
 
     `weights` are the decoder's as the view saw them, `states` those of `TRAINED`; `step` counts from 1; `mobility` is
-    as in `training.Stage`.
-    False: a gradient is not finite, and some anchors may have moved while others have not.
+    the learning-rate mask of `training.Stage`. False: a gradient is not finite, and some anchors may have moved while
+    others have not.
     """
     slow = None if mobility is None else _SlowAnchors.of(anchors, rows, mobility)
     finite, of_weights = choose(anchors.positions.device).decode_backward_adam(

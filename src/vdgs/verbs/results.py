@@ -23,8 +23,8 @@ class EvalArguments:
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
     views: Literal["test", "training"] = "test"
-    """Which views. `training` goes into evaluation_training: what is much better there than on test views was learnt by
-    heart. Blocks and seams are measured on test views only."""
+    """Which views. `training` goes into evaluation_training: a model that is much better there than on test views
+    overfits. Blocks and seams are measured on test views only."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     bins: int = 4

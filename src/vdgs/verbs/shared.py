@@ -51,7 +51,7 @@ def change_settings(run: RunFolder, method: MethodConfig, redo: bool) -> None:
     wanted = run.settings() | to_dict(method)
     if wanted != run.settings():
         with run.locked():
-            for line in run.change(wanted, redo):
+            for line in run.change_settings(wanted, redo):
                 open_console().print(f"[yellow]changed[/] {line}", highlight=False)
 
 

@@ -171,7 +171,7 @@ class GaussiansModel:
         except (KeyError, ValueError, TypeError) as error:
             raise VdgsError(
                 f"{path}: is damaged or incomplete ({error}). Delete it and train again: it is rebuilt from the last "
-                "saved state."
+                "checkpoint."
             ) from error
 
 
