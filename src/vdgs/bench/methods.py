@@ -71,7 +71,11 @@ def as_printed(config: MethodConfig, _budget: Budget) -> MethodConfig:
         config,
         assignment=replace(config.assignment, threshold=plain.assignment.threshold),
         block=replace(
-            plain.block, iterations=scene.iterations, scale_iterations=scene.scale_iterations, growth=scene.growth
+            plain.block,
+            iterations=scene.iterations,
+            scale_iterations=scene.scale_iterations,
+            growth=scene.growth,
+            max_anchors_total=scene.max_anchors_total,
         ),
     )
 

@@ -173,24 +173,19 @@ def _budget(scene: Scene, choices: Choices) -> Budget:
 
 
 def _limited(config: MethodConfig, choices: Choices) -> MethodConfig:
-    """With --max-anchors: a scene may hold so many, a block its share of them."""
+    """With --max-anchors: a scene may hold so many, all its blocks together too."""
     if not choices.max_anchors:
         return config
     training, block = config.training, config.block
     return replace(
         config,
         training=replace(training, growth=replace(training.growth, max_anchors=choices.max_anchors)),
-        block=replace(block, growth=replace(block.growth, max_anchors=choices.max_anchors)),
+        block=replace(block, max_anchors_total=choices.max_anchors),
     )
 
 
 def _planned(scene: Scene, method: Method, budget: Budget, base: MethodConfig, seed: int) -> PlannedRun:
     config = method.settings(base, budget)
-    if config.block.growth.max_anchors and config.partition.blocks != "auto":
-        share = -(-config.block.growth.max_anchors // config.partition.blocks)
-        config = replace(
-            config, block=replace(config.block, growth=replace(config.block.growth, max_anchors=share))
-        )  # fmt: skip
     problems = validate(config)
     if problems:
         raise VdgsError(f"{method.name} on {scene.name}: these settings do not work:\n  " + "\n  ".join(problems))

@@ -26,7 +26,7 @@ from vdgs.partition.regions import drawn_by, holds, ramp, split_anchors
 from vdgs.runs.cut import blocks_of, views_of_block
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.opening import open_run
-from vdgs.settings.method import block_training
+from vdgs.settings.method import block_limit, block_training
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.tensors import identity
 from vdgs.training import Stage, Surroundings, start_state
@@ -69,7 +69,10 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
     if not views or not len(anchors):
         _keep_coarse(folder, replace(coarse, anchors=anchors, facts=facts), len(views), console)
         return
+    owned = [each["anchors_core"] for each in run.partition_facts()["blocks"]]
     config = block_training(method, len(views))
+    limit = block_limit(method.block, owned[index], sum(owned))
+    config = replace(config, growth=replace(config.growth, max_anchors=limit))
     shares = shares_for(config, anchors, [view.camera for view in views])
     began = time.monotonic()
     crops = None

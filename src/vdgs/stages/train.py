@@ -18,6 +18,7 @@ from vdgs.memory.estimate import Need, estimate, in_gb
 from vdgs.memory.process import available_bytes
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.settings.method import block_limit
 from vdgs.settings.watching import WatchOptions
 from vdgs.watching.watch import Stopped
 
@@ -106,8 +107,9 @@ def _block_bytes(run: RunFolder) -> int:
     """Memory by estimate that the largest block needs for the program, its anchors once they have grown, and those
     around it. Photographs have a budget of their own."""
     method, anchors = run.method(), [each["anchors_core"] for each in run.partition_facts()["blocks"]]
+    limit = block_limit(method.block, max(anchors), sum(anchors))
     need = Need(
-        anchors=max(anchors), max_anchors=method.block.growth.max_anchors, offsets=method.training.anchors.offsets,
+        anchors=max(anchors), max_anchors=limit, offsets=method.training.anchors.offsets,
         seen=SEEN, pixels=0, images_bytes=0, surroundings=sum(anchors) - max(anchors),
     )  # fmt: skip
     return estimate(need).total
