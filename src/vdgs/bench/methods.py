@@ -199,7 +199,7 @@ _3DGS_SCHEDULE = (
     f"often than every {LEAST_INTERVAL} iterations"
 )
 _ABLATIONS = [
-    Method("full", "VDGS (full)", full, cites="VDGS, sections III-B and III-C"),
+    Method("full", "VDGS (full)", full, cites="VDGS, sections IV-B and IV-C"),
     Method("baseline", "baseline: coarse alone", coarse_alone, COARSE_ONLY, cites="VDGS, Table II (a)"),
     Method(
         "baseline-mean",
@@ -221,7 +221,7 @@ _ABLATIONS = [
         "printed",
         "VDGS, blocks as printed",
         as_printed,
-        cites="VDGS, sections III-B and III-C",
+        cites="VDGS, sections IV-B and IV-C",
         differs="blocks of the paper: frozen decoder, even use of photographs, damped rates, full size, no mean of "
         "models, whole photographs, share of 0.45, its compensation; growth, coarse stage and cut as `full`",
     ),

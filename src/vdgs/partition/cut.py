@@ -1,4 +1,4 @@
-"""The scene cut into blocks (section III-B, fig. 3): clusters, boundaries, and how many blocks there should be."""
+"""The scene cut into blocks (section IV-B, fig. 4): clusters, boundaries, and how many blocks there should be."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Block training (section III-B): one block, from the coarse anchors of its place, with its own cameras.
+"""Block training (section IV-B): one block, from the coarse anchors of its place, with its own cameras.
 
 The decoder is frozen, or each block trains a copy of its own. What lies around the block's core is drawn and never
 moves: the ring out to its widened boundary and, as context, all else that its cameras see (choice: else every pixel
