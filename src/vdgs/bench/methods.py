@@ -187,7 +187,7 @@ def _sweep(
 #: What the partitions leave out beyond what `partition.strategies` says of each.
 _COMMON = ("training schedule and losses of their own: blocks are trained as ours, but with plain growth",)
 _3DGS = "Kerbl et al., 3D Gaussian Splatting for Real-Time Radiance Field Rendering, SIGGRAPH 2023"
-#: As the docstring of `comparators.gaussians` has it.
+#: As the docstring of `comparators.gaussians.run` has it.
 _3DGS_LEAVES_OUT = (
     "pruning by footprint in the image (its section 5.2)",
     "its own image formation (alpha at most 0.999, near plane at 0.01 and extent by opacity are as for all methods)",
