@@ -105,5 +105,5 @@ def _note(capture: Capture) -> str:
     training, camera = len(capture.train_views), capture.train_views[0].camera
     return (
         f"A capture given as a folder: {training:,} training and {len(capture.test_views):,} test photographs of "
-        f"{camera.width} x {camera.height} pixels (from {capture.images}). Iterations go by their number."
+        f"{camera.width} x {camera.height} pixels (from {capture.images})."
     )
