@@ -1,4 +1,4 @@
-"""Which device computes: said before any work begins."""
+"""Which device computes: decided before any work begins."""
 
 from __future__ import annotations
 
@@ -104,6 +104,19 @@ def test_every_verb_that_computes_refuses_before_it_begins(arguments, tmp_path, 
     assert ended.value.code == 1
     assert "--device cpu" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []  # nothing was written, and that there is no capture did not matter yet
+
+
+@pytest.mark.parametrize("device", ["auto", "cpu"])
+def test_a_device_that_can_is_no_news(device, tmp_path, monkeypatch, capsys):
+    from vdgs.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(["eval", "nowhere", "--device", device])
+    said = capsys.readouterr()
+    assert ended.value.code == 1
+    assert "nowhere" in said.err
+    assert "device" not in said.out + said.err
 
 
 def test_doctor_says_what_there_is(monkeypatch: pytest.MonkeyPatch, tmp_path):

@@ -104,6 +104,8 @@ def _captures(plan: Plan, settings: BenchSettings, console: Console) -> tuple[di
 
 
 def _capture(scene: Scene, settings: BenchSettings, console: Console) -> Path:
+    if scene.folder is not None:
+        return scene.folder
     if scene.capture is not None:
         if settings.data is None:
             raise VdgsError(f"{scene.name}: say where the data is: --data FOLDER. {scene.note}")
@@ -205,7 +207,7 @@ def _job(run: PlannedRun, plan: Plan, capture: Path, settings: BenchSettings, th
     return Job(
         capture.resolve(), options, to_dict(run.config), run.stages, (settings.output / run.folder).resolve(),
         None if run.coarse_from is None else (settings.output / run.coarse_from).resolve(),
-        run.key({"options": options, "scene": dict(scene.synth) or scene.capture}, measured),
+        run.key({"options": options, "scene": dict(scene.synth or scene.contents) or scene.capture}, measured),
         settings.lpips_weights and settings.lpips_weights.resolve(), settings.bins, threads,
         threads if settings.jobs == 1 else 1, settings.redo,
         run.renders and run.renders.resolve(),
@@ -273,7 +275,7 @@ def _write(plan: Plan, results: list[Result], settings: BenchSettings, console: 
         jsonable({
             "table": plan.table.name, "title": plan.table.title, "seeds": plan.seeds,
             "budgets": {name: vars(budget) | {"total": budget.total} for name, budget in plan.budgets.items()},
-            "choices": vars(settings.choices), "results": as_json(results),
+            "choices": to_dict(settings.choices), "results": as_json(results),
             "verdict": [vars(line) for line in lines],
         }),
     )  # fmt: skip

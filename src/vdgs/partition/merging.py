@@ -3,7 +3,7 @@
 Merging is a selection by place: no anchor is changed, averaged or added. A block's training moves, grows and prunes
 only what its cameras see; where they see nothing, its anchors are the coarse ones still, and so is the merged scene.
 
-Symbols: V_i, the number of cameras that hold anchor i in their frustum (section III-B of the paper).
+Symbols: V_i, the number of cameras that hold anchor i in their frustum (section IV-B of the paper).
 """
 
 from __future__ import annotations

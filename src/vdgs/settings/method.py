@@ -79,7 +79,7 @@ class GrowthConfig:
     prune_views: float = 0.8
     """... and it was seen more often than this share of the interval."""
     max_anchors: int = 0
-    """No growth beyond this many anchors; 0 for no limit."""
+    """No growth beyond this many anchors; 0 for no limit. Nothing is removed to keep to it."""
 
 
 @dataclass(frozen=True)
@@ -236,6 +236,10 @@ class BlockConfig:
     """Draw the anchors outside the block too, frozen. Off: what the block's cameras see there is empty."""
     growth: GrowthConfig = field(default_factory=lambda: GrowthConfig(start=1000))
     """Growth and pruning of anchors."""
+    max_anchors_total: int = 0
+    """No growth beyond this many anchors of all blocks together; 0 for no limit. Each block has a share in proportion
+    to the coarse anchors it owns. A block that starts with more grows none, and none of its anchors is removed for
+    it: the merged scene has at most this many, or as many as the coarse model."""
     compensation: CompensationConfig = field(default_factory=CompensationConfig)
     """Compensated growth (eqs. 8-10)."""
 
@@ -272,6 +276,17 @@ COARSE_STEPS, BLOCK_STEPS = (60, 3_000, 30_000), (15, 500, 15_000)
 def with_iterations(config: TrainConfig, training_views: int) -> TrainConfig:
     """The settings with `iterations = 0` replaced by what the number of training photographs asks for."""
     return replace(config, iterations=config.iterations or _steps(training_views, *COARSE_STEPS))
+
+
+def block_limit(config: BlockConfig, anchors: int, of: int) -> int:
+    """Up to how many anchors a block may grow that owns so many of all (`of`) coarse anchors; 0 for no limit.
+
+    Shares are rounded down, so that together they are never more than the total. At least 1: no anchor of its own and
+    no limit are different things.
+    """
+    share = max(1, config.max_anchors_total * anchors // of) if config.max_anchors_total else 0
+    limits = [limit for limit in (config.growth.max_anchors, share) if limit]
+    return min(limits, default=0)
 
 
 def block_training(config: MethodConfig, views: int) -> TrainConfig:

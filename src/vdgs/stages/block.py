@@ -1,4 +1,4 @@
-"""Block training (section III-B): one block, from the coarse anchors of its place, with its own cameras.
+"""Block training (section IV-B): one block, from the coarse anchors of its place, with its own cameras.
 
 The decoder is frozen, or each block trains a copy of its own. What lies around the block's core is drawn and never
 moves: the ring out to its widened boundary and, as context, all else that its cameras see (choice: else every pixel
@@ -28,7 +28,7 @@ from vdgs.runs.cut import blocks_of, views_of_block
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.opening import open_run
 from vdgs.runs.status import Status
-from vdgs.settings.method import block_training
+from vdgs.settings.method import block_limit, block_training
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.tensors import identity
 from vdgs.training import Stage, Surroundings, start_state
@@ -73,7 +73,10 @@ def _train(
     if not views or not len(anchors):
         _keep_coarse(folder, replace(coarse, anchors=anchors, facts=facts), len(views), console)
         return
+    owned = [each.anchors_core for each in run.partition_record().blocks]
     config = block_training(method, len(views))
+    limit = block_limit(method.block, owned[index], sum(owned))
+    config = replace(config, growth=replace(config.growth, max_anchors=limit))
     shares = shares_for(config, anchors, [view.camera for view in views])
     began = time.monotonic()
     crops = None

@@ -1,4 +1,4 @@
-"""Trained blocks become one scene (end of section III-B)."""
+"""Trained blocks become one scene (end of section IV-B)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scene cut into blocks, and cameras for each: partition and assignment (section III-B).
+"""The scene cut into blocks, and cameras for each: partition and assignment (section IV-B).
 
 RUN/partition/   blocks.geojson (ground frame), blocks_wgs84.geojson (if georeferenced), scores.npz,
                  partition.json, blocks.png, block_facts.png, scores.png

@@ -19,6 +19,7 @@ from vdgs.memory.process import available_bytes
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.status import Status
+from vdgs.settings.method import block_limit
 from vdgs.settings.watching import WatchOptions
 
 #: Share of a block's anchors that one photograph may see, for the estimate before a block is opened (choice).
@@ -111,8 +112,9 @@ def _block_bytes(run: RunFolder) -> int:
     """Memory by estimate that the largest block needs for the program, its anchors once they have grown, and those
     around it. Photographs have a budget of their own."""
     method, anchors = run.method(), [each.anchors_core for each in run.partition_record().blocks]
+    limit = block_limit(method.block, max(anchors), sum(anchors))
     need = Need(
-        anchors=max(anchors), max_anchors=method.block.growth.max_anchors, offsets=method.training.anchors.offsets,
+        anchors=max(anchors), max_anchors=limit, offsets=method.training.anchors.offsets,
         seen=SEEN, pixels=0, images_bytes=0, surroundings=sum(anchors) - max(anchors),
     )  # fmt: skip
     return estimate(need).total

@@ -62,12 +62,10 @@ def use_threads(count: int) -> None:
 
 
 def use_device(asked: str) -> str:
-    """Decide which device computes, say so in a line, and return it. Raises VdgsError for one that cannot."""
+    """Which device computes, decided before any work begins. Raises VdgsError for one that cannot."""
     from vdgs.kernels.devices import choose
 
-    choice = choose(asked)
-    open_console().print(str(choice), highlight=False)
-    return choice.device
+    return choose(asked).device
 
 
 def open_console() -> Console:

@@ -6,7 +6,7 @@ or different:
 
 - pruning by footprint in the image (section 5.2); the prune by size in the world is there;
 - training stops at the iteration given: rates decay over that length; intervals (degree, decisions, resets) are
-  those of the settings, which `gaussian_schedule.scheduled` gives for another length than the published one;
+  those of the settings, which `schedule.scheduled` gives for another length than the published one;
 - views come in a new random order every epoch that is drawn from the seed, not from a running generator;
 - image formation is that of this project (docs/conventions.md): alpha at most 0.999, near plane at 0.01, extent by
   opacity, exact gradients;

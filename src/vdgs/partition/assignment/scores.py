@@ -1,4 +1,4 @@
-"""How well each camera shows each block: the score matrix behind camera assignment (section III-C, eqs. 6-7).
+"""How well each camera shows each block: the score matrix behind camera assignment (section IV-B, eqs. 6-7).
 
 Names and dimensions: c cameras, b blocks, n anchors, m splats of one view.
 
