@@ -49,8 +49,10 @@ sys.exit(130)
 
 def job(root: Path, index: int, script: str) -> BlockCommand:
     folder = StageFolder(root / f"{index:02d}")
-    command = [sys.executable, "-S", "-c", PRELUDE + textwrap.dedent(script), str(folder.path)]
-    return BlockCommand(index, folder, command, {"BLOCK": str(index)})
+    who = f"block = {index}\n"
+    return BlockCommand(
+        index, folder, [sys.executable, "-S", "-c", PRELUDE + who + textwrap.dedent(script), str(folder.path)]
+    )
 
 
 def run(jobs, *, at_once=2, retries=2, terminal=False):
@@ -94,7 +96,7 @@ def test_a_crash_is_continued_and_said(tmp_path):
         if not (folder / "state").exists():
             (folder / "state").touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        print("continued", os.environ["BLOCK"])
+        print("continued", block)
         tell("done")
     """
     (outcome,), text = run([job(tmp_path, 4, script)])
@@ -139,7 +141,7 @@ def test_memory_that_ran_out_lowers_the_number_at_once(tmp_path, monkeypatch):
     kills = iter([5, 6, 6, 6])
     monkeypatch.setattr(local, "out_of_memory_kills", lambda: next(kills))
     script = """
-        if not (folder / "state").exists() and os.environ["BLOCK"] == "0":
+        if not (folder / "state").exists() and block == 0:
             (folder / "state").touch()
             os.kill(os.getpid(), signal.SIGKILL)
     """
@@ -213,7 +215,7 @@ class Told(Listener):
 
 
 def task(root: Path, name: str, script: str, after: str | None = None) -> Task:
-    return Task(name, [sys.executable, "-S", "-c", script], root / f"{name}.log", after=after)
+    return Task(name, [sys.executable, "-S", "-c", script], root / f"{name}.log", {"WHO": name}, after=after)
 
 
 def test_a_failed_task_stops_only_those_that_come_after_it(tmp_path):
@@ -239,11 +241,12 @@ def test_a_task_waits_for_the_one_that_it_comes_after(tmp_path):
     tasks = [
         task(tmp_path, "second", "print('after')", after="first"),
         task(tmp_path, "first", crash.format(tmp_path / "seen")),
-        task(tmp_path, "third", "print('alone')", after="one of an earlier call"),
+        task(tmp_path, "third", "import os; print('alone', os.environ['WHO'])", after="one of an earlier call"),
     ]
     told = Told()
     outcomes = LocalExecutor(3, poll_seconds=0.02).run(tasks, told)
     assert [o.state for o in outcomes] == ["done"] * 3
+    assert "alone third" in tasks[2].output.read_text()
     assert [each for each in told.news if each[0] != "third"] == [
         ("first", 1), ("first", 2), ("first", "done"), ("second", 1), ("second", "done")
     ]  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -26,8 +26,6 @@ class BlockCommand:
     folder: StageFolder
     """The command locks it and keeps its status file; its output is appended to `output.log` there."""
     command: list[str]
-    environment: dict[str, str] = field(default_factory=dict)
-    """Variables on top of those of this process."""
 
     @property
     def name(self) -> str:
@@ -38,7 +36,7 @@ class BlockCommand:
         return self.folder.path / "output.log"
 
     def task(self) -> Task:
-        return Task(self.name, self.command, self.output, self.environment, self.folder.path)
+        return Task(self.name, self.command, self.output, folder=self.folder.path)
 
 
 def default_jobs(blocks: int, cores: int, memory_available: int, memory_per_block: int) -> tuple[int, int]:
