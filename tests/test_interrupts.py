@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from vdgs.interrupts import stop_requests
+from vdgs.watching.interrupts import stop_requests
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

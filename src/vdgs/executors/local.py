@@ -20,8 +20,8 @@ from pathlib import Path
 from vdgs.executors.executor import EndState, Listener, Outcome, Task
 from vdgs.executors.output import explanation, last_lines
 from vdgs.executors.parent import PARENT
-from vdgs.interrupts import stop_requests
 from vdgs.runs.folder import StageFolder
+from vdgs.watching.interrupts import stop_requests
 
 #: Exit codes of the command line (cli.py).
 DONE, EXPLAINED, STOPPED = 0, (1, 2), 130

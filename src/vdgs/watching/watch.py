@@ -13,11 +13,11 @@ import cv2
 from rich.console import Console
 
 from vdgs.errors import RunError, Stopped, TrainingDiverged, VdgsError
-from vdgs.interrupts import stop_requests
 from vdgs.memory.process import is_out_of_memory, peak_memory_bytes, return_unused
 from vdgs.runs.folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.storage.checkpoints import SavedState, discard_after, load_newest, save_state
+from vdgs.watching.interrupts import stop_requests
 
 #: As what missing memory arrives, among others (`is_out_of_memory`): from Python and C++, torch, the system, OpenCV.
 MEMORY_ERRORS = (MemoryError, RuntimeError, OSError, cv2.error)
