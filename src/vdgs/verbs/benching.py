@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from vdgs.settings.capture import CaptureOptions
-from vdgs.verbs.shared import open_console, use_device
+from vdgs.verbs.shared import open_console
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,6 @@ class BenchArguments:
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     bins: int = 4
     """Number of groups by visibility."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     """How folders among --scenes are read; scenes with names have their own. --validation holds for all."""
 
@@ -62,7 +60,6 @@ def bench(arguments: list[str]) -> None:
     from vdgs.bench.bench import BenchSettings, run_bench
     from vdgs.bench.plan import Choices
 
-    use_device(asked.device)
     choices = Choices(
         asked.seeds, asked.scenes, asked.methods, asked.scale_iterations, asked.iterations_total, asked.max_anchors,
         asked.options.validation, asked.renders, replace(asked.options, validation=False),
