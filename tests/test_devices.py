@@ -92,7 +92,6 @@ def test_deciding_needs_no_torch():
         ["run", "nowhere", "--output", "run"],
         ["render", "nowhere", "--output", "pictures"],
         ["eval", "nowhere"],
-        ["bench", "toy", "--output", "bench"],
     ],
 )
 def test_every_verb_that_computes_refuses_before_it_begins(arguments, tmp_path, monkeypatch, capsys):
