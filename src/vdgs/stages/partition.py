@@ -204,9 +204,10 @@ def _draw(
 ) -> None:  # fmt: skip
     ours = config.strategy == "visibility" and config.lambda_vis > 0
     compare = spatial if ours and len(blocks) > 1 else None
+    cuts = [(how_cut(config), blocks)] + ([] if compare is None else [(figures.BY_PLACE, compare)])
     figures.draw_blocks(
-        folder / "blocks.png", scene.positions, scene.visibility, blocks, scene.cameras, assignment.cameras,
-        scene.opened.capture.ground.unit, compare, how_cut(config),
+        folder / "blocks.png", scene.positions, scene.visibility, scene.cameras, assignment.cameras, cuts,
+        scene.opened.capture.ground.unit,
     )  # fmt: skip
     figures.draw_block_facts(
         folder / "block_facts.png", scene.positions, scene.visibility, blocks, assignment.cameras,
