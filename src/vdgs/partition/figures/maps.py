@@ -65,8 +65,8 @@ def draw_blocks(
 ) -> None:
     """Anchors from above coloured by block, with outlines and cameras, for each of the `cuts` with its name.
 
-    The first cut is the scene's own, to which cameras are assigned; another is there to compare with. The map shows 99 % of the anchors in x and in y. Writes a PNG; `unit` is that of
-    places.
+    The first cut is the scene's own, to which cameras are assigned; another is there to compare with. The map shows
+    99 % of the anchors in x and in y. Writes a PNG; `unit` is that of places.
     """
     low, high = _frame(_inner(positions[:, :2]))
     width, height = map_size(low, high)
