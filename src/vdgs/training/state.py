@@ -115,7 +115,8 @@ class Stage:
     images: TrainingImages
     image_count: int
     voxel: float
-    #: Median height of the cameras above the ground, in units of the ground frame.
+    #: How high the cameras fly above the ground, or how far they are from the scene (`captures.heights`), in units of
+    #: the ground frame.
     camera_height: float
     #: Whether the whole scene is trained or one block of it.
     kind: StageKind = "coarse"
