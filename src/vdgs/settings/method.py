@@ -93,7 +93,8 @@ class CompensationConfig:
     hold it in their frustum."""
     t_low_quantile: float = 0.0
     """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on
-    a large scene nearly every anchor is below a fixed share)."""
+    a large scene nearly every anchor is below a fixed share). Anchors that tie there are in L all or none, whichever
+    comes nearer to the quantile."""
     beta_g: float = 2.0
     """beta_g: weight of a cycle's mean gradient in the cache g. With the paper's 2, g is a sum that grows to twenty
     times the gradients it is made of; with 1 - gamma (the preset `laptop`) it is a mean over cycles."""

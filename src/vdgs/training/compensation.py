@@ -56,14 +56,27 @@ def low_visibility(share: Float[Tensor, " n"], config: CompensationConfig) -> tu
     """The set L = {c_k < T_low} of anchors, and the T_low used.
 
     `share` is c_k: the share in [0, 1] of the cycle's cameras whose frustum holds the anchor. With `t_low_quantile`
-    above 0, T_low is that quantile of the shares above 0, and 0 where there are none (L is then empty).
+    above 0, T_low is that quantile of the shares above 0. Cycles of few cameras have few different shares, and many
+    anchors may have just T_low: L then takes in all anchors up to that share at which it comes nearest to the quantile
+    of those seen (choice; the larger of two that are as near). It is empty where no anchor is seen, and where nearly
+    all that are seen have the least share.
     """
-    threshold = config.t_low
-    if config.t_low_quantile > 0:
-        some = share[share > 0]
-        # Not torch.quantile, which refuses more than 16 million numbers.
-        threshold = float(np.quantile(some.cpu().numpy(), config.t_low_quantile)) if len(some) else 0.0
-    return share < threshold, threshold
+    if config.t_low_quantile <= 0:
+        return share < config.t_low, config.t_low
+    some = share[share > 0].cpu().numpy()
+    if not len(some):
+        return torch.zeros_like(share, dtype=torch.bool), 0.0
+    # Not torch.quantile, which refuses more than 16 million numbers.
+    return share <= _highest_of(some, config.t_low_quantile), float(np.quantile(some, config.t_low_quantile))
+
+
+def _highest_of(shares: Float[np.ndarray, " s"], quantile: float) -> float:
+    """The highest share in the set of lowest ones whose size is nearest to the quantile; 0 if that set is empty."""
+    values, counts = np.unique(shares, return_counts=True)
+    sizes = np.concatenate([[0], np.cumsum(counts)])
+    off = np.abs(sizes - quantile * len(shares))
+    nearest = int(np.flatnonzero(off == off.min())[-1])
+    return float(values[nearest - 1]) if nearest else 0.0
 
 
 def begin_cycle(compensation: Compensation, statistics: Statistics) -> None:
@@ -116,18 +129,25 @@ def compensate(
 
 
 def cycle_facts(
-    compensated: Compensated, threshold: float, decision: Decision, config: CompensationConfig
+    compensated: Compensated,
+    share: Float[Tensor, " n"],
+    threshold: float,
+    decision: Decision,
+    config: CompensationConfig,
 ) -> dict[str, Any]:
     """JSON-able facts of one cycle for the log.
 
-    `low_share`: share of the anchors that are of low visibility; `t_low`: the threshold used; `mean_cache`,
+    `low_share`: share of the anchors that are of low visibility; `low_share_of_seen`: the same of those that a camera
+    of the cycle sees, 0 where ties leave nothing near the wished quantile; `t_low`: the threshold used; `mean_cache`,
     `max_cache`: g over the offsets of L (null where L is empty), `capped`: how many of them are at the cap;
     `grown_low`, `grown_other`: new anchors in cells with a parent in L, and the others; `pruned`: anchors removed.
     """
     low, offsets = int(compensated.low.sum()), compensated.added.shape[1]
+    seen = share > 0
     added = compensated.added.cpu().numpy()  # numpy sums in one order for any number of threads
     return {
         "low_share": low / max(len(compensated.low), 1),
+        "low_share_of_seen": int((compensated.low & seen).sum()) / max(int(seen.sum()), 1),
         "t_low": threshold,
         "mean_cache": float(added.sum(dtype=np.float64)) / (low * offsets) if low else None,
         "max_cache": float(added.max()) if low else None,

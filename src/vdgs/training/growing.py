@@ -21,7 +21,7 @@ def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:
     config = stage.config
     return_unused()
     generator = torch.Generator().manual_seed(config.seed * 1_000_003 + state.iteration)
-    compensated, threshold = _compensate(state, stage)
+    compensated, share, threshold = _compensate(state, stage)
     decision = decide(
         state.anchors, state.statistics, stage.voxel, config.growth, generator,
         compensated=compensated,
@@ -35,22 +35,22 @@ def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:
     return_unused()
     if state.compensation is not None:
         begin_cycle(state.compensation, state.statistics)
-    cycle = {} if compensated is None else cycle_facts(compensated, threshold, decision, config.compensation)
+    cycle = {} if compensated is None else cycle_facts(compensated, share, threshold, decision, config.compensation)
     if config.growth.max_anchors:
         cycle["budget_reached"] = before + added >= config.growth.max_anchors
     return {"grown": added, "pruned": decision.pruned, "cycle": cycle}
 
 
-def _compensate(state: TrainingState, stage: Stage) -> tuple[Compensated | None, float]:
-    """Close a cycle of compensated growth (eqs. 8-10): what is added for whom, and the T_low used."""
+def _compensate(state: TrainingState, stage: Stage) -> tuple[Compensated | None, Tensor, float]:
+    """Close a cycle of compensated growth (eqs. 8-10): what is added for whom, c_k, and the T_low used."""
     if state.compensation is None:
-        return None, 0.0
+        return None, torch.zeros(0), 0.0
     config = stage.config
     cameras = [stage.images.camera(view) for view in views_in_cycle(state.iteration, stage)]
     share = share_in_cycle(state.anchors.positions, cameras)
     low, threshold = low_visibility(share, config.compensation)
     update_cache(state.compensation, state.statistics, low, config.compensation)
-    return compensate(state.compensation, low, threshold, config.growth, config.compensation), threshold
+    return compensate(state.compensation, low, threshold, config.growth, config.compensation), share, threshold
 
 
 def reorder(state: TrainingState) -> None:
