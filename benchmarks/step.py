@@ -100,7 +100,8 @@ def one_step(
 
     timed(times, "move", move)
     timed(times, "statistics", lambda: kernels.add_view_statistics(
-        state.statistics, rows, view.source, view.opacities, gradients.means_px, camera.width, camera.height
+        state.statistics, rows, kernels.mark_visible(state.anchors.positions[rows], camera), view.source,
+        view.opacities, gradients.means_px, camera.width, camera.height,
     ))  # fmt: skip
     return len(rows), len(view.source)
 

@@ -136,12 +136,15 @@ def test_a_view_is_counted_where_it_was_drawn():
     visible = torch.tensor([1, 3])
     source = torch.tensor([0, 2, K + 1], dtype=torch.int32)  # anchor 1: offsets 0, 2; anchor 3: offset 1
     gradient = torch.tensor([[3.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
-    native.add_view_statistics(stats, visible, source, torch.tensor([0.5, 0.25, 1.0]), gradient, width=4, height=2)
+    inside = torch.tensor([False, True])
+    native.add_view_statistics(
+        stats, visible, inside, source, torch.tensor([0.5, 0.25, 1.0]), gradient, width=4, height=2
+    )
     assert stats.gradient[1].tolist() == [6.0, 0.0, 1.0, 0.0]
     assert stats.gradient[3, 1] == pytest.approx(math.hypot(2.0, 1.0))
     assert stats.drawn.sum() == 3
     assert stats.opacity.tolist() == [0, 0.75, 0, 1.0, 0]
-    assert stats.seen.tolist() == [0, 1, 0, 1, 0]
+    assert stats.seen.tolist() == [0, 0, 0, 1, 0]
 
 
 def test_surroundings_occupy_cells_but_neither_grow_nor_go():

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from checkerboard import Photographs
 from vdgs.errors import TrainingDiverged, VdgsError
+from vdgs.kernels import native
 from vdgs.kernels.native.module import set_threads, threads
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
@@ -18,6 +19,7 @@ from vdgs.model.start import initial_anchors
 from vdgs.settings.method import AnchorConfig, GrowthConfig, TrainConfig
 from vdgs.storage.checkpoints import load_newest, save_state
 from vdgs.training import Stage, downscale_at, from_saved, start_state, to_saved, train, train_step, view_at
+from vdgs.training.crops import Crop, crop_at
 
 BLACK = (0.0, 0.0, 0.0)
 CONFIG = TrainConfig(
@@ -142,6 +144,46 @@ def test_anchors_that_no_camera_sees_keep_their_bits():
     run(state, stage(), until=9)
     after = state.anchors.select(state.anchors.positions[:, 0] > 500)
     assert all(torch.equal(before.tensors()[name], after.tensors()[name]) for name in before.tensors())
+
+
+@pytest.mark.parametrize("crops", [None, (Crop(0.0, 0.1, 0.5, 0.6),) * 8])
+def test_anchors_are_seen_by_the_pictures_that_hold_their_centres(crops):
+    config = replace(CONFIG, growth=replace(CONFIG.growth, statistics_from=0, start=1000))
+    seen_by = replace(stage(config), crops=crops)
+    state = start(config)
+    expected = torch.zeros(len(state.anchors))
+    for iteration in range(12):
+        camera = Photographs().camera(view_at(iteration, 8, 0), downscale_at(iteration, config))
+        crop = crop_at(crops, 0, iteration)
+        part = camera.cropped(*crop.pixels(camera.width, camera.height))
+        expected += torch.from_numpy(part.sees(state.anchors.positions.double().numpy()))
+        train_step(state, seen_by)
+    assert torch.equal(state.statistics.seen, expected)
+    assert 0 < float(expected.mean()) < 12
+
+
+def test_transparent_anchors_go_where_they_are_seen_and_stay_just_outside_of_all_pictures():
+    config = replace(CONFIG, growth=replace(CONFIG.growth, threshold=1e9))
+    state, nothing = start(config), replace(stage(config), frozen_decoder=True)
+    with torch.no_grad():
+        state.decoder.weights.opacity.w2[:] = 0.0
+        state.decoder.weights.opacity.b2[:] = -1.0  # no Gaussian is drawn
+    for tensor in state.decoder.tensors().values():
+        tensor.requires_grad_(False)
+    before = state.anchors.positions.clone()
+    cameras = Photographs().cameras
+    times = native.count_visibility(before, cameras)
+    beside = torch.zeros(len(before), dtype=torch.bool)
+    for camera in cameras:
+        beside[native.cull(before, state.anchors.log_scales, camera)] = True
+    beside &= times == 0
+    run(state, nothing)
+    left = {tuple(place) for place in state.anchors.positions.tolist()}
+    stays = torch.tensor([tuple(place) in left for place in before.tolist()])
+    assert beside.sum() > 3
+    assert stays[times == 0].all()
+    assert not stays[times > 1].any()
+    assert (times > 1).sum() > 100
 
 
 def test_a_parameter_that_is_not_a_number_stops_training():

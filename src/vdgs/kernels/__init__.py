@@ -21,7 +21,8 @@ Names and dimensions, fixed once for all files in this folder:
        rasterise_vjp(the same) -> Raster, and the function that takes gradients of it back to the splats
     d  photometric_loss(image [h,w,3], target uint8 [h,w,3], mask) -> Photometric(loss, l1, ssim)
        adam_rows(parameter [n,...], rows [v], gradient [v,...], moments, ...) -> finite; in place
-       add_view_statistics(visible [v], source [m], opacities [m], gradient_px [m,2], ..., sums) in place
+       add_view_statistics(visible [v], inside [v], source [m], opacities [m], gradient_px [m,2], ..., sums)
+                 in place
        count_visibility(points [n,3], cameras) -> int32 [n];  mark_visible(points [n,3], camera) -> bool [n]
        cell_keys, cell_centres, group_cells, group_max, contains, morton_order: the lattice of growth
 

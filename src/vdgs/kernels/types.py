@@ -197,7 +197,7 @@ class Statistics:
     #: Norm of dL/d(mean) in NDC units, and how often the offset was drawn.
     gradient: Float[Tensor, "n k"]
     drawn: Float[Tensor, "n k"]
-    #: Opacity of the anchor's Gaussians, summed over them, and how often the anchor was visible.
+    #: Opacity of the anchor's Gaussians, summed over them, and how often its centre was in the picture.
     opacity: Float[Tensor, "n"]
     seen: Float[Tensor, "n"]
 

@@ -73,8 +73,10 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
 
     growing = iteration + 1 <= config.growth.until * config.iterations
     if growing and iteration + 1 > config.growth.statistics_from:
+        # Seen is what V counts too: an anchor beside the picture may touch it, but is not to blame for showing nothing.
+        inside = kernels.mark_visible(state.anchors.positions[rows], camera)
         kernels.add_view_statistics(
-            state.statistics, rows, drawn.source, drawn.opacities, gradients.means_px, *camera.whole_size
+            state.statistics, rows, inside, drawn.source, drawn.opacities, gradients.means_px, *camera.whole_size
         )
     state.iteration += 1
     report = StepReport(value, float(photometric.l1), float(photometric.ssim), len(rows), len(drawn.source))
