@@ -95,7 +95,7 @@ def one_step(
 
     def move() -> None:
         states = state.optimiser.anchor_states(state.anchors, rates)
-        move_anchors(state.anchors, rows, gradients, weights, camera, states, step)
+        move_anchors(state.anchors, rows, gradients, weights, camera, states, state.optimiser.updates)
         state.optimiser.update_decoder(state.decoder, rates, step)
 
     timed(times, "move", move)

@@ -16,7 +16,7 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
 from vdgs.model.render import render
 from vdgs.model.start import initial_anchors
-from vdgs.settings.method import AnchorConfig, GrowthConfig, TrainConfig
+from vdgs.settings.method import AnchorConfig, GrowthConfig, RateConfig, TrainConfig
 from vdgs.storage.checkpoints import load_newest, save_state
 from vdgs.training import Stage, downscale_at, from_saved, start_state, to_saved, train, train_step, view_at
 from vdgs.training.crops import Crop, crop_at
@@ -184,6 +184,35 @@ def test_transparent_anchors_go_where_they_are_seen_and_stay_just_outside_of_all
     assert stays[times == 0].all()
     assert not stays[times > 1].any()
     assert (times > 1).sum() > 100
+
+
+@pytest.mark.parametrize("first_seen", [0, 10_000])
+def test_the_first_step_of_an_anchor_is_the_same_whenever_it_is_seen_first(first_seen):
+    """An anchor that was never seen keeps everything; seen first, it moves as it would have at once."""
+    config = replace(CONFIG, iterations=20_000, rates=RateConfig(features=(0.01, 0.01), log_scales=(0.01, 0.01)))
+    state = start(config)
+    state.iteration = first_seen
+    before = state.anchors.select(torch.arange(len(state.anchors)))
+    one_view = replace(stage(replace(config, growth=replace(config.growth, until=0.0))), image_count=1)
+    train_step(state, one_view)
+    updates = state.optimiser.updates
+    assert set(updates.tolist()) == {0, 1}
+    for name, rate in (("features", 0.01), ("log_scales", 0.01)):
+        moved = (getattr(state.anchors, name) - getattr(before, name)).abs()
+        assert not moved[updates == 0].any()
+        assert 0.99 * rate < float(moved.max()) < 1.01 * rate
+
+
+def test_updates_follow_their_anchors():
+    state = start()
+    state.optimiser.updates += torch.arange(len(state.anchors), dtype=torch.int32)
+    names = {tuple(place): i for i, place in enumerate(state.anchors.positions.tolist())}
+    order = torch.randperm(len(state.anchors), generator=torch.Generator().manual_seed(0))
+    state.optimiser.rebuild(2, torch.cat([order, torch.tensor([len(order), len(order) + 1])]))
+    places = state.anchors.positions[order].tolist()
+    assert state.optimiser.updates.tolist() == [*(names[tuple(place)] for place in places), 0, 0]
+    again = from_saved(to_saved(start()), stage()).optimiser
+    assert torch.equal(again.updates, start().optimiser.updates)
 
 
 def test_a_parameter_that_is_not_a_number_stops_training():

@@ -51,8 +51,7 @@ class Operations(Protocol):
         camera: Camera,
         rows: Tensor,
         gradients: SplatGradients,
-        *,
-        step: int,
+        updates: Tensor,
     ) -> tuple[bool, tuple[Tensor, ...] | None]: ...
 
     def project(self, means: Tensor, scales: Tensor, quaternions: Tensor, camera: Camera) -> Projected: ...
@@ -70,24 +69,15 @@ class Operations(Protocol):
     ) -> Photometric: ...
 
     def adam_rows(
-        self,
-        parameter: Tensor,
-        rows: Tensor | None,
-        gradient: Tensor,
-        first_moment: Tensor,
-        second_moment: Tensor,
-        *,
-        learning_rate: float,
-        step: int,
-        beta1: float = 0.9,
-        beta2: float = 0.999,
-        epsilon: float = 1e-15,
-    ) -> bool: ...
+        self, state: AdamState, rows: Tensor | None, gradient: Tensor, step: int | Tensor, *, beta1: float = 0.9,
+        beta2: float = 0.999, epsilon: float = 1e-15,
+    ) -> bool: ...  # fmt: skip
 
     def add_view_statistics(
         self,
         statistics: Statistics,
         visible: Tensor,
+        inside: Tensor,
         source: Tensor,
         opacities: Tensor,
         gradient_px: Tensor,

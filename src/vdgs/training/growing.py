@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from vdgs.kernels import choose
 from vdgs.memory.process import return_unused

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Int32
 from torch import Tensor
 
 from vdgs.kernels import choose
@@ -31,15 +32,20 @@ class Moments:
 
 @dataclass
 class Optimiser:
-    """Moments of all parameters; `step` counts updates from 1 (for the bias correction)."""
+    """Moments of all parameters, and what the bias correction counts: the updates of each anchor, [n] int32.
+
+    The decoder moves in every step: its updates are the steps.
+    """
 
     anchors: Moments
     decoder: Moments
+    updates: Int32[Tensor, " n"]
 
     @staticmethod
     def start(anchors: Anchors, decoder: Decoder) -> Optimiser:
         trained = {name: tensor for name, tensor in anchors.tensors().items() if name in TRAINED}
-        return Optimiser(Moments.zeros(trained), Moments.zeros(decoder.tensors()))
+        updates = torch.zeros_like(anchors.positions[:, 0], dtype=torch.int32)
+        return Optimiser(Moments.zeros(trained), Moments.zeros(decoder.tensors()), updates)
 
     def anchor_states(self, anchors: Anchors, rates: dict[str, float]) -> list[AdamState]:
         """What moves of the anchors, in the order of `TRAINED`."""
@@ -49,14 +55,16 @@ class Optimiser:
         ]
 
     def update_decoder(self, decoder: Decoder, rates: dict[str, float], step: int) -> bool:
-        """Move the decoder's tensors by their `.grad`, in place. False: a gradient is not finite."""
+        """Move the decoder's tensors by their `.grad`, in place; `step` counts from 1.
+
+        False: a gradient is not finite.
+        """
         finite = True
         for name, tensor in decoder.tensors().items():
             if tensor.grad is not None:
-                finite &= choose(tensor.device).adam_rows(
-                    tensor.detach(), None, tensor.grad, self.decoder.first[name], self.decoder.second[name],
-                    learning_rate=rates[name.split("_")[0]], step=step,
-                )  # fmt: skip
+                moments = self.decoder.first[name], self.decoder.second[name]
+                state = AdamState(tensor.detach(), *moments, rates[name.split("_")[0]])
+                finite &= choose(tensor.device).adam_rows(state, None, tensor.grad, step)
                 tensor.grad = None
         return finite
 

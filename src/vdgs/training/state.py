@@ -67,6 +67,7 @@ class TrainingState:
         groups = {
             "anchors": self.anchors.tensors(), "statistics": self.statistics.tensors(),
             "first.anchors": moments.first, "second.anchors": moments.second,
+            "updates": {"anchors": self.optimiser.updates},
         }  # fmt: skip
         if self.compensation is not None:
             groups["compensation"] = self.compensation.tensors()
@@ -84,6 +85,7 @@ class TrainingState:
         """The inverse of `take_groups`."""
         self.anchors, self.statistics = Anchors(**groups["anchors"]), Statistics(**groups["statistics"])
         self.optimiser.anchors = Moments(groups["first.anchors"], groups["second.anchors"])
+        self.optimiser.updates = groups["updates"]["anchors"]
         if self.compensation is not None:
             self.compensation = Compensation(**groups["compensation"])
         if self.average is not None:

@@ -69,18 +69,18 @@ def move_anchors(
     weights: DecoderWeights,
     camera: Camera,
     states: Sequence[AdamState],
-    step: int,
+    updates: Int32[Tensor, " n"],
     mobility: Callable[[Tensor], Tensor] | None = None,
 ) -> bool:
     """Move the anchors of the given rows in place, and leave the decoder's gradients in its `.grad`.
 
-    `weights` are the decoder's as the view saw them, `states` those of `TRAINED`; `step` counts from 1; `mobility` is
-    the learning-rate mask of `training.Stage`. False: a gradient is not finite, and some anchors may have moved while
-    others have not.
+    `weights` are the decoder's as the view saw them, `states` those of `TRAINED`; `updates` counts how often each
+    anchor has moved; `mobility` is the learning-rate mask of `training.Stage`. False: a gradient is not finite, and some
+    anchors may have moved while others have not.
     """
     slow = None if mobility is None else _SlowAnchors.of(anchors, rows, mobility)
     finite, of_weights = choose(anchors.positions.device).decode_backward_adam(
-        anchors.positions, states, weights, camera, rows, gradients, step=step
+        anchors.positions, states, weights, camera, rows, gradients, updates
     )
     if slow is not None:
         slow.hold_back(anchors)

@@ -19,6 +19,7 @@ from vdgs.comparators.gaussians.density import DensityConfig, control_density, r
 from vdgs.comparators.gaussians.model import Gaussians, draw_gaussians, visible_rows
 from vdgs.errors import TrainingDiverged
 from vdgs.kernels import choose
+from vdgs.kernels.types import AdamState
 from vdgs.storage.checkpoints import SavedState
 from vdgs.training import PSNR_INTERVAL, TrainingImages, view_at
 from vdgs.training.optimiser import Moments
@@ -209,10 +210,8 @@ def _move(
         if name == "rest" and not degree:
             continue  # gradients and moments are zero: nothing moves
         everywhere = state.room[name].index_copy_(0, rows, gradients[name])
-        finite &= choose(tensor.device).adam_rows(
-            tensor, None, everywhere, state.moments.first[name], state.moments.second[name],
-            learning_rate=rates[name], step=state.iteration + 1,
-        )  # fmt: skip
+        moved = AdamState(tensor, state.moments.first[name], state.moments.second[name], rates[name])
+        finite &= choose(tensor.device).adam_rows(moved, None, everywhere, state.iteration + 1)
         everywhere.index_fill_(0, rows, 0.0)
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {state.iteration + 1}.")
