@@ -203,18 +203,6 @@ def test_the_first_step_of_an_anchor_is_the_same_whenever_it_is_seen_first(first
         assert 0.99 * rate < float(moved.max()) < 1.01 * rate
 
 
-def test_updates_follow_their_anchors():
-    state = start()
-    state.optimiser.updates += torch.arange(len(state.anchors), dtype=torch.int32)
-    names = {tuple(place): i for i, place in enumerate(state.anchors.positions.tolist())}
-    order = torch.randperm(len(state.anchors), generator=torch.Generator().manual_seed(0))
-    state.optimiser.rebuild(2, torch.cat([order, torch.tensor([len(order), len(order) + 1])]))
-    places = state.anchors.positions[order].tolist()
-    assert state.optimiser.updates.tolist() == [*(names[tuple(place)] for place in places), 0, 0]
-    again = from_saved(to_saved(start()), stage()).optimiser
-    assert torch.equal(again.updates, start().optimiser.updates)
-
-
 def test_a_parameter_that_is_not_a_number_stops_training():
     state = start()
     with torch.no_grad():

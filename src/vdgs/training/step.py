@@ -75,8 +75,8 @@ def move_anchors(
     """Move the anchors of the given rows in place, and leave the decoder's gradients in its `.grad`.
 
     `weights` are the decoder's as the view saw them, `states` those of `TRAINED`; `updates` counts how often each
-    anchor has moved; `mobility` is the learning-rate mask of `training.Stage`. False: a gradient is not finite, and some
-    anchors may have moved while others have not.
+    anchor has moved; `mobility` is the learning-rate mask of `training.Stage`. False: a gradient is not finite, and
+    some anchors may have moved while others have not.
     """
     slow = None if mobility is None else _SlowAnchors.of(anchors, rows, mobility)
     finite, of_weights = choose(anchors.positions.device).decode_backward_adam(
