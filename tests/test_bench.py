@@ -26,6 +26,8 @@ from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
 from vdgs.settings.capture import CaptureOptions
 
+pytestmark = pytest.mark.xdist_group("bench")
+
 
 def test_a_failed_run_stops_only_those_that_build_on_it(tmp_path):
     files = [tmp_path / f"{name}.json" for name in "abc"]

@@ -59,7 +59,7 @@ def test_merging_one_block_is_the_identity(config: MergeConfig):
     }  # fmt: skip
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10**6), st.sampled_from([OWNER, BEST_SEEN]))
 def test_the_merged_scene_is_a_disjoint_union(seed: int, config: MergeConfig):
     """Whatever the blocks hold, even in each other's places, each gives what lies where it is the giver."""

@@ -19,6 +19,8 @@ from vdgs.settings.method import AnchorConfig, GrowthConfig, TrainConfig
 from vdgs.storage.checkpoints import load_newest, save_state
 from vdgs.training import Stage, downscale_at, from_saved, start_state, to_saved, train, train_step, view_at
 
+pytestmark = pytest.mark.xdist_group("training")
+
 BLACK = (0.0, 0.0, 0.0)
 CONFIG = TrainConfig(
     iterations=60,
