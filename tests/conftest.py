@@ -1,15 +1,33 @@
-"""Shared by all tests: shapes are checked at run time, figures need no screen."""
+"""Shared by all tests: shapes are checked at run time, nothing depends on the clock, figures need no screen.
+
+The whole suite runs on all cores (pytest-xdist, up to four workers); single files run here and now, without workers.
+Modules whose fixtures are expensive are marked as one group each (`xdist_group`): one worker runs them.
+"""
 
 import os
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("MPLBACKEND", "Agg")
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # The workers fill the cores: kernels and torch on more threads would only wait for each other. Tests about threads
+    # ask for theirs. Processes that tests start inherit this.
+    os.environ.setdefault("VDGS_THREADS", "1")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
+from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
 PACKAGE = Path(__file__).parents[1] / "src" / "vdgs"
+#: Memory is what limits their number on machines of many cores (about 1 GB each).
+MOST_WORKERS = 4
+
+# The same examples in every run, and as many on a busy machine as on an idle one. Search for new ones with
+# `pytest --hypothesis-profile search`.
+settings.register_profile("vdgs", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("search", settings.get_profile("vdgs"), derandomize=False, max_examples=1000)
+settings.load_profile("vdgs")
 
 
 def files_with_shapes() -> list[Path]:
@@ -25,6 +43,14 @@ def module_name(file: Path) -> str:
 
 # Their annotations are checked while the tests run.
 install_import_hook([module_name(file) for file in files_with_shapes()], "typecheck.checked")
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """What `-n auto` means: no workers (0) where only some files were asked for, for they take seconds to start."""
+    if any(argument.partition("::")[0].endswith(".py") for argument in config.args):
+        return 0
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, MOST_WORKERS)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -66,7 +66,7 @@ def test_rows_that_are_not_given_keep_parameters_and_moments(implementation):
         assert torch.all(tensor[rows] != old[rows])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.integers(0, 400),
     st.sampled_from([(), (1,), (3,), (6,), (32,), (10, 3)]),

@@ -34,7 +34,7 @@ matrices = st.integers(0, 12).flatmap(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(matrices, st.sampled_from(MODES), st.integers(0, 8))
 def test_laws_of_assignment(matrix, mode, floor):
     scores = hand_made(*matrix, mode=mode)

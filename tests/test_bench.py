@@ -24,6 +24,8 @@ from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
 from vdgs.settings.capture import CaptureOptions
 
+pytestmark = pytest.mark.xdist_group("bench")
+
 SMALL = ("--methods", "baseline", "full", "--scale-iterations", "0.1", "--jobs", "2")
 
 

@@ -16,6 +16,8 @@ from vdgs.bench.verdict import verdict
 from vdgs.errors import VdgsError
 from vdgs.evaluation import saving
 
+pytestmark = pytest.mark.xdist_group("bench_renders")
+
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:

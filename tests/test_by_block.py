@@ -107,7 +107,7 @@ def test_labels_need_depth():
 label_maps = arrays(np.int16, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.integers(-1, 2))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(label_maps, st.sampled_from([0.0, 1.0, 1.5, 3.0]))
 def test_border_pixels_by_exhaustion(labels: np.ndarray, width_px: float):
     height, width = labels.shape

@@ -20,7 +20,7 @@ from vdgs.captures.loading import load_capture
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
 
-FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FUZZ = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture

@@ -39,7 +39,7 @@ def ground_of(scene, tmp_path, **options):
     return find_ground_frame(source_of(scene), tmp_path, CaptureOptions(**options))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), scale=st.floats(0.01, 100))
 def test_a_rigid_motion_and_scaling_of_the_world_changes_only_the_yaw(tmp_path_factory, seed, scale):
     scene = tiny_scene(seed=seed % 7)
@@ -55,7 +55,7 @@ def test_a_rigid_motion_and_scaling_of_the_world_changes_only_the_yaw(tmp_path_f
     assert turn.scale == pytest.approx(1, abs=1e-9)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000))
 def test_the_estimated_up_axis_is_up(tmp_path_factory, seed):
     """The generated world has z up; so has the ground frame, whichever way the input was turned."""

@@ -62,7 +62,7 @@ def test_native_keys_equal_the_twin(dtype, cell_size):
     assert torch.equal(native.cell_keys(positions, cell_size, origin), expected)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(KEYS)
 def test_groups_equal_torch_unique(keys):
     expected = torch.unique(keys, return_inverse=True)
@@ -72,7 +72,7 @@ def test_groups_equal_torch_unique(keys):
         assert torch.equal(group, expected[1])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(KEYS, KEYS)
 def test_contains_equals_membership(table, query):
     held = set(table.tolist())
@@ -81,7 +81,7 @@ def test_contains_equals_membership(table, query):
         assert implementation.contains(table, query).tolist() == expected
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 300), st.integers(1, 40), st.integers(1, 50), st.integers(0, 1000))
 def test_native_group_max_equals_the_twin(n, d, count, seed):
     generator = torch.Generator().manual_seed(seed)

@@ -5,23 +5,24 @@ import os
 import random
 import shutil
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import cv2
 import pytest
 import torch
 
 from captures_support import tiny_scene, write_colmap
+from cli_support import begun, entry_point, vdgs
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.runs.opening import open_run
 
+pytestmark = pytest.mark.xdist_group("coarse")
+
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "1500", "--save-every", "50", "--anchors.offsets", "3", "--up", "z",
-    "--growth.start", "100", "--growth.statistics-from", "50", "--growth.gate", "0.05",
+    "--preset", "laptop", "--iterations", "200", "--save-every", "10", "--anchors.offsets", "3", "--up", "z",
+    "--growth.start", "40", "--growth.interval", "20", "--growth.statistics-from", "20", "--growth.gate", "0.05",
 )  # fmt: skip
 
 
@@ -33,22 +34,11 @@ def capture(tmp_path_factory) -> Path:
 
 
 def command(capture: Path, run: Path, *more: str) -> list[str]:
-    return [sys.executable, "-m", "vdgs.cli", "coarse", str(capture), "--output", str(run), *SETTINGS, *more]
+    return ["coarse", str(capture), "--output", str(run), *SETTINGS, *more]
 
 
-def finish(capture: Path, run: Path, *more: str) -> subprocess.CompletedProcess:
-    return subprocess.run(command(capture, run, *more), capture_output=True, text=True, timeout=120)
-
-
-def begin(capture: Path, run: Path) -> subprocess.Popen:
-    """Start the command and wait until it trains."""
-    started = subprocess.Popen(command(capture, run), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    status, before = run / "coarse" / "status.json", time.time()
-    while started.poll() is None and not (
-        status.exists() and status.stat().st_mtime >= before - 0.01 and '"running"' in status.read_text()
-    ):
-        time.sleep(0.01)
-    return started
+def finish(capture: Path, run: Path, *more: str) -> CompletedProcess[str]:
+    return vdgs(*command(capture, run, *more))
 
 
 def model_bytes(run: Path) -> bytes:
@@ -58,7 +48,7 @@ def model_bytes(run: Path) -> bytes:
 @pytest.fixture(scope="module")
 def unbroken(capture, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("unbroken") / "run"
-    done = finish(capture, run)
+    done = entry_point(*command(capture, run))
     assert done.returncode == 0, done.stderr
     return run
 
@@ -75,11 +65,11 @@ def test_a_run_leaves_what_the_documents_say(unbroken):
     assert not [name for name in names if name.endswith(".tmp")]
     log = [json.loads(line) for line in (unbroken / "coarse/log.jsonl").read_text().splitlines()]
     assert [line["iteration"] for line in log] == sorted({line["iteration"] for line in log})
-    assert log[-1]["iteration"] == 1500
+    assert log[-1]["iteration"] == 200
     assert log[-1]["loss"] < 0.5 * log[0]["loss"]
     status = json.loads((unbroken / "coarse/status.json").read_text())
     assert status["state"] == "done"
-    assert AnchorModel.load(unbroken / "coarse/model.safetensors").facts["iterations"] == 1500
+    assert AnchorModel.load(unbroken / "coarse/model.safetensors").facts["iterations"] == 200
 
 
 def test_a_finished_run_is_not_trained_again(capture, unbroken):
@@ -91,47 +81,47 @@ def test_a_finished_run_is_not_trained_again(capture, unbroken):
 
 
 def test_ten_kills_change_no_bit(capture, unbroken, tmp_path):
+    """Each just before something happens to a file of the run: a state is begun, renamed, removed, read again."""
     run, moments = tmp_path / "run", random.Random(7)
-    kills = 0
     for _ in range(10):
-        process = begin(capture, run)
-        time.sleep(moments.uniform(0.0, 0.35))
-        kills += process.poll() is None
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-    assert kills >= 8
+        with begun(*command(capture, run), pause_at=("*/coarse/*", moments.randrange(1, 30))) as process:
+            process.wait_until_paused()
+            process.send_signal(signal.SIGKILL)
+            assert process.finished().returncode == -signal.SIGKILL
     done = finish(capture, run)
     assert done.returncode == 0, done.stderr
+    assert "continuing at iteration" in done.stdout
     assert model_bytes(run) == model_bytes(unbroken)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_run_saves_and_continues(capture, unbroken, tmp_path, number):
     run = tmp_path / "run"
-    process = begin(capture, run)
-    process.send_signal(number)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert "The same command continues" in errors
+    with begun(*command(capture, run), pause_at=("*/checkpoints/00000020.json", 1)) as process:
+        process.wait_until_paused()
+        process.send_signal(number)
+        stopped = process.finished()
+    assert stopped.returncode == 130
+    assert "The same command continues" in stopped.stderr
     assert json.loads((run / "coarse/status.json").read_text())["state"] == "stopped"
     done = finish(capture, run)
-    assert "continuing at iteration" in done.stdout
+    assert "continuing at iteration 20" in done.stdout
     assert model_bytes(run) == model_bytes(unbroken)
 
 
 def test_a_truncated_state_falls_back_and_says_so(capture, unbroken, tmp_path):
     run = tmp_path / "run"
-    process = begin(capture, run)
-    while len(list((run / "coarse/checkpoints").glob("*.json"))) < 2:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
+    with begun(*command(capture, run), pause_at=("*/checkpoints/00000060.json", 1)) as process:
+        process.wait_until_paused()
+        process.send_signal(signal.SIGKILL)
+        process.finished()
     newest = sorted((run / "coarse/checkpoints").glob("*.json"))[-1].with_suffix(".safetensors")
     os.truncate(newest, newest.stat().st_size // 3)
     done = finish(capture, run)
     assert done.returncode == 0, done.stderr
     assert newest.name in done.stdout.replace("\n", "")
     assert "damaged" in done.stdout
+    assert "continuing at iteration 40" in done.stdout
     assert model_bytes(run) == model_bytes(unbroken)
 
 
@@ -215,8 +205,7 @@ def test_a_capture_that_changed_is_refused(capture, unbroken, tmp_path, change):
 def test_a_disk_that_is_full_is_said_and_the_same_command_continues(capture, unbroken, tmp_path):
     """A limit on the size of files stands in for the disk: the states of this run do not fit."""
     run = tmp_path / "run"
-    limited = ["bash", "-c", 'ulimit -f 60; exec "$@"', "-", *command(capture, run)]
-    done = subprocess.run(limited, capture_output=True, text=True, timeout=120)
+    done = vdgs(*command(capture, run), file_blocks=60)
     assert done.returncode == 1
     assert "cannot be written" in done.stderr
     assert "Traceback" not in done.stderr
@@ -229,16 +218,15 @@ def test_a_photograph_deleted_on_the_way_loses_nothing(capture, unbroken, tmp_pa
     other = tmp_path / "capture"
     shutil.copytree(capture, other)
     run = tmp_path / "run"
-    process = subprocess.Popen(
-        command(other, run, "--image-memory-gb", "1e-6"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    while not list((run / "coarse/checkpoints").glob("*.json")) and process.poll() is None:
-        time.sleep(0.01)
-    photograph = sorted((other / "images").iterdir())[5]
-    photograph.rename(tmp_path / photograph.name)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 1
-    assert photograph.name in errors
+    tight = command(other, run, "--image-memory-gb", "1e-6")
+    with begun(*tight, pause_at=("*/checkpoints/00000010.json", 1)) as process:
+        process.wait_until_paused()
+        photograph = sorted((other / "images").iterdir())[5]
+        photograph.rename(tmp_path / photograph.name)
+        process.go_on()
+        failed = process.finished()
+    assert failed.returncode == 1
+    assert photograph.name in failed.stderr
     assert json.loads((run / "coarse/status.json").read_text())["state"] == "failed"
     (tmp_path / photograph.name).rename(photograph)
     done = finish(other, run)
@@ -249,16 +237,15 @@ def test_a_photograph_deleted_on_the_way_loses_nothing(capture, unbroken, tmp_pa
 
 def test_a_few_iterations_are_a_run_too(capture, tmp_path):
     arguments = command(capture, tmp_path / "run")
-    arguments[arguments.index("1500")] = "3"
-    done = subprocess.run(arguments, capture_output=True, text=True, timeout=120)
+    arguments[arguments.index("200")] = "3"
+    done = vdgs(*arguments)
     assert done.returncode == 0, done.stderr
     assert "no anchor will grow" in done.stdout
 
 
 def test_evaluation_and_renders_of_a_run(unbroken, tmp_path):
-    vdgs = [sys.executable, "-m", "vdgs.cli"]
     run = copy_of(unbroken, tmp_path / "run")
-    measured = subprocess.run([*vdgs, "eval", str(run)], capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    measured = vdgs("eval", run)
     assert measured.returncode == 0, measured.stderr
     assert "LPIPS is null" in measured.stdout
     metrics = json.loads((run / "coarse/evaluation/metrics.json").read_text())
@@ -267,18 +254,16 @@ def test_evaluation_and_renders_of_a_run(unbroken, tmp_path):
     assert metrics["n_anchors"] > 100
     assert sum(bin["pixels"] for bin in metrics["by_visibility"]) == 2 * 64 * 48
     test_files = {path: path.read_bytes() for path in (run / "coarse/evaluation").rglob("*.png")}
-    learnt = [*vdgs, "eval", str(run), "--views", "training"]
-    assert subprocess.run(learnt, capture_output=True, timeout=120, cwd=tmp_path).returncode == 0
+    assert vdgs("eval", run, "--views", "training").returncode == 0
     training = json.loads((run / "coarse/evaluation_training/metrics.json").read_text())
     assert (metrics["test_views"], training["training_views"]) == (2, 10)
     assert training["psnr"] > metrics["psnr"]
     assert {path: path.read_bytes() for path in test_files} == test_files
     for kind in ("image", "depth", "visibility"):
-        shown = [*vdgs, "render", str(run), "--output", str(tmp_path / kind), "--kind", kind]
-        assert subprocess.run(shown, capture_output=True, timeout=120).returncode == 0
+        assert vdgs("render", run, "--output", tmp_path / kind, "--kind", kind).returncode == 0
         pictures = [cv2.imread(str(path)) for path in sorted((tmp_path / kind).glob("*.png"))]
         assert [picture.shape for picture in pictures] == [(48, 64, 3)] * 2
         assert min(float(picture.std()) for picture in pictures) > 3
-    film = [*vdgs, "render", str(run), "--output", str(tmp_path / "f.mp4"), "--views", "orbit", "--seconds", "0.5"]
-    assert subprocess.run(film, capture_output=True, timeout=120).returncode == 0
+    film = ("render", run, "--output", tmp_path / "f.mp4", "--views", "orbit", "--seconds", "0.5")
+    assert vdgs(*film).returncode == 0
     assert (tmp_path / "f.mp4").stat().st_size > 1000

@@ -89,7 +89,7 @@ def bits(anchors: Anchors, statistics: Statistics) -> list[bytes]:
     return [tensor.numpy().tobytes() for tensor in (*anchors.tensors().values(), *statistics.tensors().values())]
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(
     seed=st.integers(0, 1000),
     config=st.sampled_from(
@@ -110,7 +110,7 @@ def test_with_the_papers_weights_more_grows_and_twice_the_same():
     assert torch.equal(once[2].cache, again[2].cache)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     cycles=st.lists(st.tuples(st.booleans(), st.integers(0, 50), st.floats(0, 1)), min_size=1, max_size=12),
     beta=st.sampled_from([0.0, 1.0, 2.0, 3.0]),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from block_support import BLOCKS, block_stage, coarse
@@ -91,7 +91,6 @@ def test_a_part_keeps_the_size_of_the_whole_and_must_lie_in_it():
         part.resized(10, 10)
 
 
-@settings(deadline=None)
 @given(
     sides=st.tuples(*[st.floats(0, 1)] * 4),
     width=st.integers(1, 300),

@@ -15,7 +15,7 @@ from vdgs.kernels.cuda.driver import CudaUnavailable, cuda_driver
 from vdgs.kernels.cuda.launching import Program, read_source
 from vdgs.kernels.reference import loss as reference
 
-pytestmark = needs_nvrtc
+pytestmark = [needs_nvrtc, pytest.mark.xdist_group("cuda_loss")]
 needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
 SIZES = [(1, 1), (3, 2), (16, 16), (17, 33), (37, 50), (64, 31)]
 

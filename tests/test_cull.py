@@ -35,7 +35,7 @@ def ellipse_touches_image(positions, log_scales, camera) -> torch.Tensor:
 
 
 @BOTH
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10**6), spread=st.floats(0.5, 30), log_scale=st.floats(-6, 3), which=st.integers(0, 3))
 def test_never_drops_what_touches_the_image(cull, seed, spread, log_scale, which):
     positions, log_scales = anchors(400, seed, spread, log_scale)

@@ -23,7 +23,7 @@ def ground(seed: int = 0, count: int = 4000) -> np.ndarray:
     return np.column_stack([flat, 0.05 * flat[:, 0]])
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 100))
 def test_a_hole_is_filled_at_the_height_of_the_ground_about_it(seed):
     points = ground(seed)

@@ -34,7 +34,7 @@ def some_gaussians(count: int = 40, seed: int = 0, degree: int = 1) -> Gaussians
 
 
 @given(seed=st.integers(0, 10_000), size=st.floats(-3, 1.5))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_what_is_left_out_of_a_view_would_not_change_it(seed, size):
     everything = some_gaussians(seed=seed)
     everything = replace(

@@ -37,6 +37,8 @@ from vdgs.runs.folder import StageFolder
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.checkpoints import load_newest, save_state
 
+pytestmark = pytest.mark.xdist_group("gaussian_training")
+
 CONFIG = GaussiansConfig(
     iterations=80,
     resolutions=((0, 2), (20, 1)),

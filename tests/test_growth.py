@@ -38,7 +38,7 @@ def cell_of(points: torch.Tensor, cell: float) -> set[tuple[int, ...]]:
     return {tuple(int(c) for c in row) for row in torch.floor(points / cell + 0.5)}
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(n=st.integers(1, 60), seed=st.integers(0, 1000), cell=st.sampled_from([0.5, 1.0, 2.5]))
 def test_new_anchors_are_centred_in_empty_cells_that_hold_a_strong_offset(n, seed, cell):
     before = anchors(n, seed)
@@ -191,7 +191,7 @@ def test_the_order_of_anchors_does_not_decide_where_new_ones_come(monkeypatch):
     assert torch.equal(moved.features, added.features)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(count=st.integers(1, 300), chunk=st.integers(1, 100), data=st.data())
 def test_random_numbers_are_those_of_one_draw(count, chunk, data):
     index = torch.tensor(sorted(data.draw(st.sets(st.integers(0, count - 1)))), dtype=torch.int64)

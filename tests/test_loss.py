@@ -98,7 +98,7 @@ def test_native_equals_twin(height, width, kept, instructions):
     assert float((gradient - truth_gradient).abs().max()) < 1e-4 * scale
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(1, 90), st.integers(1, 40), st.floats(0, 1), st.integers(0, 99))
 def test_native_equals_twin_at_any_size(height, width, weight, seed):
     image, target, mask = scene(height, width, seed, kept=0.8)

@@ -58,7 +58,7 @@ def test_merging_one_block_is_the_identity(config: MergeConfig):
     assert replace(became[0], unseen=0) == MergedBlock(0, trained=80, kept=80, dropped=0, from_coarse=0, unseen=0)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10**6), st.sampled_from([OWNER, BEST_SEEN]))
 def test_the_merged_scene_is_a_disjoint_union(seed: int, config: MergeConfig):
     """Whatever the blocks hold, even in each other's places, each gives what lies where it is the giver."""

@@ -96,7 +96,7 @@ def test_rounding_to_8_bits():
 
 
 @given(st.lists(st.integers(0, 60), min_size=1, max_size=300), st.integers(1, 9))
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_quantile_bins_partition_the_pixels(visibility: list[int], n_bins: int):
     values = np.array(visibility, dtype=np.float64)[None]
     errors = np.linspace(0.01, 0.5, values.size)[None]

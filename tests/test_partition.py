@@ -46,7 +46,7 @@ def by_distance(blocks: Blocks, places: np.ndarray) -> np.ndarray:
 # ------------------------------------------------------------------------------------------- invariance
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(
     turn=st.floats(0, 2 * np.pi), factor=st.floats(0.01, 100), shift=st.tuples(*[st.floats(-1e3, 1e3)] * 2),
     balanced=st.booleans(),

@@ -3,9 +3,6 @@
 import json
 import shutil
 import signal
-import subprocess
-import sys
-import time
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -14,6 +11,8 @@ import pytest
 import torch
 
 from captures_support import tiny_scene, write_colmap
+from cli_support import begun, entry_point, vdgs, wait_until
+from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
 from vdgs.model.visibility import visibility_of
@@ -23,20 +22,18 @@ from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
 from vdgs.stages.evaluate import BlocksAlone
 
+pytestmark = pytest.mark.xdist_group("pipeline")
+
+ITERATIONS, BLOCK_ITERATIONS = 200, 120
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "400", "--save-every", "40", "--anchors.offsets", "3",
-    "--growth.start", "100", "--growth.statistics-from", "50", "--growth.gate", "0.05", "--blocks", "2",
-    "--block.compensation.t-low-quantile", "0",
-    "--assignment.min-cameras", "4", "--block.iterations", "250", "--block.growth.gate", "0.05",
-    "--block.growth.start", "50", "--block.growth.statistics-from", "0", "--block.growth.interval", "50",
+    "--preset", "laptop", "--iterations", str(ITERATIONS), "--save-every", "20", "--anchors.offsets", "3",
+    "--growth.start", "50", "--growth.interval", "50", "--growth.statistics-from", "25", "--growth.gate", "0.05",
+    "--blocks", "2", "--jobs", "2", "--block.compensation.t-low-quantile", "0",
+    "--assignment.min-cameras", "4", "--block.iterations", str(BLOCK_ITERATIONS), "--block.growth.gate", "0.05",
+    "--block.growth.start", "25", "--block.growth.statistics-from", "0", "--block.growth.interval", "25",
 )  # fmt: skip
 #: What a block's model is compared by: the whole file.
 MERGED = "merged/model.safetensors"
-
-
-def vdgs(*arguments: object, wait: float = 240) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "vdgs.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=wait)
 
 
 @pytest.fixture(scope="module")
@@ -51,8 +48,9 @@ def capture(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def unbroken(capture, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("unbroken") / "run"
-    done = vdgs("run", capture, "--output", run, *SETTINGS)
+    done = entry_point("run", capture, "--output", run, *SETTINGS)
     assert done.returncode == 0, done.stderr + done.stdout
+    assert "2 at once" in done.stdout
     assert "→ merged" in done.stdout
     return run
 
@@ -78,20 +76,34 @@ def moments(run: Path) -> dict[str, int]:
     }
 
 
-def test_blocks_draw_parts_of_photographs_and_the_pixels_that_were_asked_for(unbroken, capture, tmp_path):
-    """250 photographs' worth of pixels in more steps, or 250 steps with fewer pixels: by the setting."""
-    shutil.copytree(unbroken, tmp_path / "run", ignore=shutil.ignore_patterns(".lock"))
+def is_free(run: Path) -> bool:
+    """Whether no process works on a run."""
+    try:
+        with RunFolder(run).locked():
+            return True
+    except RunError:
+        return False
+
+
+def train_each(run: Path, *settings: str) -> None:
+    """Train every block again, one command each."""
+    for index in range(2):
+        done = vdgs("train", run, "--block", index, *settings, "--redo")
+        assert done.returncode == 0, done.stderr
+
+
+def test_blocks_draw_parts_of_photographs_and_the_pixels_that_were_asked_for(unbroken, copied):
+    """So many photographs' worth of pixels in more steps, or so many steps with fewer pixels: by the setting."""
     for index, folder in enumerate(RunFolder(unbroken).block_folders()):
         status, cameras = folder.status(), load_scores(unbroken / "partition" / "scores.npz")[2].cameras
-        assert status.iteration > 260
-        assert status.photographs == pytest.approx(250, abs=1)
+        assert status.iteration > 1.04 * BLOCK_ITERATIONS
+        assert status.photographs == pytest.approx(BLOCK_ITERATIONS, abs=1)
         assert len(json.loads((folder.path / "crops.json").read_text())["crops"]) == cameras[:, index].sum()
-    done = vdgs("run", capture, "--output", tmp_path / "run", *SETTINGS, "--block.crop", "steps", "--redo")
-    assert done.returncode == 0, done.stderr + done.stdout
-    for folder in RunFolder(tmp_path / "run").block_folders():
-        assert folder.status().iteration == 250
-        assert folder.status().photographs < 240
-    assert model(tmp_path / "run") != model(unbroken)
+    train_each(copied, "--block.crop", "steps")
+    for folder in RunFolder(copied).block_folders():
+        assert folder.status().iteration == BLOCK_ITERATIONS
+        assert folder.status().photographs < 0.96 * BLOCK_ITERATIONS
+        assert model(copied, folder.model) != model(unbroken, folder.model.relative_to(copied))
 
 
 def test_a_run_leaves_what_the_documents_say(unbroken):
@@ -132,17 +144,14 @@ def bits(decoder: Decoder) -> dict[str, bytes]:
     return {name: tensor.detach().numpy().tobytes() for name, tensor in decoder.tensors().items()}
 
 
-def test_blocks_as_printed_leave_one_decoder(unbroken, tmp_path):
-    run = tmp_path / "run"
-    shutil.copytree(unbroken, run)
-    trained = vdgs("train", run, "--block.decoder", "frozen", "--block.sampling", "even", "--redo", "--jobs", 1)
-    assert trained.returncode == 0, trained.stderr
-    assert vdgs("merge", run).returncode == 0
-    coarse, merged = AnchorModel.load(run / "coarse/model.safetensors"), AnchorModel.load(run / MERGED)
+def test_blocks_as_printed_leave_one_decoder(unbroken, copied):
+    train_each(copied, "--block.decoder", "frozen", "--block.sampling", "even")
+    assert vdgs("merge", copied).returncode == 0
+    coarse, merged = AnchorModel.load(copied / "coarse/model.safetensors"), AnchorModel.load(copied / MERGED)
     assert merged.parts == ()
     assert bits(merged.decoder) == bits(coarse.decoder)
     for index in range(2):
-        block = AnchorModel.load(run / f"blocks/{index:02d}/model.safetensors")
+        block = AnchorModel.load(copied / f"blocks/{index:02d}/model.safetensors")
         assert bits(block.decoder) == bits(coarse.decoder)
         other = AnchorModel.load(unbroken / f"blocks/{index:02d}/model.safetensors")
         assert bits(other.decoder) != bits(block.decoder)
@@ -160,7 +169,7 @@ def test_a_block_alone_stands_among_coarse_anchors_with_the_coarse_decoder(unbro
 def test_cycles_of_compensated_growth_are_logged(unbroken):
     lines = [json.loads(line) for line in (unbroken / "blocks/00/log.jsonl").read_text().splitlines()]
     cycles = [line for line in lines if line.get("low_share") is not None]
-    assert [line["iteration"] for line in cycles] == [50, 100]
+    assert [line["iteration"] for line in cycles] == [25, 50]
     assert all(0 <= line["low_share"] <= 1 and line["t_low"] == 0.2 for line in cycles)
     assert all(line["grown_low"] + line["grown_other"] == line["grown"] for line in cycles)
 
@@ -200,36 +209,35 @@ def test_a_changed_setting_redoes_exactly_what_depends_on_it(capture, copied):
     assert changed == {"config.yaml", "blocks", "merged", "evaluation", "report.html"}
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_a_run_that_is_cut_off_while_blocks_train_continues_to_the_same_bits(capture, unbroken, copied, number):
-    for name in ("blocks", "merged", "evaluation"):
+@pytest.mark.parametrize(("number", "blocks"), [(signal.SIGINT, ["00", "01"]), (signal.SIGKILL, ["01"])])
+def test_a_run_that_is_cut_off_while_blocks_train_continues_to_the_same_bits(capture, unbroken, copied, number, blocks):
+    for name in ("merged", "evaluation", *(f"blocks/{block}" for block in blocks)):
         shutil.rmtree(copied / name)
-    command = [sys.executable, "-m", "vdgs.cli", "run", str(capture), "--output", str(copied), *SETTINGS]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    while process.poll() is None and not list(copied.glob("blocks/*/checkpoints/*.json")):
-        time.sleep(0.02)
-    process.send_signal(number)
-    _, errors = process.communicate(timeout=60)
-    if number == signal.SIGINT:
-        assert process.returncode == 130, errors
-        assert "The same command continues" in errors
-    done = vdgs("run", capture, "--output", copied, *SETTINGS)
+    command = ("run", capture, "--output", copied, *SETTINGS)
+    with begun(*command, pause_at=("*/blocks/*/checkpoints/00000040.json", 1)) as process:
+        process.wait_until_paused(processes=len(blocks))
+        process.send_signal(number)
+        cut_off = process.finished()
+    wait_until(lambda: is_free(copied))  # blocks notice that their driver is gone, save and end
+    assert cut_off.returncode == (130 if number == signal.SIGINT else -number)
+    assert ("The same command continues" in cut_off.stderr) == (number == signal.SIGINT)
+    for block in blocks:
+        status = json.loads((copied / "blocks" / block / "status.json").read_text())
+        assert (status["state"], status["iteration"]) == ("stopped", 40)
+    done = vdgs(*command)
     assert done.returncode == 0, done.stderr + done.stdout
     assert model(copied) == model(unbroken)
 
 
 def test_a_block_that_is_killed_is_started_again(unbroken, copied):
     shutil.rmtree(copied / "blocks/01")
-    command = [sys.executable, "-m", "vdgs.cli", "train", str(copied)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    while process.poll() is None and not list(copied.glob("blocks/01/checkpoints/*.json")):
-        time.sleep(0.02)
-    children = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout.split()
-    for child in children:
-        subprocess.run(["kill", "-9", child], check=False)
-    output, errors = process.communicate(timeout=120)
-    assert process.returncode == 0, errors
-    assert "crashed by SIGKILL" in output
+    with begun("train", copied, "--save-every", "20", pause_at=("*/blocks/*/checkpoints/00000040.json", 1)) as process:
+        process.wait_until_paused()
+        process.kill_paused()
+        done = process.finished()
+    assert done.returncode == 0, done.stderr
+    assert "crashed by SIGKILL" in done.stdout
+    assert "continuing at iteration 20" in (copied / "blocks/01/output.log").read_text()
     assert model(copied, "blocks/01/model.safetensors") == model(unbroken, "blocks/01/model.safetensors")
 
 
@@ -260,9 +268,10 @@ def test_a_missing_block_stops_the_merge_unless_the_coarse_model_may_stand_in(co
     assert torch.equal(stood_in, held)
 
 
-def test_one_block_is_the_whole_scene_and_merging_it_the_identity(capture, copied):
-    done = vdgs("run", capture, "--output", copied, *SETTINGS, "--no-blocking", "--redo")
-    assert done.returncode == 0, done.stderr
+def test_one_block_is_the_whole_scene_and_merging_it_the_identity(copied):
+    for command in (("partition", copied, "--no-blocking", "--redo"), ("train", copied), ("merge", copied)):
+        done = vdgs(*command)
+        assert done.returncode == 0, done.stderr
     assert [path.name for path in (copied / "blocks").iterdir()] == ["00"]
     merged, block = (AnchorModel.load(copied / name) for name in (MERGED, "blocks/00/model.safetensors"))
     assert all(torch.equal(t, block.anchors.tensors()[name]) for name, t in merged.anchors.tensors().items())
@@ -270,16 +279,22 @@ def test_one_block_is_the_whole_scene_and_merging_it_the_identity(capture, copie
 
 def test_stages_need_those_before_them(capture, tmp_path):
     run = tmp_path / "run"
-    done = vdgs("coarse", capture, "--output", run, *SETTINGS[:4], "--anchors.offsets", "3")
+    done = vdgs(
+        "coarse", capture, "--output", run, "--preset", "laptop", "--iterations", "30", "--anchors.offsets", "3"
+    )
     assert done.returncode == 0, done.stderr
     for verb, needed in (("train", "vdgs partition"), ("merge", "vdgs partition")):
         refused = vdgs(verb, run)
         assert refused.returncode == 1
         assert needed in refused.stderr
         assert "Traceback" not in refused.stderr
-    for verb in ("visibility", "partition", "train", "merge", "eval", "report"):
-        more = ["--blocks", "2"] if verb == "partition" else ["--block.iterations", "30"] if verb == "train" else []
-        done = vdgs(verb, run, *more)
+    short = ("--block.iterations", "30")
+    commands = (
+        ("visibility", run), ("partition", run, "--blocks", "2"), ("train", run, "--block", "0", *short),
+        ("train", run, "--block", "1"), ("train", run), ("merge", run), ("eval", run), ("report", run),
+    )  # fmt: skip
+    for command in commands:
+        done = vdgs(*command)
         assert done.returncode == 0, done.stderr
     assert json.loads((run / "evaluation/metrics.json").read_text())["model"] == "merged"
 
@@ -298,22 +313,43 @@ def test_damaged_files_of_a_partition_are_named(copied, file):
     assert vdgs("train", copied, "--block", "0").returncode == 0
 
 
-def test_nothing_is_built_on_a_model_of_other_settings(capture, copied):
+#: Of a change of the coarse stage's settings: they are written, the old model is deleted, it is gone.
+MOMENTS_OF_A_CHANGE = [("*/coarse/key", 2), ("*/coarse/model.safetensors", 1), ("*/coarse/.key.*", 1)]
+OTHER_SEED = (*SETTINGS, "--seed", "7")
+
+
+def change_cut_off(capture: Path, run: Path, moment: tuple[str, int]) -> None:
+    """Ask for another seed, and kill the command before it trains."""
+    with begun("run", capture, "--output", run, *OTHER_SEED, "--redo", pause_at=moment) as process:
+        process.wait_until_paused()
+        process.send_signal(signal.SIGKILL)
+        process.finished()
+    assert "seed: 7" in (run / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize("moment", MOMENTS_OF_A_CHANGE)
+def test_nothing_is_built_on_a_model_of_other_settings(capture, copied, moment):
     """A change of the coarse stage's settings counts at once, even if training it again never began."""
-    settings = ["--seed", "7", *SETTINGS]
-    command = [sys.executable, "-m", "vdgs.cli", "run", str(capture), "--output", str(copied), *settings, "--redo"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    while process.poll() is None and "seed: 7" not in (copied / "config.yaml").read_text():
-        time.sleep(0.001)
-    process.kill()
-    process.communicate()
-    if "seed: 7" in (copied / "config.yaml").read_text():
-        refused = vdgs("partition", copied)
-        if refused.returncode:  # unless the kill came before the claim: then the old model still has the old key
-            assert "no coarse model of its settings" in refused.stderr
-    done = vdgs("run", capture, "--output", copied, *settings, "--redo")
-    assert done.returncode == 0, done.stderr
-    assert "already trained; nothing to do" not in done.stdout
+    change_cut_off(capture, copied, moment)
+    refused = vdgs("partition", copied)
+    assert refused.returncode == 1
+    assert "no coarse model of its settings" in refused.stderr
+
+
+def test_all_that_was_built_on_a_model_of_other_settings_is_made_again(capture, copied):
+    change_cut_off(capture, copied, MOMENTS_OF_A_CHANGE[0])
+    coarse_settings = OTHER_SEED[: OTHER_SEED.index("--blocks")]
+    commands = (
+        ("coarse", capture, "--output", copied, *coarse_settings, "--seed", "7"),
+        ("visibility", copied), ("partition", copied), ("train", copied, "--block", "0"),
+    )  # fmt: skip
+    for command in commands:
+        done = vdgs(*command)
+        assert done.returncode == 0, done.stderr
+        assert "nothing to do" not in done.stdout
+    stale = vdgs("merge", copied)
+    assert stale.returncode == 1
+    assert "not all blocks are trained:\n  block 1" in stale.stderr
 
 
 def test_figures_of_another_model_are_not_taken_for_this_ones(capture, copied):
@@ -329,7 +365,7 @@ def test_a_block_trained_again_is_merged_again(unbroken, copied):
     shutil.rmtree(copied / "blocks/01")
     assert vdgs("merge", copied, "--incomplete").returncode == 0
     assert model(copied) != model(unbroken)
-    assert vdgs("train", copied).returncode == 0
+    assert vdgs("train", copied, "--block", "1").returncode == 0
     assert vdgs("merge", copied).returncode == 0
     assert model(copied) == model(unbroken)
 

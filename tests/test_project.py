@@ -116,7 +116,7 @@ def test_native_equals_the_twin(camera, make, isa, monkeypatch):
         torch.testing.assert_close(ours_g.double() / size, twin_g / size, rtol=1e-3, atol=2e-3)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10**6), angle=st.floats(-3, 3))
 def test_moving_the_world_and_the_camera_together_changes_nothing(seed, angle):
     means, scales, quaternions = gaussians(5, seed=seed)

@@ -82,7 +82,7 @@ def test_picture_and_gradients_equal_the_reference(name: str, isa: str) -> None:
         assert_close(a.grad, e.grad, 2e-3 if name == "edge-on" else 5e-5)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     n=st.integers(0, 120),
     width=st.integers(1, 70),

@@ -41,7 +41,7 @@ coordinates = st.tuples(*[st.floats(-50, 50)] * 3)
 
 
 @given(coordinates, coordinates)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_look_at_puts_the_target_in_the_middle(position, target):
     if np.linalg.norm(np.subtract(position, target)) < 0.1:
         return

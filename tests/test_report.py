@@ -20,6 +20,8 @@ from vdgs.report.pictures import MOST_BYTES, reduced
 from vdgs.report.words import duration, gain, memory
 from vdgs.runs.folder import RunFolder
 
+pytestmark = pytest.mark.xdist_group("report")
+
 VOID = {"meta", "img", "br", "link", "hr", "input"}
 FILES = ("coarse/log.jsonl", "coarse/evaluation/metrics.json", "visibility/visibility.json", "partition/partition.json",
          "blocks/00/log.jsonl", "blocks/01/status.json", "merged/status.json", "evaluation/metrics.json",

@@ -23,6 +23,8 @@ from vdgs.synth.town import build_town
 from vdgs.synth.truth import load_truth
 from vdgs.synth.zones import Zone
 
+pytestmark = pytest.mark.xdist_group("synth")
+
 TINY = SynthOptions(
     seed=3, images=6, test_images=2, validation_images=1, width=96, height=72, extent_m=50.0, points=400,
     noise_px=0.3, truth=True,

@@ -27,6 +27,8 @@ from vdgs.synth.town import Town, build_town
 from vdgs.synth.tracing import Tracer
 from vdgs.synth.truth import load_truth, pack_depth, unpack_depth
 
+pytestmark = pytest.mark.xdist_group("synth_flights")
+
 FLIGHTS = ("uneven", "even", "distant", "orbits", "corridor")
 TOY = SynthOptions(size="toy", width=64, height=48, samples_per_pixel=1, points=300, seed=1, truth=True)
 

@@ -21,6 +21,8 @@ from vdgs.storage.checkpoints import load_newest, save_state
 from vdgs.training import Stage, downscale_at, from_saved, start_state, to_saved, train, train_step, view_at
 from vdgs.training.crops import Crop, crop_at
 
+pytestmark = pytest.mark.xdist_group("training")
+
 BLACK = (0.0, 0.0, 0.0)
 CONFIG = TrainConfig(
     iterations=60,

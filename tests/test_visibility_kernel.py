@@ -45,7 +45,7 @@ def brute_force(points: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
     return torch.from_numpy(np.sum(seen, axis=0, dtype=np.int32))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(1, 3000), st.integers(1, 12), st.sampled_from([1.0, 50.0, 1e4]), st.integers(0, 10**6))
 def test_native_equals_brute_force(n, count, spread, seed):
     generator = np.random.default_rng(seed)

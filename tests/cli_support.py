@@ -1,0 +1,147 @@
+"""Commands of vdgs as processes of their own: real ones, to be signalled and killed, without the seconds of importing.
+
+    done = vdgs("merge", run)                      # waits; done.returncode, done.stdout, done.stderr
+    with begun("coarse", capture, "--output", run, pause_at=("*/00000040.json", 1)) as command:
+        command.wait_until_paused()
+        command.send_signal(signal.SIGKILL)
+
+One server for each worker of the tests imports the package once; every command is forked from it. What a command starts
+itself (the processes of blocks) is started as always. `entry_point` is a whole `python -m vdgs.cli`.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from pausing import Pause, pause_where_asked
+
+#: What nothing takes that still goes on, however busy the machine is. The limit of a whole test is larger still.
+PATIENCE_SECONDS = 900.0
+#: Seconds between two looks at what is waited for.
+GLANCE_SECONDS = 0.01
+
+#: What the server imports; the last two are what the cut and the first gradient import when they come.
+IMPORTED = [
+    "vdgs.verbs", "vdgs.pipeline", "vdgs.films.film", "vdgs.bench.bench", "sklearn.cluster",
+    "torch.fx.experimental.symbolic_shapes",
+]  # fmt: skip
+# Only Linux forks safely what has imported this much.
+_PROCESSES = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
+if sys.platform == "linux":
+    _PROCESSES.set_forkserver_preload(IMPORTED)
+
+
+class Command:
+    """A command that runs, its output going to files in a folder."""
+
+    def __init__(self, arguments: Sequence[str], folder: Path, pause: Pause, file_blocks: int | None):
+        self.args, self._pause = list(arguments), pause
+        self._files = (folder / "stdout", folder / "stderr")
+        environment = pause.environment() if pause.count else {}
+        target = (self.args, *map(str, self._files), environment, file_blocks)
+        self._process = _PROCESSES.Process(target=_run, args=target)
+        self._process.start()
+
+    @property
+    def pid(self) -> int:
+        assert self._process.pid is not None
+        return self._process.pid
+
+    def runs(self) -> bool:
+        return self._process.is_alive()
+
+    def send_signal(self, number: signal.Signals) -> None:
+        os.kill(self.pid, number)
+
+    def paused(self) -> list[int]:
+        """Numbers of the processes that wait where `pause_at` asked them to, or did."""
+        return self._pause.processes()
+
+    def wait_until_paused(self, processes: int = 1) -> None:
+        wait_until(lambda: len(self.paused()) >= processes or not self.runs())
+        assert self.runs(), f"ended before it was paused: {self.finished()}"
+
+    def go_on(self) -> None:
+        """End all pauses."""
+        self._pause.end()
+
+    def kill_paused(self) -> None:
+        """Kill the processes that wait; none waits after them."""
+        self._pause.end(signal.SIGKILL)
+
+    def finished(self) -> subprocess.CompletedProcess[str]:
+        """How the command ended and what it printed; waits for its end."""
+        self._process.join(PATIENCE_SECONDS)
+        assert not self.runs(), f"vdgs {' '.join(self.args)} does not end"
+        code = self._process.exitcode
+        assert code is not None
+        printed = [file.read_text(encoding="utf-8") if file.exists() else "" for file in self._files]
+        return subprocess.CompletedProcess(self.args, code, *printed)
+
+    def close(self) -> None:
+        """Kill the process if it still runs."""
+        self._process.kill()
+        self._process.join()
+
+
+@contextmanager
+def begun(*arguments: object, pause_at: tuple[str, int] = ("", 0), file_blocks: int | None = None) -> Iterator[Command]:
+    """A `vdgs` that runs meanwhile; killed at the end if it still does.
+
+    `pause_at`: it waits, and so do processes that it starts, before the n-th time that it opens, renames to or removes
+    a file whose whole path is like this pattern. `file_blocks`: no file that it writes may be larger, in units of 1024
+    bytes.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        waiting = Path(folder) / "waiting"
+        waiting.mkdir()
+        pause = Pause(*pause_at, str(waiting))
+        command = Command([str(each) for each in arguments], Path(folder), pause, file_blocks)
+        try:
+            yield command
+        finally:
+            command.close()
+
+
+def vdgs(*arguments: object, file_blocks: int | None = None) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end. See `begun`."""
+    with begun(*arguments, file_blocks=file_blocks) as command:
+        return command.finished()
+
+
+def entry_point(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """The same as a person starts it: `python -m vdgs.cli`, with all that it imports."""
+    command = [sys.executable, "-m", "vdgs.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_SECONDS)
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    """Return once the condition holds; fail if that never comes."""
+    end = time.monotonic() + PATIENCE_SECONDS
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(GLANCE_SECONDS)
+
+
+def _run(arguments: list[str], stdout: str, stderr: str, environment: dict[str, str], file_blocks: int | None) -> None:
+    """In the process of the command."""
+    for descriptor, file in ((1, stdout), (2, stderr)):
+        os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), descriptor)
+    if file_blocks is not None:
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * file_blocks,) * 2)
+    os.environ.update(environment)
+    pause_where_asked()
+    from vdgs.cli import main
+
+    main(arguments)
