@@ -132,6 +132,18 @@ def wait_until(condition: Callable[[], object]) -> None:
         time.sleep(GLANCE_SECONDS)
 
 
+def is_free(run: Path) -> bool:
+    """Whether no process works on a run."""
+    from vdgs.errors import RunError
+    from vdgs.runs.folder import RunFolder
+
+    try:
+        with RunFolder(run).locked():
+            return True
+    except RunError:
+        return False
+
+
 def _run(arguments: list[str], stdout: str, stderr: str, environment: dict[str, str], file_blocks: int | None) -> None:
     """In the process of the command."""
     for descriptor, file in ((1, stdout), (2, stderr)):

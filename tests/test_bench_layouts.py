@@ -1,23 +1,22 @@
 """The published data sets' scenes of `vdgs bench`, end to end: a tiny generated town written in their layouts."""
 
 import json
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import pytest
 
+from bench_support import forked_blocks, run_here
 from captures_support import TinyScene, write_colmap
 from layouts_support import halves, write_matrixcity, write_mega_nerf
 from vdgs.bench import bench
-from vdgs.bench.processes import Ended, Task
 from vdgs.bench.scenes import SCENES
-from vdgs.bench.worker import Job, work
 from vdgs.captures.capture import Capture
 from vdgs.captures.loading import load_capture
 from vdgs.cli import main
 from vdgs.runs.folder import RunFolder
+from vdgs.stages import train
 from vdgs.synth import SynthOptions, generate
 
 WIDTH, HEIGHT = 160, 120
@@ -55,16 +54,10 @@ def data(tmp_path_factory) -> Path:
     return folder
 
 
-def run_here(tasks: Sequence[Task], _at_once: int, _tell: Callable[..., None]) -> dict[str, Ended]:
-    """As `run_tasks`, but in this process: starting others would take most of the time."""
-    for task in tasks:
-        work(Job.read(task.file))
-    return {task.name: Ended(task.name, "done") for task in tasks}
-
-
 def test_the_published_data_sets_are_benched(data, tmp_path, monkeypatch):
     """Their folders are found and read, methods run with the paper's settings, and pixels are grouped by V."""
     monkeypatch.setattr(bench, "run_tasks", run_here)
+    monkeypatch.setattr(train, "run_jobs", forked_blocks)
     asked = ("--scenes", "residence", "block-all", "--methods", "3dgs", "blocks-2", "--iterations-total", "80")
     with pytest.raises(SystemExit) as ended:
         main(["bench", "table1", "--output", str(tmp_path), "--data", str(data), *asked, "--seeds", "1"])

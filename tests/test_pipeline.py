@@ -11,8 +11,7 @@ import pytest
 import torch
 
 from captures_support import tiny_scene, write_colmap
-from cli_support import begun, entry_point, vdgs, wait_until
-from vdgs.errors import RunError
+from cli_support import begun, entry_point, is_free, vdgs, wait_until
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
 from vdgs.model.visibility import visibility_of
@@ -74,15 +73,6 @@ def moments(run: Path) -> dict[str, int]:
         for path in run.rglob("*")
         if path.is_file() and path.name != ".lock"
     }
-
-
-def is_free(run: Path) -> bool:
-    """Whether no process works on a run."""
-    try:
-        with RunFolder(run).locked():
-            return True
-    except RunError:
-        return False
 
 
 def train_each(run: Path, *settings: str) -> None:
