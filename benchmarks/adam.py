@@ -16,6 +16,7 @@ from stopwatch import medians_ms
 from vdgs.kernels.native import adam as native
 from vdgs.kernels.native import module
 from vdgs.kernels.reference import adam as reference
+from vdgs.kernels.types import AdamState
 
 #: The trained arrays of an anchor.
 WIDTHS = {"log_scales": 6, "offsets": 30, "features": 32}
@@ -29,7 +30,7 @@ def step(implementation: ModuleType, anchors: int, visible: int, width: int) -> 
     parameter, first, second = (torch.zeros(anchors, width) for _ in range(3))
 
     def run() -> object:
-        return implementation.adam_rows(parameter, rows, gradient, first, second, learning_rate=1e-3, step=10)
+        return implementation.adam_rows(AdamState(parameter, first, second, 1e-3), rows, gradient, 10)
 
     return run
 

@@ -23,7 +23,7 @@ from vdgs.kernels.native.cull import cull as native_cull
 from vdgs.kernels.native.decode import decode as native_decode
 from vdgs.kernels.reference.cull import cull as twin_cull
 from vdgs.kernels.reference.decode import decode as twin_decode
-from vdgs.kernels.types import DecoderWeights, Splats
+from vdgs.kernels.types import AnchorSplats, DecoderWeights
 
 
 def overhead_camera() -> Camera:
@@ -54,7 +54,7 @@ def best_ms(run: Callable[[], object], repeats: int) -> float:
     return 1e3 * min(times)
 
 
-def decode_times(decode: Callable[..., Splats], arguments: tuple, repeats: int) -> tuple[float, float, int]:
+def decode_times(decode: Callable[..., AnchorSplats], arguments: tuple, repeats: int) -> tuple[float, float, int]:
     """Forward ms, backward ms (of the decoder alone), and how many splats came out."""
     camera = overhead_camera()
     splats = decode(*arguments, camera)

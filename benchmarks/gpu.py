@@ -26,6 +26,7 @@ from vdgs.kernels.cuda.driver import CudaUnavailable, cuda_driver
 from vdgs.kernels.cuda.nvrtc import nvrtc
 from vdgs.kernels.gsplat import rasterise as rasterise_by_gsplat
 from vdgs.kernels.operations import missing_on_cuda
+from vdgs.kernels.types import Splats
 
 SIZES = [(400, 300), (800, 600), (1600, 1200)]
 #: Largest difference that counts as agreement, in the norm over that of the processor's result: sums are added in
@@ -107,16 +108,15 @@ def raster(width: int, height: int, rounds: int, splats: int = 200_000) -> Row:
     g = torch.Generator().manual_seed(0)
     spread = 0.3 + 3 * torch.rand(splats, generator=g)
     conics = torch.stack([1 / spread, torch.zeros(splats), 1 / spread], dim=1)
-    tensors = (
+    here = Splats(
         torch.rand(splats, 2, generator=g) * torch.tensor([float(width), float(height)]), conics,
-        torch.rand(splats, 3, generator=g), torch.rand(splats, generator=g), 1 + torch.rand(splats, generator=g),
-        torch.zeros(3),
+        1 + torch.rand(splats, generator=g), torch.rand(splats, 3, generator=g), torch.rand(splats, generator=g),
     )  # fmt: skip
-    there = tuple(tensor.cuda() for tensor in tensors)
+    there = Splats(**{name: tensor.cuda() for name, tensor in vars(here).items()})
     return compare(
         "gsplat: rasterise", f"{width}x{height}",
-        lambda: rasterise_by_gsplat(*there, width, height)[:2],
-        lambda: native.rasterise(*tensors, width, height)[:2],
+        lambda: rasterise_by_gsplat(there, torch.zeros(3).cuda(), width, height)[:2],
+        lambda: native.rasterise(here, torch.zeros(3), width, height)[:2],
         rounds,
     )  # fmt: skip
 

@@ -33,6 +33,7 @@ import torch
 from machine import describe
 from vdgs.kernels.native.module import load, supported
 from vdgs.kernels.native.rasterise import rasterise
+from vdgs.kernels.types import Splats
 
 COUNTS = (20_000, 200_000, 1_000_000)
 SIZES = ((400, 300), (800, 600), (1600, 1200))
@@ -106,7 +107,8 @@ class Ours:
         start = time.perf_counter()
         size = self.scene.width, self.scene.height
         means, conics, colours, opacities, depths = self.tensors
-        raster = rasterise(means, conics, colours, opacities, depths, self.background, *size, module=self.module)
+        splats = Splats(means, conics, depths, colours, opacities)
+        raster = rasterise(splats, self.background, *size, module=self.module)
         middle = time.perf_counter()
         torch.autograd.backward(raster.image, self.gradient)
         return middle - start, time.perf_counter() - middle

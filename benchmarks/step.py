@@ -29,8 +29,7 @@ import torch
 
 from machine import describe
 from vdgs.cameras import Camera
-from vdgs.kernels import native as kernels
-from vdgs.kernels.native.module import set_threads
+from vdgs.kernels import choose, set_threads
 from vdgs.memory.process import forget_peak, peak_memory_bytes
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
@@ -79,7 +78,7 @@ def one_step(
     state: Any, camera: Camera, target: torch.Tensor, step: int, times: dict[str, list[float]]
 ) -> tuple[int, int]:
     """The work of vdgs.training.train_step, phase by phase."""
-    rates = rates_at(TrainConfig().rates, 0.1)
+    kernels, rates = choose(torch.device("cpu")), rates_at(TrainConfig().rates, 0.1)
     weights = state.decoder.for_image(0)
     with torch.no_grad():
         rows = timed(times, "cull", lambda: visible_rows(state.anchors, camera))
@@ -95,12 +94,14 @@ def one_step(
     gradients = timed(times, "backward", lambda: view.backward(image_gradient, 0.01))
 
     def move() -> None:
-        move_anchors(state.anchors, rows, gradients, weights, camera, state.optimiser, rates, step)
+        states = state.optimiser.anchor_states(state.anchors, rates)
+        move_anchors(state.anchors, rows, gradients, weights, camera, states, state.optimiser.updates)
         state.optimiser.update_decoder(state.decoder, rates, step)
 
     timed(times, "move", move)
-    timed(times, "statistics", lambda: state.statistics.add_view(
-        rows, view.source, view.opacities, gradients.means_px, camera.width, camera.height
+    timed(times, "statistics", lambda: kernels.add_view_statistics(
+        state.statistics, rows, kernels.mark_visible(state.anchors.positions[rows], camera), view.source,
+        view.opacities, gradients.means_px, camera.width, camera.height,
     ))  # fmt: skip
     return len(rows), len(view.source)
 
@@ -166,7 +167,6 @@ def main() -> None:
         print_peaks(*arguments.peak)
         return
     set_threads(arguments.threads)
-    torch.set_num_threads(arguments.threads)
     print(describe())
     for width, height in ((400, 300), (800, 600)):
         measure(arguments.visible, width, height, arguments.repeats)

@@ -3,41 +3,32 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import torch
 from rich.console import Console
 
 from captures_support import tiny_scene, write_colmap
-from cli_support import vdgs
-from native_choice import on_threads
+from cli_support import threads_as_before
 from vdgs.bench.bench import BenchSettings, run_bench
 from vdgs.bench.plan import Choices
-from vdgs.bench.processes import Ended, Task
 from vdgs.bench.results import Result
 from vdgs.bench.worker import Job, work
-from vdgs.executors.jobs import Outcome
+from vdgs.executors.executor import Listener, Outcome, Task
 
 
-def run_here(tasks: Sequence[Task], _at_once: int, _tell: Callable[..., None]) -> dict[str, Ended]:
-    """As `run_tasks`, but in this process: starting others would take most of the time."""
-    before = torch.get_num_threads()
-    with on_threads(1):
-        for task in tasks:
-            work(replace(Job.read(task.file), threads=1))
-    torch.set_num_threads(before)
-    return {task.name: Ended(task.name, "done") for task in tasks}
+@dataclass(frozen=True)
+class InThisProcess:
+    """An executor without processes: starting them would take most of the time."""
 
+    at_once: int
 
-def forked_blocks(jobs: Sequence[Any], **_how: object) -> list[Outcome]:
-    """As `run_jobs`, one after the other: `python -m vdgs.cli ...` without what importing takes."""
-    for job in jobs:
-        done = vdgs(*job.command[3:])
-        assert done.returncode == 0, done.stderr
-    return [Outcome(job.index, "done", 1, "") for job in jobs]
+    def run(self, tasks: Sequence[Task], _listener: Listener) -> list[Outcome]:
+        with threads_as_before():
+            for task in tasks:
+                work(replace(Job.read(Path(task.command[-1])), threads=1))
+        return [Outcome(task.name, "done") for task in tasks]
 
 
 def write_data(folder: Path) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from vdgs.cameras import Camera
+from vdgs.captures.capture import GroundFrame
 
 MODEL_IDS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4}
 
@@ -79,6 +80,11 @@ def render_plane(camera: Camera) -> np.ndarray:
     seen = np.isfinite(distance)
     colour = ground_colour(np.nan_to_num(hit[..., 0]), np.nan_to_num(hit[..., 1]))
     return np.where(seen[..., None], colour, np.uint8(255))
+
+
+def to_source(frame: GroundFrame, points: np.ndarray) -> np.ndarray:
+    """The inverse of `GroundFrame.to_ground`."""
+    return ((points - frame.translation) / frame.scale) @ frame.rotation
 
 
 def moved(scene: TinyScene, scale: float, rotation: np.ndarray, translation: np.ndarray) -> TinyScene:

@@ -13,6 +13,8 @@ import torch
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import View
+from vdgs.captures.photographs import decode_mask
+from vdgs.evaluation import metrics
 
 
 def photograph(rng: np.random.Generator, height: int = 48, width: int = 64) -> np.ndarray:
@@ -32,6 +34,21 @@ def view(name: str, width: int = 64, height: int = 48, shift: float = 0.0, mask:
     pose[0, 3] = shift
     camera = Camera(pose, 60.0, 60.0, width / 2, height / 2, width, height)
     return View(name, camera, Path("images") / name, mask, "test")
+
+
+def load_mask(view: View) -> np.ndarray | None:
+    camera = view.camera
+    return None if view.mask_path is None else decode_mask(view.mask_path, camera.width, camera.height)
+
+
+def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """PSNR in dB over all kept pixels and channels, as an evaluation puts it together."""
+    return metrics.psnr_of(metrics.masked_mean(metrics.squared_error(image, reference), mask))
+
+
+def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Mean SSIM over the kept pixels, likewise."""
+    return metrics.masked_mean(metrics.ssim_map(image, reference, mask), mask)
 
 
 def as_render(image: np.ndarray) -> SimpleNamespace:

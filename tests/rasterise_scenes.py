@@ -8,6 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vdgs.kernels.types import Splats
+
+
+def splats_of(tensors: tuple[Tensor, ...]) -> tuple[Splats, Tensor]:
+    """Splats and background from means, conics, colours, opacities, depths and background."""
+    means, conics, colours, opacities, depths, background = tensors
+    return Splats(means, conics, depths, colours, opacities), background
+
 
 @dataclass(frozen=True)
 class Scene:

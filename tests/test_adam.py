@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 from native_choice import every_instruction_set, on_threads, using
 from vdgs.kernels.native import adam as native
 from vdgs.kernels.reference import adam as reference
-from vdgs.training.optimiser import rebuild
+from vdgs.kernels.types import AdamState
+
+
+def adam_rows(implementation, parameter, rows, gradient, first, second, *, learning_rate, step, **settings):
+    """A step of the implementation for tensors by name."""
+    return implementation.adam_rows(
+        AdamState(parameter, first, second, learning_rate), rows, gradient, step, **settings
+    )
+
 
 BOTH = pytest.mark.parametrize("implementation", [reference, native])
 
@@ -39,7 +47,7 @@ def test_all_rows_are_torch_adam(implementation):
         peer.grad = gradient.clone()
         optimiser.step()
         rows = None if step % 2 else torch.arange(37)
-        assert implementation.adam_rows(parameter, rows, gradient, first, second, learning_rate=0.01, step=step)
+        assert adam_rows(implementation, parameter, rows, gradient, first, second, learning_rate=0.01, step=step)
         torch.testing.assert_close(parameter, peer.detach(), rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(first, optimiser.state[peer]["exp_avg"])
     torch.testing.assert_close(second, optimiser.state[peer]["exp_avg_sq"])
@@ -50,7 +58,7 @@ def test_rows_that_are_not_given_keep_parameters_and_moments(implementation):
     parameter, gradient, first, second = state(50, 10, 3)
     rows = some_rows(50, 0.4)
     before = [tensor.clone() for tensor in (parameter, first, second)]
-    implementation.adam_rows(parameter, rows, gradient[rows], first, second, learning_rate=0.1, step=9)
+    adam_rows(implementation, parameter, rows, gradient[rows], first, second, learning_rate=0.1, step=9)
     others = torch.ones(50, dtype=torch.bool)
     others[rows] = False
     for tensor, old in zip((parameter, first, second), before, strict=True):
@@ -70,7 +78,8 @@ def test_native_equals_twin(n, rest, share, step):
     results = []
     for implementation in (reference, native):
         parameter, gradient, first, second = state(n, *rest)
-        implementation.adam_rows(
+        adam_rows(
+            implementation,
             parameter,
             rows,
             gradient[rows],
@@ -86,19 +95,81 @@ def test_native_equals_twin(n, rest, share, step):
         torch.testing.assert_close(value, expected, rtol=2e-6, atol=2e-6)
 
 
+def some_updates(count: int, most: int = 20_000, seed: int = 2) -> torch.Tensor:
+    """Numbers of updates from 1, a half of them small, some beyond what the bias correction can tell."""
+    g = torch.Generator().manual_seed(seed)
+    few = torch.randint(1, 40, (count,), generator=g, dtype=torch.int32)
+    return torch.where(torch.rand(count, generator=g) < 0.5, few, torch.randint(1, most, (count,), generator=g).int())
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.integers(1, 400),
+    st.sampled_from([(), (1,), (3,), (6,), (32,), (10, 3), (1500,)]),
+    st.sampled_from([0.0, 0.3, 0.9, 1.0]),
+)
+def test_rows_that_count_for_themselves_are_rows_alone(n, rest, share):
+    """Native and twin; and each row is to the bit what it would be with its own count as the step of all."""
+    rows = some_rows(n, share)
+    updates, results = some_updates(len(rows)), []
+    for implementation in (reference, native):
+        parameter, gradient, first, second = state(n, *rest)
+        assert adam_rows(
+            implementation, parameter, rows, gradient[rows], first, second, learning_rate=0.02, step=updates
+        )
+        results.append((parameter, first, second))
+        for row, count in list(zip(rows, updates.tolist(), strict=True))[:10]:
+            alone, of_all, m, v = state(n, *rest)
+            one = row[None]
+            adam_rows(implementation, alone, one, of_all[one], m, v, learning_rate=0.02, step=count)
+            assert all(torch.equal(a[row], b[row]) for a, b in zip((alone, m, v), results[-1], strict=True))
+    for value, expected in zip(*results, strict=True):
+        torch.testing.assert_close(value, expected, rtol=2e-6, atol=2e-6)
+
+
+@BOTH
+def test_the_first_step_of_a_row_is_the_same_whenever_it_comes(implementation):
+    """Whatever the gradient, the first step of Adam is as long as its rate."""
+    g = torch.Generator().manual_seed(3)
+    gradient = torch.randn(6, 4, generator=g)
+    zeros, moved = torch.zeros(6, 4), []
+    for late in (1, 10_000):
+        parameter, first, second = torch.zeros(6, 4), torch.zeros(6, 4), torch.zeros(6, 4)
+        updates = torch.tensor([late, 1, late, late, 1, late], dtype=torch.int32)
+        adam_rows(implementation, parameter, None, gradient, first, second, learning_rate=0.1, step=updates)
+        moved.append(parameter)
+    torch.testing.assert_close(moved[0], zeros - 0.1 * gradient.sign())
+    assert torch.equal(moved[0][[1, 4]], moved[1][[1, 4]])
+    assert (moved[1][[0, 2, 3, 5]].abs() > 0.3).all()  # what counting all steps alike would make of it
+
+
+@BOTH
+@pytest.mark.parametrize(
+    "updates", [torch.tensor([1, 0, 1], dtype=torch.int32), torch.ones(3), torch.ones(2, dtype=torch.int32)]
+)
+def test_counts_that_do_not_fit_are_refused(implementation, updates):
+    parameter, gradient, first, second = state(3, 4)
+    before = parameter.clone()
+    with pytest.raises((ValueError, TypeError), match=r"updates|step"):
+        adam_rows(implementation, parameter, None, gradient, first, second, learning_rate=0.1, step=updates)
+    assert torch.equal(parameter, before)
+
+
 @every_instruction_set
-def test_same_bits_for_any_number_of_threads(instructions):
+@pytest.mark.parametrize("counts", [False, True])
+def test_same_bits_for_any_number_of_threads(instructions, counts):
     rows, results = some_rows(20_000, 0.6), []
+    step = some_updates(len(rows)) if counts else 3
     with using(instructions):
         for threads in (1, 2, 3):
             with on_threads(threads):
                 parameter, gradient, first, second = state(20_000, 7)
-                native.adam_rows(parameter, rows, gradient[rows], first, second, learning_rate=0.1, step=3)
+                adam_rows(native, parameter, rows, gradient[rows], first, second, learning_rate=0.1, step=step)
                 results.append((parameter, first, second))
     for result in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
     parameter, gradient, first, second = state(20_000, 7)
-    reference.adam_rows(parameter, rows, gradient[rows], first, second, learning_rate=0.1, step=3)
+    adam_rows(reference, parameter, rows, gradient[rows], first, second, learning_rate=0.1, step=step)
     for value, expected in zip(results[0], (parameter, first, second), strict=True):
         torch.testing.assert_close(value, expected, rtol=2e-6, atol=2e-6)
 
@@ -110,7 +181,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing(implementation, bad, plac
     parameter, gradient, first, second = state(10_000, 5)
     gradient[place] = bad
     before = [tensor.clone() for tensor in (parameter, first, second)]
-    finite = implementation.adam_rows(parameter, None, gradient, first, second, learning_rate=0.1, step=1)
+    finite = adam_rows(implementation, parameter, None, gradient, first, second, learning_rate=0.1, step=1)
     assert finite is False
     assert all(torch.equal(a, b) for a, b in zip((parameter, first, second), before, strict=True))
 
@@ -124,7 +195,7 @@ def test_wrong_rows_are_refused_before_any_change(implementation, rows, error):
     parameter, gradient, first, second = state(4, 3)
     before = [tensor.clone() for tensor in (parameter, first, second)]
     with pytest.raises(error, match="rows"):
-        implementation.adam_rows(parameter, torch.tensor(rows), gradient[:2], first, second, learning_rate=0.1, step=1)
+        adam_rows(implementation, parameter, torch.tensor(rows), gradient[:2], first, second, learning_rate=0.1, step=1)
     assert all(torch.equal(a, b) for a, b in zip((parameter, first, second), before, strict=True))
 
 
@@ -132,7 +203,7 @@ def test_wrong_rows_are_refused_before_any_change(implementation, rows, error):
 def test_zero_gradients_of_fresh_rows_change_nothing(implementation):
     parameter = torch.randn(5, 3)
     before, zeros = parameter.clone(), torch.zeros(5, 3)
-    assert implementation.adam_rows(parameter, None, zeros, zeros.clone(), zeros.clone(), learning_rate=1.0, step=1)
+    assert adam_rows(implementation, parameter, None, zeros, zeros.clone(), zeros.clone(), learning_rate=1.0, step=1)
     assert torch.equal(parameter, before)
 
 
@@ -141,10 +212,10 @@ def test_no_rows_is_a_step_of_nothing(implementation):
     parameter, gradient, first, second = state(4, 3)
     before = parameter.clone()
     none = torch.zeros(0, dtype=torch.int64)
-    assert implementation.adam_rows(parameter, none, gradient[:0], first, second, learning_rate=0.1, step=1)
+    assert adam_rows(implementation, parameter, none, gradient[:0], first, second, learning_rate=0.1, step=1)
     assert torch.equal(parameter, before)
     empty = torch.zeros(0, 3)
-    assert implementation.adam_rows(empty, None, empty, empty, empty, learning_rate=0.1, step=1)
+    assert adam_rows(implementation, empty, None, empty, empty, empty, learning_rate=0.1, step=1)
 
 
 @BOTH
@@ -153,7 +224,7 @@ def test_a_parameter_that_asks_for_gradients_is_updated_in_place(implementation)
     leaf = parameter.requires_grad_()
     used = (leaf * leaf).sum()
     before = leaf.detach().clone()
-    implementation.adam_rows(leaf, None, gradient, first, second, learning_rate=0.1, step=1)
+    adam_rows(implementation, leaf, None, gradient, first, second, learning_rate=0.1, step=1)
     assert torch.all(leaf.detach() != before)
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         used.backward()
@@ -164,7 +235,7 @@ def test_a_strided_gradient_is_read_as_it_is(implementation):
     results = []
     for prepare in (lambda g: g.t().contiguous().t(), lambda g: g):
         parameter, gradient, first, second = state(30, 8)
-        implementation.adam_rows(parameter, None, prepare(gradient), first, second, learning_rate=0.1, step=2)
+        adam_rows(implementation, parameter, None, prepare(gradient), first, second, learning_rate=0.1, step=2)
         results.append(parameter)
     assert torch.equal(*results)
 
@@ -174,7 +245,7 @@ def test_unsuitable_arguments_are_refused(implementation):
     parameter, gradient, first, second = state(6, 3)
 
     def step(p=parameter, rows=None, g=gradient, m=first, v=second, **changes):
-        implementation.adam_rows(p, rows, g, m, v, **({"learning_rate": 0.1, "step": 1} | changes))
+        adam_rows(implementation, p, rows, g, m, v, **({"learning_rate": 0.1, "step": 1} | changes))
 
     for error, changes in [
         (TypeError, {"p": parameter.long()}),
@@ -189,19 +260,3 @@ def test_unsuitable_arguments_are_refused(implementation):
     ]:
         with pytest.raises(error):
             step(**changes)
-
-
-@pytest.mark.parametrize("pruned", [0, 3])
-@pytest.mark.parametrize("added", [0, 4])
-def test_rebuilding_keeps_rows_of_old_and_new_and_lets_old_tensors_go(pruned, added):
-    generator = torch.Generator().manual_seed(pruned + added)
-    before = {"a": torch.randn(10, 2, 3, generator=generator), "b": torch.randn(10, generator=generator)}
-    more = {name: torch.randn(added, *t.shape[1:], generator=generator) for name, t in before.items()}
-    kept = torch.ones(10 + added, dtype=torch.bool)
-    kept[torch.randperm(10 + added, generator=generator)[:pruned]] = False
-    order = torch.randperm(10 + added, generator=generator)
-    for rows in (kept, order):
-        tensors = dict(before)
-        rebuild(tensors, more, rows)
-        for name, tensor in tensors.items():
-            assert torch.equal(tensor, torch.cat([before[name], more[name]])[rows])

@@ -19,6 +19,8 @@ from vdgs.partition.assignment.assign import ABOVE_THRESHOLD, BEST_BLOCK, NOT_AS
 from vdgs.partition.assignment.saving import load_scores, save_scores
 from vdgs.partition.assignment.scores import score_matrix
 from vdgs.partition.assignment.tables import assignment_rows, assignment_table, explain
+from vdgs.partition.records import AssignedBlock
+from vdgs.storage.records import plain, record_of
 
 # Whom each block gets
 
@@ -163,19 +165,14 @@ def test_a_file_whose_arrays_disagree_is_refused(saved):
 
 def test_anyone_can_ask_why(saved):
     names, scores, result = load_scores(saved[0])
-    rows = explain(names, scores, result, view="b/ö.jpg")
-    assert [row["block"] for row in rows[:1]] == [1]
-    assert rows[0]["why"] == "above the threshold"
-    assert [row["score"] for row in rows[1:]] == sorted((row["score"] for row in rows[1:]), reverse=True)
-    assert {row["why"] for row in rows[1:]} == {"not assigned"}
-    assert explain(names, scores, result, block=3)[0]["view"] == "c.jpg"
-    assert len(explain(names, scores, result)) == 12
-    unmeasured = score_matrix(scene(), strips(4), [camera(2.0)], replace(CONFIG, mode="frustum"))
-    assert explain(["a"], unmeasured, assign(unmeasured, CONFIG), block=0)[0]["covered"] is None
+    rows = explain(names, scores, result, "b/ö.jpg")
+    assert [row.block for row in rows[:1]] == [1]
+    assert rows[0].why == "above the threshold"
+    assert [row.score for row in rows[1:]] == sorted((row.score for row in rows[1:]), reverse=True)
+    assert {row.why for row in rows[1:]} == {"not assigned"}
+    assert sorted(row.block for row in rows) == [0, 1, 2, 3]
     with pytest.raises(RunError, match="no training view 'z'"):
-        explain(names, scores, result, view="z")
-    with pytest.raises(RunError, match="numbered 0 to 3"):
-        explain(names, scores, result, block=4)
+        explain(names, scores, result, "z")
 
 
 def test_the_table_counts_what_was_decided(saved):
@@ -184,15 +181,15 @@ def test_the_table_counts_what_was_decided(saved):
     visibility = kernels.count_visibility(scene().anchors.positions, [camera(2.0), camera(8.0)]).numpy()
     rows = assignment_rows(blocks, positions, visibility, result)
     for index, row in enumerate(rows):
-        assert row["cameras"] == row["above_threshold"] + row["best_block"] + row["topped_up"]
-        assert row["cameras"] == result.cameras[:, index].sum()
-        assert row["anchors_core"] == scores.anchors[index] < row["anchors_expanded"]
-        assert row["area"] == pytest.approx(36.0)
-    assert rows[3]["mean_v"] == 0.0 < rows[0]["mean_v"]
+        assert row.cameras == row.above_threshold + row.best_block + row.topped_up
+        assert row.cameras == result.cameras[:, index].sum()
+        assert row.anchors_core == scores.anchors[index] < row.anchors_expanded
+        assert row.area == pytest.approx(36.0)
+    assert rows[3].mean_v == 0.0 < rows[0].mean_v
     console = Console(width=100, file=io.StringIO())
     console.print(assignment_table(rows))
     lines = [line.split() for line in console.file.getvalue().splitlines()]
     assert [line[:2] for line in lines if line and line[0].isdigit()] == [
-        [str(row["block"]), str(row["cameras"])] for row in rows
+        [str(row.block), str(row.cameras)] for row in rows
     ]
-    assert json.loads(json.dumps(rows)) == rows
+    assert [record_of(AssignedBlock, json.loads(json.dumps(plain(row)))) for row in rows] == rows

@@ -16,30 +16,12 @@ from cli_support import begun, is_free, wait_until
 from vdgs.bench import bench
 from vdgs.bench.bench import BenchSettings, run_bench
 from vdgs.bench.plan import Choices
-from vdgs.bench.processes import Task, run_tasks
 from vdgs.bench.seen import seen_truly
-from vdgs.bench.worker import Job
 from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
 from vdgs.settings.capture import CaptureOptions
 
 pytestmark = pytest.mark.xdist_group("bench")
-
-
-def test_a_failed_run_stops_only_those_that_build_on_it(tmp_path):
-    files = [tmp_path / f"{name}.json" for name in "abc"]
-    Job(tmp_path / "nowhere", {}, {}, ("coarse",), tmp_path / "run", None, "k", None, 4, 1, 1).write(files[0])
-    tasks = [Task(file.stem, file, file.with_suffix(".log")) for file in files]
-    tasks[1] = replace(tasks[1], after="a")
-    told = []
-    ended = run_tasks(tasks, 1, lambda name, result: told.append((name, result and result.state)))
-    assert {name: end.state for name, end in ended.items()} == {"a": "failed", "b": "failed", "c": "failed"}
-    assert "nowhere" in ended["a"].why
-    assert ended["b"].why.startswith("a failed")
-    assert "c.json" in ended["c"].why
-    assert ("b", None) not in told  # it was never started
-    assert ("c", None) in told
-
 
 SMALL = ("--methods", "baseline", "full", "--scale-iterations", "0.1", "--jobs", "2")
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench_support import benched, run_here, write_data
+from bench_support import InThisProcess, benched, write_data
 from vdgs.bench import bench
 from vdgs.bench.explicit import gaussians_config
 from vdgs.bench.measure import GROUPS_FILE
@@ -18,11 +18,10 @@ from vdgs.bench.results import Result
 from vdgs.comparators.gaussians import watching as gaussian_watching
 from vdgs.comparators.gaussians.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS, scheduled
 from vdgs.comparators.gaussians.training import GaussiansConfig
-from vdgs.errors import RunError
+from vdgs.errors import RunError, Stopped
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
 from vdgs.settings.method import MethodConfig
-from vdgs.watching.watch import Stopped
 
 
 def test_the_published_length_has_the_published_schedule():
@@ -79,7 +78,7 @@ def data(tmp_path_factory) -> Path:
 
 
 def test_it_stands_beside_methods_with_anchors(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench, "run_tasks", run_here)
+    monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
     both = benched(data, tmp_path, "3dgs", "scaffold-gs")
     explicit, anchored = both["3dgs"].figures, both["scaffold-gs"].figures
     assert explicit["iterations"] == anchored["iterations"] == 40
@@ -96,7 +95,7 @@ def test_it_stands_beside_methods_with_anchors(data, tmp_path, monkeypatch):
 
 
 def test_alone_it_has_no_groups_and_other_settings_train_it_again(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench, "run_tasks", run_here)
+    monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
     alone = benched(data, tmp_path, "3dgs")["3dgs"]
     assert (alone.state, alone.groups, alone.seen_by) == ("done", (), "")
     run = RunFolder(tmp_path / alone.folder)
@@ -113,7 +112,7 @@ def test_alone_it_has_no_groups_and_other_settings_train_it_again(data, tmp_path
 
 
 def test_a_stopped_run_continues(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench, "run_tasks", run_here)
+    monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
     whole = benched(data, tmp_path / "whole", "3dgs")["3dgs"]
     train = gaussian_watching.train
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bench_support import benched, run_here, write_data
+from bench_support import InThisProcess, benched, write_data
 from vdgs.bench import bench
 from vdgs.bench.measure import evaluated
 from vdgs.bench.notes import notes_of
@@ -31,14 +31,14 @@ def output(data, tmp_path_factory) -> Path:
     """A bench of one method of our own."""
     folder = tmp_path_factory.mktemp("bench")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(bench, "run_tasks", run_here)
+        patched.setattr(bench, "LocalExecutor", InThisProcess)
         benched(data, folder, "baseline")
     return folder
 
 
 @pytest.fixture(autouse=True)
 def here(monkeypatch) -> None:
-    monkeypatch.setattr(bench, "run_tasks", run_here)
+    monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
 
 
 @pytest.fixture

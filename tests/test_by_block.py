@@ -28,7 +28,7 @@ from vdgs.evaluation.by_block import (
     border_pixels,
     label_map,
 )
-from vdgs.evaluation.photographs import Photographs
+from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.seams import SEAM_VIEWS, block_table, evaluate_blocks
 from vdgs.kernels.types import Raster
 from vdgs.model.render import render
@@ -257,7 +257,7 @@ class Plane:
         return drawn._replace(image=drawn.image + torch.from_numpy(noise))
 
     def evaluate(self, output: Path, mask: np.ndarray | None = None) -> dict:
-        photographs = Photographs(self.views, self.load_image, lambda _: mask)
+        photographs = ReferenceViews(self.views, self.load_image, lambda _: mask)
         return evaluate_blocks(photographs, self.coarse, self.merged, self.block, quadrants(), output)
 
 

@@ -12,7 +12,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from captures_support import TinyScene, moved, tiny_scene, write_colmap, write_images, write_ply
+from captures_support import TinyScene, moved, tiny_scene, to_source, write_colmap, write_images, write_ply
 from layouts_support import DRB, OPENGL, halves, matrixcity_frames, write_matrixcity, write_mega_nerf
 from vdgs.captures.capture import Capture
 from vdgs.captures.formats.ply import read_point_cloud
@@ -82,7 +82,7 @@ def test_applied_transform_is_undone(tmp_path, scene):
     write_transforms(tmp_path, scene, applied)
     capture = load_capture(tmp_path, CaptureOptions(up="z"))
     assert_sees_the_scene(capture, scene)
-    np.testing.assert_allclose(capture.ground.to_source(capture.points), scene.points, atol=1e-9)
+    np.testing.assert_allclose(to_source(capture.ground, capture.points), scene.points, atol=1e-9)
 
 
 def test_applied_scale_is_undone_too(tmp_path, scene):
@@ -91,7 +91,7 @@ def test_applied_scale_is_undone_too(tmp_path, scene):
     write_images(tmp_path / "images", scene)
     capture = load_capture(tmp_path)
     assert_sees_the_scene(capture, scene)
-    np.testing.assert_allclose(capture.ground.to_source(capture.points), scene.points, atol=1e-9)
+    np.testing.assert_allclose(to_source(capture.ground, capture.points), scene.points, atol=1e-9)
 
 
 def test_intrinsics_per_frame_splits_and_masks(tmp_path, scene):

@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vdgs.kernels.types import Statistics
 from vdgs.model.anchors import Anchors
 from vdgs.settings.method import CompensationConfig, GrowthConfig
 from vdgs.training.compensation import (
@@ -21,7 +22,8 @@ from vdgs.training.compensation import (
     low_visibility,
     update_cache,
 )
-from vdgs.training.growth import Statistics, decide
+from vdgs.training.growth import decide
+from vdgs.training.per_anchor import remap_rows
 
 K = 3
 PAPER = CompensationConfig()
@@ -68,12 +70,19 @@ def simulate(config: CompensationConfig | None, seed: int, cycles: int = 4, grow
             update_cache(memory, statistics, low, config)
             change = compensate(memory, low, threshold, growth, config)
         decision = decide(anchors, statistics, 1.0, growth, g, compensated=change)
-        count = len(decision.added)
-        kept = torch.cat([decision.kept, torch.ones(count, dtype=torch.bool)])
+        kept = torch.cat([decision.kept, torch.ones(len(decision.added), dtype=torch.bool)])
         anchors = anchors.extended(decision.added).select(kept)
-        statistics, memory = statistics.extended(count).select(kept), memory.extended(count).select(kept)
+        statistics, memory = Statistics(**remapped(statistics, kept)), Compensation(**remapped(memory, kept))
         begin_cycle(memory, statistics)
     return anchors, statistics, memory
+
+
+def remapped(kept_per_anchor: Statistics | Compensation, kept: torch.Tensor) -> dict[str, torch.Tensor]:
+    """As training keeps them beside the anchors: new rows are zero."""
+    group = kept_per_anchor.tensors()
+    count = len(kept) - len(next(iter(group.values())))
+    remap_rows(group, {name: tensor.new_zeros(count, *tensor.shape[1:]) for name, tensor in group.items()}, kept)
+    return group
 
 
 def bits(anchors: Anchors, statistics: Statistics) -> list[bytes]:
@@ -170,16 +179,47 @@ def test_fewer_than_the_threshold_means_fewer():
 
 
 @given(shares=st.lists(st.integers(0, 20), max_size=30), quantile=st.sampled_from([0.1, 0.25, 0.5, 0.9]))
-def test_a_quantile_counts_the_anchors_that_some_camera_sees(shares, quantile):
+def test_a_quantile_of_the_anchors_that_some_camera_sees_is_met_as_nearly_as_ties_allow(shares, quantile):
     share = torch.tensor(shares, dtype=torch.float32) / 20
     low, threshold = low_visibility(share, replace(PAPER, t_low_quantile=quantile))
     seen = share > 0
-    assert int((low & seen).sum()) <= quantile * (int(seen.sum()) - 1) + 1
-    if seen.any():
-        assert low[~seen].all()
-        assert threshold == pytest.approx(float(np.quantile(share[seen].numpy(), quantile)))
-    else:
+    if not seen.any():
         assert not low.any()
+        return
+    assert low[~seen].all()
+    assert threshold == pytest.approx(float(np.quantile(share[seen].numpy(), quantile)))
+    assert not (low.any() and (~low).any()) or float(share[low].max()) < float(share[~low].min())
+    wished = quantile * int(seen.sum())
+    possible = [int((share[seen] <= limit).sum()) for limit in (0.0, *share[seen].tolist())]
+    assert abs(int(low[seen].sum()) - wished) == min(abs(size - wished) for size in possible)
+    order = torch.randperm(len(share), generator=torch.Generator().manual_seed(0))
+    assert torch.equal(low_visibility(share[order], replace(PAPER, t_low_quantile=quantile))[0], low[order])
+
+
+@pytest.mark.parametrize(
+    ("shares", "expected"),
+    [
+        ([0.2] * 3 + [0.4] * 7, 3),  # the quantile is a share of seven: those below it
+        ([0.2] * 4 + [0.4] * 6, 4),  # it is the least share, of four: none is below it
+        ([0.5, 0.5, 1.0, 1.0], 2),  # as near as none: the larger
+        ([0.5] * 10, 0),  # all are seen alike: none is of low visibility
+        ([0.0] * 5 + [0.2] * 4 + [0.4] * 6, 9),  # what no camera sees counts for nothing, and is in L
+    ],
+)
+def test_shares_that_tie_do_not_empty_the_set(shares, expected):
+    low, _ = low_visibility(torch.tensor(shares), replace(PAPER, t_low_quantile=0.25))
+    assert low.tolist() == [True] * expected + [False] * (len(shares) - expected)
+
+
+def test_an_empty_set_of_those_seen_shows_in_the_facts():
+    n, config = 10, replace(PAPER, t_low_quantile=0.25)
+    anchors, statistics, memory = some_anchors(n), Statistics.zeros(n, K), Compensation.zeros(n, K)
+    share = torch.tensor([0.0] * 2 + [1.0] * 8)
+    low, threshold = low_visibility(share, config)
+    change = compensate(memory, low, threshold, GROWTH, config)
+    decision = decide(anchors, statistics, 1.0, GROWTH, torch.Generator(), compensated=change)
+    facts = cycle_facts(change, share, threshold, decision, config)
+    assert (facts["low_share"], facts["low_share_of_seen"], facts["t_low"]) == (0.2, 0.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -227,10 +267,10 @@ def test_a_poorly_seen_place_grows_where_plain_growth_sees_nothing():
     decision, change = results["compensated"]
     assert len(decision.added) > 50
     assert float(decision.added.positions[:, 0].min()) > -5  # offsets reach some units beyond their anchor
-    facts = cycle_facts(change, 0.2, decision, CompensationConfig())
+    facts = cycle_facts(change, torch.where(east, 0.12, 0.6), 0.2, decision, CompensationConfig())
     assert facts["grown_low"] == len(decision.added)
     assert facts["grown_other"] == 0
-    assert facts["low_share"] == pytest.approx(float(east.float().mean()))
+    assert facts["low_share"] == facts["low_share_of_seen"] == pytest.approx(float(east.float().mean()))
     assert facts["mean_cache"] == facts["max_cache"] == pytest.approx(1.6)
     assert len(decision.added.log_scales.unique()) == 2  # both levels grew
     assert json.loads(json.dumps(facts)) == facts
@@ -270,6 +310,7 @@ def test_facts_without_low_visibility_are_null():
     change = compensate(memory, torch.zeros(2, dtype=torch.bool), 0.2, GROWTH, PAPER)
     facts = cycle_facts(
         change,
+        torch.ones(2),
         0.2,
         decide(anchors, statistics, 1.0, GROWTH, torch.Generator(), compensated=change),
         CompensationConfig(),
@@ -277,14 +318,6 @@ def test_facts_without_low_visibility_are_null():
     assert facts["mean_cache"] is None
     assert facts["low_share"] == 0
     assert not any(isinstance(value, float) and math.isnan(value) for value in facts.values())
-
-
-def test_select_and_extend_keep_rows_together():
-    memory = Compensation(*(torch.arange(12.0).reshape(4, 3) + 100 * i for i in range(3)))
-    moved = memory.extended(2).select(torch.tensor([5, 2, 0]))
-    for i, tensor in enumerate(moved.tensors().values()):
-        expected = torch.stack([torch.zeros(3), torch.arange(6.0, 9) + 100 * i, torch.arange(0.0, 3) + 100 * i])
-        assert torch.equal(tensor, expected)
 
 
 def test_statistics_of_other_anchors_are_refused():

@@ -46,11 +46,7 @@ def drawn(scene: Scene, camera, part, kernels) -> torch.Tensor:
     rows = kernels.cull(scene.positions, scene.log_scales, camera)
     part = camera.cropped(*part)
     splats = kernels.decode(scene.positions, scene.features, scene.offsets, scene.log_scales, scene.weights, part, rows)
-    raster = kernels.rasterise(
-        splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths, torch.tensor([0.1, 0.5, 0.9]),
-        part.width, part.height,
-    )  # fmt: skip
-    return raster.image
+    return kernels.rasterise(splats, torch.tensor([0.1, 0.5, 0.9]), part.width, part.height).image
 
 
 @pytest.mark.parametrize("kernels", [native, reference], ids=["native", "twin"])

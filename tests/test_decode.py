@@ -12,7 +12,7 @@ from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.native import module
 from vdgs.kernels.native.decode import decode as native_decode
 from vdgs.kernels.reference.decode import decode as twin_decode
-from vdgs.kernels.types import DecoderWeights, Splats
+from vdgs.kernels.types import AnchorSplats, DecoderWeights
 
 CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
 EVERY_ISA = pytest.mark.parametrize("isa", module.supported())
@@ -20,7 +20,7 @@ BOTH = pytest.mark.parametrize("decode", [twin_decode, native_decode])
 NUMBERS = ("means_px", "conics", "depths", "colours", "opacities", "volumes")
 
 
-def weighted_sum(splats: Splats, seed: int = 0) -> torch.Tensor:
+def weighted_sum(splats: AnchorSplats, seed: int = 0) -> torch.Tensor:
     """A scalar that depends on every number of every splat, the same in either precision."""
     total = splats.depths.new_zeros(())
     for name in NUMBERS:
@@ -110,10 +110,10 @@ def assert_same(scene: Scene, camera, frozen: bool = False, tolerance: float = 1
         assert error <= tolerance * scale, f"gradient {index}: {error:.3g} of {scale:.3g}"
 
 
-def restricted(splats: Splats, sources: list[int]) -> Splats:
+def restricted(splats: AnchorSplats, sources: list[int]) -> AnchorSplats:
     position = {s: i for i, s in enumerate(splats.source.tolist())}
     index = torch.tensor([position[s] for s in sources], dtype=torch.long)
-    return Splats(**{name: getattr(splats, name)[index] for name in (*NUMBERS, "source")})
+    return AnchorSplats(**{name: getattr(splats, name)[index] for name in (*NUMBERS, "source")})
 
 
 @pytest.mark.parametrize("camera", CAMERAS)

@@ -14,6 +14,8 @@ CAMERA = turned(96, 64)
 #: A few of the anchors, some of them neighbours.
 ROWS = torch.tensor([row for row in range(700) if row % 7 in (0, 3, 4)])
 RATES = (0.01, 0.02, 0.005)
+#: How often each anchor has moved: some never, some so often that it no longer matters.
+UPDATES = torch.tensor([(row * row * 7) % 997 * (1 if row % 5 else 30) for row in range(700)], dtype=torch.int32)
 
 
 def states_of(scene: Scene) -> list[AdamState]:
@@ -37,11 +39,19 @@ def gradients_of(scene: Scene, rows: torch.Tensor = ROWS) -> SplatGradients:
 
 
 def fused(kernels, scene: Scene, gradients: SplatGradients, rows: torch.Tensor = ROWS):
-    states = states_of(scene)
+    states, updates = states_of(scene), UPDATES[: len(scene.positions)].clone()
     weights = scene.weights.map(lambda t: t.clone().requires_grad_(True))
-    finite, found = kernels.decode_backward_adam(scene.positions, states, weights, CAMERA, rows, gradients, step=4)
+    finite, found = kernels.decode_backward_adam(scene.positions, states, weights, CAMERA, rows, gradients, updates)
     assert found is not None
+    assert torch.equal(updates, counted(rows, len(updates))) or not finite
     return finite, [*(t for state in states for t in state[:3]), *found]
+
+
+def counted(rows: torch.Tensor, n: int = 700) -> torch.Tensor:
+    """`UPDATES` after one more of these rows."""
+    updates = UPDATES[:n].clone()
+    updates[rows] += 1
+    return updates
 
 
 def apart(scene: Scene, gradients: SplatGradients) -> list[torch.Tensor]:
@@ -55,9 +65,7 @@ def apart(scene: Scene, gradients: SplatGradients) -> list[torch.Tensor]:
                 torch.full_like(splats.volumes, gradients.volume)]  # fmt: skip
     found = torch.autograd.grad(outputs, [*leaves, *weights.tensors()], received)
     for state, gradient in zip(states, found, strict=False):
-        assert native.adam_rows(
-            state.parameter, ROWS, gradient, state.first, state.second, learning_rate=state.learning_rate, step=4
-        )
+        assert native.adam_rows(state, ROWS, gradient, counted(ROWS)[ROWS])
     return [*(t for state in states for t in state[:3]), *found[3:]]
 
 
@@ -107,7 +115,9 @@ def test_a_gradient_that_is_not_a_number_is_reported_and_stays_out_of_its_anchor
 def test_a_frozen_decoder_gets_no_gradients():
     scene = Scene.random(700, seed=2)
     gradients, states = gradients_of(scene), states_of(scene)
-    answer = native.decode_backward_adam(scene.positions, states, scene.weights, CAMERA, ROWS, gradients, step=4)
+    answer = native.decode_backward_adam(
+        scene.positions, states, scene.weights, CAMERA, ROWS, gradients, UPDATES.clone()
+    )
     assert answer == (True, None)
     _, expected = fused(native, scene, gradients)
     assert all(torch.equal(a, b) for a, b in zip([t for s in states for t in s[:3]], expected, strict=False))
@@ -150,7 +160,7 @@ def test_rows_that_are_not_there_are_refused(rows, error):
     gradients, states = gradients_of(scene), states_of(scene)
     with pytest.raises(error):
         native.decode_backward_adam(
-            scene.positions, states, scene.weights, CAMERA, torch.tensor(rows), gradients, step=1
+            scene.positions, states, scene.weights, CAMERA, torch.tensor(rows), gradients, UPDATES.clone()
         )
     assert torch.equal(states[0].parameter, scene.features)
 
@@ -166,4 +176,16 @@ def test_a_state_that_does_not_fit_is_refused():
         states = states_of(scene)
         states[0] = states[0]._replace(**damage)
         with pytest.raises(ValueError, match="moments"):
-            native.decode_backward_adam(scene.positions, states, scene.weights, CAMERA, ROWS, gradients, step=1)
+            native.decode_backward_adam(
+                scene.positions, states, scene.weights, CAMERA, ROWS, gradients, UPDATES.clone()
+            )
+
+
+@pytest.mark.parametrize("kernels", [native, reference])
+@pytest.mark.parametrize("updates", [torch.zeros(699, dtype=torch.int32), torch.zeros(700), UPDATES - 1])
+def test_counts_that_do_not_fit_are_refused(kernels, updates):
+    scene = Scene.random(700, seed=2)
+    gradients, states = gradients_of(scene), states_of(scene)
+    with pytest.raises((ValueError, TypeError), match="updates"):
+        kernels.decode_backward_adam(scene.positions, states, scene.weights, CAMERA, ROWS, gradients, updates)
+    assert torch.equal(states[0].parameter, scene.features)

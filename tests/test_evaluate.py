@@ -16,12 +16,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from evaluation_support import as_render, noisy, photograph, real_photographs, view
+from evaluation_support import as_render, load_mask, noisy, photograph, psnr, real_photographs, ssim, view
 from vdgs.errors import CaptureError, RunError, TrainingDiverged
 from vdgs.evaluation import metrics, pictures, saving
 from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import Lpips, LpipsScores
-from vdgs.evaluation.photographs import Photographs
+from vdgs.evaluation.reference_views import ReferenceViews
+from vdgs.storage.files import jsonable, write_json
 
 NAMES = ["a/b.jpg", "c/b.jpg", "a/b.png", "plain.jpg"]
 
@@ -33,7 +34,7 @@ class City:
         rng = np.random.default_rng(0)
         self.views = [view(name, shift=float(i)) for i, name in enumerate(NAMES)]
         self.photographs = [photograph(rng) for _ in NAMES]
-        self.taken = Photographs(self.views, self.load_image)
+        self.taken = ReferenceViews(self.views, self.load_image, load_mask)
         self.renders = [noisy(each, rng, 0.02 * (i + 1)) for i, each in enumerate(self.photographs)]
 
     def load_image(self, which):
@@ -69,8 +70,8 @@ def test_what_is_written_is_what_was_measured(city: City, tmp_path: Path):
     assert [row["name"] for row in rows] == NAMES
     for row, reference in zip(rows, city.photographs, strict=True):
         saved = cv2.imread(str(tmp_path / row["render"]))[..., ::-1]
-        assert row["psnr"] == metrics.psnr(saved, reference)
-        assert row["ssim"] == pytest.approx(metrics.ssim(saved, reference), abs=1e-12)
+        assert row["psnr"] == psnr(saved, reference)
+        assert row["ssim"] == pytest.approx(ssim(saved, reference), abs=1e-12)
         assert row["psnr_cc"] > row["psnr"] - 0.01
         assert (tmp_path / "comparisons" / Path(row["render"]).name).is_file()
     assert result["psnr"] == pytest.approx(np.mean([row["psnr"] for row in rows]))
@@ -112,8 +113,8 @@ def test_masks_are_respected(city: City, tmp_path: Path):
     mask[:, :32] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     masked = view(NAMES[0], mask=tmp_path / "mask.png")
-    result = evaluate(Photographs([masked], city.load_image), MeasuredModel(city.render), tmp_path / "out")
-    left = metrics.psnr(city.renders[0][:, :32], city.photographs[0][:, :32])
+    result = evaluate(replace(city.taken, views=[masked]), MeasuredModel(city.render), tmp_path / "out")
+    left = psnr(city.renders[0][:, :32], city.photographs[0][:, :32])
     assert result["psnr"] == pytest.approx(left, abs=1e-9)
     assert read(tmp_path / "out" / "per_view.json")[0]["kept_pixels"] == 48 * 32
 
@@ -199,9 +200,12 @@ def test_readable_file_names():
     assert saving.file_stems(names) == ["a__b", "c__b", "a__b_png", "A__B_JPG", "DJI_0018"]
 
 
-def test_json_has_no_nan():
+def test_json_has_no_nan(tmp_path):
     value = {"a": [np.float32("nan"), math.inf, np.int64(3)], "b": (None, "x", True)}
-    assert saving.jsonable(value) == {"a": [None, None, 3], "b": [None, "x", True]}
+    assert jsonable(value) == {"a": [None, None, 3], "b": [None, "x", True]}
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "strict.json", value["a"][1:2])
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_colour_map_grows_with_the_error():
@@ -233,7 +237,7 @@ def test_on_photographs(tmp_path: Path):
         index = round(camera.camera_from_world[0, 3])
         return as_render(noisy(cv2.GaussianBlur(photographs[index], (0, 0), 1.0), rng, 0.01))
 
-    taken = Photographs(views, lambda v: photographs[int(v.name[0])])
+    taken = ReferenceViews(views, lambda v: photographs[int(v.name[0])], load_mask)
     result = evaluate(taken, MeasuredModel(render), tmp_path)
     assert 20 < result["psnr"] < 40
     assert result["psnr_cc"] >= result["psnr"]

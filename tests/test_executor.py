@@ -14,8 +14,9 @@ import pytest
 from rich.console import Console
 
 from vdgs.executors import local
-from vdgs.executors.jobs import Job
-from vdgs.executors.local import run_jobs
+from vdgs.executors.blocks import BlockCommand, run_blocks
+from vdgs.executors.executor import Listener, Outcome, Task
+from vdgs.executors.local import LocalExecutor
 from vdgs.executors.parent import PARENT, stop_when_parent_dies
 from vdgs.runs.folder import StageFolder
 
@@ -46,23 +47,27 @@ sys.exit(130)
 """
 
 
-def job(root: Path, index: int, script: str) -> Job:
+def job(root: Path, index: int, script: str) -> BlockCommand:
     folder = StageFolder(root / f"{index:02d}")
-    command = [sys.executable, "-S", "-c", PRELUDE + textwrap.dedent(script), str(folder.path)]
-    return Job(index, folder, command, {"BLOCK": str(index)})
+    who = f"block = {index}\n"
+    return BlockCommand(
+        index, folder, [sys.executable, "-S", "-c", PRELUDE + who + textwrap.dedent(script), str(folder.path)]
+    )
 
 
 def run(jobs, *, at_once=2, retries=2, terminal=False):
     """Outcomes, and what was printed."""
     console = Console(file=io.StringIO(), width=120, height=40, force_terminal=terminal, color_system=None)
-    outcomes = run_jobs(jobs, at_once=at_once, retries=retries, console=console, poll_seconds=0.02)
+    outcomes = run_blocks(jobs, LocalExecutor(at_once, retries, poll_seconds=0.02), console)
     return outcomes, console.file.getvalue()
 
 
 @pytest.mark.parametrize("terminal", [False, True])
 def test_all_are_done_and_shown(tmp_path, terminal):
     outcomes, text = run([job(tmp_path, i, FINE) for i in (0, 3, 5)], terminal=terminal)
-    assert [(o.index, o.state, o.attempts, o.why) for o in outcomes] == [(i, "done", 1, "") for i in (0, 3, 5)]
+    assert [(o.name, o.state, o.attempts, o.why) for o in outcomes] == [
+        (f"block {i:02d}", "done", 1, "") for i in (0, 3, 5)
+    ]
     assert "3 of 3 blocks done" in text
     expected = ("3/3 done", "25.50", "1,234", "100 %") if terminal else ("block 05: started", "block 05: done after")
     assert all(word in text for word in expected)
@@ -91,7 +96,7 @@ def test_a_crash_is_continued_and_said(tmp_path):
         if not (folder / "state").exists():
             (folder / "state").touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        print("continued", os.environ["BLOCK"])
+        print("continued", block)
         tell("done")
     """
     (outcome,), text = run([job(tmp_path, 4, script)])
@@ -111,7 +116,7 @@ def test_a_crash_that_comes_back_fails_and_leaves_no_running_status(tmp_path):
     assert "exit code 77" in outcome.why
     assert "last words" in text
     status = StageFolder(tmp_path / "00").status()
-    assert (status["state"], status["iteration"]) == ("failed", 7)
+    assert (status.state, status.iteration) == ("failed", 7)
 
 
 def test_an_explained_failure_is_not_repeated_and_stops_no_other(tmp_path):
@@ -136,7 +141,7 @@ def test_memory_that_ran_out_lowers_the_number_at_once(tmp_path, monkeypatch):
     kills = iter([5, 6, 6, 6])
     monkeypatch.setattr(local, "out_of_memory_kills", lambda: next(kills))
     script = """
-        if not (folder / "state").exists() and os.environ["BLOCK"] == "0":
+        if not (folder / "state").exists() and block == 0:
             (folder / "state").touch()
             os.kill(os.getpid(), signal.SIGKILL)
     """
@@ -177,7 +182,7 @@ def test_a_full_disk_is_named(tmp_path):
 
 
 def test_a_command_that_is_not_there_is_named(tmp_path):
-    (outcome,), _ = run([Job(0, StageFolder(tmp_path), ["/nowhere/python"])])
+    (outcome,), _ = run([BlockCommand(0, StageFolder(tmp_path), ["/nowhere/python"])])
     assert outcome.state == "failed"
     assert "/nowhere/python" in outcome.why
 
@@ -196,19 +201,73 @@ def test_a_folder_that_another_process_holds_is_waited_for(tmp_path):
     assert "waiting for another process" in text
 
 
+class Told(Listener):
+    """What it was told, in order."""
+
+    def __init__(self):
+        self.news: list[tuple[str, str | int]] = []
+
+    def started(self, task: Task, attempt: int) -> None:
+        self.news.append((task.name, attempt))
+
+    def ended(self, task: Task, outcome: Outcome) -> None:
+        self.news.append((task.name, outcome.state))
+
+
+def task(root: Path, name: str, script: str, after: str | None = None) -> Task:
+    return Task(name, [sys.executable, "-S", "-c", script], root / f"{name}.log", {"WHO": name}, after=after)
+
+
+def test_a_failed_task_stops_only_those_that_come_after_it(tmp_path):
+    tasks = [
+        task(tmp_path, "a", "import sys; print('vdgs bench: no such place', file=sys.stderr); sys.exit(1)"),
+        task(tmp_path, "b", "print('never')", after="a"),
+        task(tmp_path, "c", "print('fine')"),
+        task(tmp_path, "d", "print('never')", after="b"),
+    ]
+    told = Told()
+    outcomes = LocalExecutor(1, poll_seconds=0.02).run(tasks, told)
+    assert [(o.name, o.state, o.attempts) for o in outcomes] == [
+        ("a", "failed", 1), ("b", "failed", 0), ("c", "done", 1), ("d", "failed", 0)
+    ]  # fmt: skip
+    assert [o.why for o in outcomes[:2]] == ["no such place", "a failed: no such place"]
+    assert told.news == [("a", 1), ("a", "failed"), ("b", "failed"), ("c", 1), ("d", "failed"), ("c", "done")]
+
+
+def test_a_task_waits_for_the_one_that_it_comes_after(tmp_path):
+    """However often that one crashes on its way, and whatever was done before this call."""
+    crash = "import os, pathlib, time; seen = pathlib.Path('{0}'); first = not seen.exists(); seen.touch()\n"
+    crash += "time.sleep(0.1)\nif first: os.kill(os.getpid(), 9)"
+    tasks = [
+        task(tmp_path, "second", "print('after')", after="first"),
+        task(tmp_path, "first", crash.format(tmp_path / "seen")),
+        task(tmp_path, "third", "import os; print('alone', os.environ['WHO'])", after="one of an earlier call"),
+    ]
+    told = Told()
+    outcomes = LocalExecutor(3, poll_seconds=0.02).run(tasks, told)
+    assert [o.state for o in outcomes] == ["done"] * 3
+    assert "alone third" in tasks[2].output.read_text()
+    assert [each for each in told.news if each[0] != "third"] == [
+        ("first", 1), ("first", 2), ("first", "done"), ("second", 1), ("second", "done")
+    ]  # fmt: skip
+
+
 DRIVER = """
 import json, sys
 from pathlib import Path
 from rich.console import Console
-from vdgs.executors.local import Job, run_jobs
+from vdgs.executors.blocks import BlockCommand, run_blocks
+from vdgs.executors.local import LocalExecutor
 from vdgs.runs.folder import StageFolder
-jobs = [Job(index, StageFolder(Path(folder)), command, {}) for index, folder, command in json.loads(sys.argv[1])]
-outcomes = run_jobs(jobs, at_once=2, retries=2, console=Console(), poll_seconds=0.02)
+jobs = [
+    BlockCommand(index, StageFolder(Path(folder)), command) for index, folder, command in json.loads(sys.argv[1])
+]
+outcomes = run_blocks(jobs, LocalExecutor(2, poll_seconds=0.02), Console())
 print("OUTCOMES", json.dumps([[o.state, o.attempts, o.why] for o in outcomes]))
 """
 
 
-def driver(jobs: list[Job]) -> subprocess.Popen:
+def driver(jobs: list[BlockCommand]) -> subprocess.Popen:
     """A process that runs the jobs; returns once the first two say that they are ready."""
     argument = json.dumps([[made.index, str(made.folder.path), made.command] for made in jobs])
     process = subprocess.Popen([sys.executable, "-c", DRIVER, argument], stdout=subprocess.PIPE, text=True)
@@ -240,7 +299,7 @@ def test_a_request_to_stop_reaches_each_job_once(tmp_path, number):
         process.send_signal(number)  # a scheduler that asks twice: still once, and no kill
     outcomes = outcomes_of(process)
     assert [o[:2] for o in outcomes] == [["stopped", 1], ["stopped", 1], ["stopped", 0]]
-    assert [made.folder.status()["state"] for made in jobs[:2]] == ["stopped"] * 2
+    assert [made.folder.status().state for made in jobs[:2]] == ["stopped"] * 2
     assert [(made.folder.path / "terms").read_text() for made in jobs[:2]] == ["TERM "] * 2
     assert not jobs[2].folder.path.exists() or not jobs[2].output.exists()
 
@@ -255,7 +314,7 @@ def test_a_second_interrupt_kills(tmp_path):
     outcomes = outcomes_of(process)
     assert [o[0] for o in outcomes] == ["stopped", "stopped"]
     assert all("SIGKILL" in o[2] for o in outcomes)
-    assert jobs[0].folder.status()["state"] == "stopped"  # it could not write that itself
+    assert jobs[0].folder.status().state == "stopped"  # it could not write that itself
 
 
 def test_a_job_ends_with_a_driver_that_was_killed(tmp_path):
@@ -271,7 +330,7 @@ def test_a_job_ends_with_a_driver_that_was_killed(tmp_path):
     process.kill()
     process.communicate()
     for made in jobs:
-        wait_until(lambda made=made: made.folder.status()["state"] == "stopped")
+        wait_until(lambda made=made: made.folder.status().state == "stopped")
         assert (made.folder.path / "terms").read_text() == "TERM "
 
 

@@ -3,7 +3,6 @@
 import io
 import itertools
 from dataclasses import replace
-from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -33,7 +32,7 @@ from vdgs.comparators.gaussians.training import (
 )
 from vdgs.comparators.gaussians.watching import train_watched
 from vdgs.errors import TrainingDiverged, VdgsError
-from vdgs.kernels.native.module import set_threads, threads
+from vdgs.kernels import native, set_threads, threads
 from vdgs.runs.folder import StageFolder
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.checkpoints import load_newest, save_state
@@ -111,17 +110,16 @@ def test_the_number_of_threads_changes_no_bit(unbroken):
         set_threads(before)
 
 
-def memory_runs_out(monkeypatch, where: str, at_call: int) -> None:
-    """The given function of the training, by name, finds no memory in its call of that number."""
-    function, calls = attrgetter(where)(gaussian_training), itertools.count(1)
+def memory_runs_out(monkeypatch, where: str, at_call: int, room=gaussian_training) -> None:
+    """The given function of a module, by name, finds no memory in its call of that number."""
+    function, calls = getattr(room, where), itertools.count(1)
 
     def scarce(*values, **named):
         if next(calls) == at_call:
             raise MemoryError("std::bad_alloc")
         return function(*values, **named)
 
-    *module, name = where.split(".")
-    monkeypatch.setattr(attrgetter(*module)(gaussian_training) if module else gaussian_training, name, scarce)
+    monkeypatch.setattr(room, where, scarce)
 
 
 def watched(folder: StageFolder):
@@ -138,15 +136,15 @@ def test_where_memory_runs_out_before_anything_moves_no_step_is_lost(where, unbr
     folder = StageFolder(tmp_path / "gaussians")
     with monkeypatch.context() as scarcity:
         memory_runs_out(scarcity, where, 38)
-        with pytest.raises(VdgsError, match=r"out of memory with .* The state of iteration 37 is saved in"):
+        with pytest.raises(VdgsError, match=r"out of memory with .* The checkpoint of iteration 37 is saved in"):
             watched(folder)
     assert bits(watched(folder)) == bits(unbroken)
 
 
 def test_where_memory_runs_out_within_a_step_nothing_half_moved_is_saved(tmp_path, monkeypatch):
     folder = StageFolder(tmp_path / "gaussians")
-    memory_runs_out(monkeypatch, "kernels.adam_rows", 38 * 5)  # four of the tensors have moved, or three
-    with pytest.raises(VdgsError, match="No state was saved yet"):
+    memory_runs_out(monkeypatch, "adam_rows", 38 * 5, room=native)  # four of the tensors have moved, or three
+    with pytest.raises(VdgsError, match="There is no checkpoint yet"):
         watched(folder)
 
 

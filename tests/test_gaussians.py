@@ -22,12 +22,11 @@ from vdgs.comparators.gaussians.training import (
     GaussiansConfig,
     train,
 )
-from vdgs.errors import RunError, VdgsError
+from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.evaluate import EvaluationSettings
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.watching import WatchOptions
-from vdgs.watching.watch import Stopped
 
 DENSITY = DensityConfig(start=15, interval=10, until=0.5, dense=0.08, reset_interval=40)
 SHORT = GaussiansConfig(iterations=60, resolutions=((0, 2), (30, 1)), density=DENSITY)
@@ -57,7 +56,7 @@ def test_a_run_leaves_model_log_and_figures(trained):
     assert written["psnr"] > 12
     assert written["by_visibility"][0]["lower"] == written["by_visibility"][-1]["upper"] == 3.0
     model = GaussiansModel.load(trained.folder.model)
-    assert written["n_gaussians"] == len(model.gaussians) == trained.folder.status()["gaussians"]
+    assert written["n_gaussians"] == len(model.gaussians) == trained.folder.status().gaussians
     lines = [json.loads(line) for line in trained.folder.log.read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [20, 30, 50]
     assert lines[-1]["loss"] < 0.7 * lines[0]["loss"]
@@ -78,7 +77,7 @@ def test_a_stopped_run_continues_from_its_last_state(trained, capture, tmp_path,
     monkeypatch.setattr(gaussian_watching, "train", stopped)
     with pytest.raises(Stopped, match="37"):
         comparator.train_gaussians(capture, SHORT, tmp_path, QUIET, options=WatchOptions(save_every=10))
-    assert StageFolder(tmp_path).status()["state"] == "stopped"
+    assert StageFolder(tmp_path).status().state == "stopped"
     monkeypatch.undo()
     comparator.train_gaussians(capture, SHORT, tmp_path, QUIET)
     assert StageFolder(tmp_path).model.read_bytes() == trained.folder.model.read_bytes()

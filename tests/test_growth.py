@@ -7,10 +7,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vdgs.kernels import native
+from vdgs.kernels.types import Statistics
 from vdgs.model.anchors import Anchors
 from vdgs.settings.method import GrowthConfig
 from vdgs.training import growth
-from vdgs.training.growth import Statistics, decide
+from vdgs.training.growth import decide
 
 K = 4
 ALWAYS = GrowthConfig(gate=0.0, levels=1, coarsest_cell=1.0, threshold=1.0)
@@ -134,12 +136,15 @@ def test_a_view_is_counted_where_it_was_drawn():
     visible = torch.tensor([1, 3])
     source = torch.tensor([0, 2, K + 1], dtype=torch.int32)  # anchor 1: offsets 0, 2; anchor 3: offset 1
     gradient = torch.tensor([[3.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
-    stats.add_view(visible, source, torch.tensor([0.5, 0.25, 1.0]), gradient, width=4, height=2)
+    inside = torch.tensor([False, True])
+    native.add_view_statistics(
+        stats, visible, inside, source, torch.tensor([0.5, 0.25, 1.0]), gradient, width=4, height=2
+    )
     assert stats.gradient[1].tolist() == [6.0, 0.0, 1.0, 0.0]
     assert stats.gradient[3, 1] == pytest.approx(math.hypot(2.0, 1.0))
     assert stats.drawn.sum() == 3
     assert stats.opacity.tolist() == [0, 0.75, 0, 1.0, 0]
-    assert stats.seen.tolist() == [0, 1, 0, 1, 0]
+    assert stats.seen.tolist() == [0, 0, 0, 1, 0]
 
 
 def test_surroundings_occupy_cells_but_neither_grow_nor_go():
@@ -178,7 +183,8 @@ def test_the_order_of_anchors_does_not_decide_where_new_ones_come(monkeypatch):
     before, stats = anchors(80), statistics(80)
     order = torch.randperm(80, generator=torch.Generator().manual_seed(1))
     config = GrowthConfig(gate=0.0, levels=3, coarsest_cell=4.0, threshold=1.0)
-    moved = decide(before.select(order), stats.select(order), 1.0, config, torch.Generator()).added
+    turned = Statistics(**{name: tensor[order] for name, tensor in stats.tensors().items()})
+    moved = decide(before.select(order), turned, 1.0, config, torch.Generator()).added
     added = decide(before, stats, 1.0, config, torch.Generator()).added
     assert len(added) > 50
     assert torch.equal(moved.positions, added.positions)

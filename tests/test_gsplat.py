@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import gsplat_stand_in
-from rasterise_scenes import make_scene
+from rasterise_scenes import make_scene, splats_of
 from test_rasterise import assert_close, loss_of
 from vdgs.errors import VdgsError
 from vdgs.kernels.gsplat import rasterise
@@ -30,9 +30,9 @@ SCENES = {
 @pytest.mark.parametrize("name", SCENES)
 def test_it_draws_and_differentiates_what_the_reference_does(name):
     scene = SCENES[name]
-    ours = rasterise(*scene.tensors, scene.width, scene.height, depth=True, engine=gsplat_stand_in)
+    ours = rasterise(*splats_of(scene.tensors), scene.width, scene.height, depth=True, engine=gsplat_stand_in)
     exact_scene = scene.to(torch.float64)
-    exact = reference(*exact_scene.tensors, scene.width, scene.height, depth=True)
+    exact = reference(*splats_of(exact_scene.tensors), scene.width, scene.height, depth=True)
     for actual, expected in zip(ours, exact, strict=True):
         assert actual.shape == expected.shape
         assert_close(actual, expected, 1e-4)
@@ -45,7 +45,7 @@ def test_it_draws_and_differentiates_what_the_reference_does(name):
 
 def test_without_depth_there_is_none():
     scene = SCENES["ordinary"]
-    raster = rasterise(*scene.tensors, scene.width, scene.height, engine=gsplat_stand_in)
+    raster = rasterise(*splats_of(scene.tensors), scene.width, scene.height, engine=gsplat_stand_in)
     assert raster.depth is None
     assert raster.image.shape == (29, 37, 3)
 
@@ -55,7 +55,7 @@ def test_without_depth_there_is_none():
 def test_rows_that_are_not_finite_are_not_drawn(column, value):
     tensors = [tensor.detach().clone() for tensor in SCENES["ordinary"].tensors]
     tensors[column].view(len(tensors[column]), -1)[3, 0] = value
-    reach = reach_px(*tensors[:5])
+    reach = reach_px(splats_of(tensors)[0])
     assert torch.all(reach[3] == 0)
     assert torch.any(reach > 0)
 
@@ -64,14 +64,14 @@ def test_rows_that_are_not_finite_are_not_drawn(column, value):
 def test_conics_that_are_not_positive_definite_are_not_drawn(conic):
     tensors = [tensor.detach().clone() for tensor in SCENES["ordinary"].tensors]
     tensors[1][5] = torch.tensor(conic)
-    assert torch.all(reach_px(*tensors[:5])[5] == 0)
+    assert torch.all(reach_px(splats_of(tensors)[0])[5] == 0)
 
 
 def test_without_gsplat_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     scene = SCENES["ordinary"]
     with pytest.raises(GsplatUnavailable, match=r"import of gsplat halted.*vdgs\[gsplat\]") as raised:
-        rasterise(*scene.tensors, scene.width, scene.height)
+        rasterise(*splats_of(scene.tensors), scene.width, scene.height)
     assert isinstance(raised.value, VdgsError)
 
 
@@ -81,7 +81,7 @@ def test_gsplat_itself_draws_what_the_reference_does(name):
     pytest.importorskip("gsplat")
     scene = SCENES[name]
     there = [tensor.detach().cuda().requires_grad_() for tensor in scene.tensors]
-    ours = rasterise(*there, scene.width, scene.height, depth=True)
-    exact = reference(*scene.to(torch.float64).tensors, scene.width, scene.height, depth=True)
+    ours = rasterise(*splats_of(there), scene.width, scene.height, depth=True)
+    exact = reference(*splats_of(scene.to(torch.float64).tensors), scene.width, scene.height, depth=True)
     for actual, expected in zip(ours, exact, strict=True):
         assert_close(actual.cpu(), expected, 1e-3)

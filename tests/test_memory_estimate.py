@@ -199,7 +199,7 @@ def test_training_that_runs_out_of_memory_saves_says_what_helps_and_continues(tm
     folder = tmp_path / "run" / "coarse"
     (saved,) = (int(path.stem) for path in (folder / "checkpoints").glob("*.json"))
     assert 5 < saved < 40
-    assert f"The state of iteration {saved} is saved in {folder / 'checkpoints'}." in broken.stderr
+    assert f"The checkpoint of iteration {saved} is saved in {folder / 'checkpoints'}." in broken.stderr
     assert json.loads((folder / "status.json").read_text())["why"] == "out of memory"
 
     continued, unbroken = coarse(capture, tmp_path / "run"), coarse(capture, tmp_path / "unbroken")

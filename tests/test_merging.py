@@ -19,6 +19,7 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.render import render
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.merging import giver_of_places, merge
+from vdgs.partition.records import MergedBlock
 from vdgs.settings.method import MergeConfig
 
 OWNER, BEST_SEEN = MergeConfig("owner"), MergeConfig("best_seen")
@@ -51,12 +52,10 @@ def places(model: AnchorModel) -> np.ndarray:
 def test_merging_one_block_is_the_identity(config: MergeConfig):
     core = shapely.box(-1, -1, 1, 1)
     blocks, coarse, trained = Blocks((Block(core, core.buffer(0.4)),)), scattered(50), scattered(80, seed=1)
-    merged, facts = merge(coarse, [trained], blocks, [[camera_above(0, 0)]], config)
+    merged, became = merge(coarse, [trained], blocks, [[camera_above(0, 0)]], config)
     assert bits(merged.anchors) == bits(trained.anchors)
     assert (merged.voxel, merged.background, merged.facts) == (coarse.voxel, coarse.background, coarse.facts)
-    assert {**facts[0], "unseen": 0} == {
-        "block": 0, "trained": 80, "kept": 80, "dropped": 0, "from_coarse": 0, "unseen": 0,
-    }  # fmt: skip
+    assert replace(became[0], unseen=0) == MergedBlock(0, trained=80, kept=80, dropped=0, from_coarse=0, unseen=0)
 
 
 @settings(max_examples=25)
@@ -67,7 +66,7 @@ def test_the_merged_scene_is_a_disjoint_union(seed: int, config: MergeConfig):
     blocks, coarse = quadrants(), scattered(40, seed)
     trained = [scattered(int(rng.integers(0, 60)), seed + 1 + i) for i in range(4)]
     cameras = [[camera_above(*rng.uniform(-3, 3, 2)) for _ in range(rng.integers(0, 4))] for _ in range(4)]
-    merged, facts = merge(coarse, trained, blocks, cameras, config)
+    merged, became = merge(coarse, trained, blocks, cameras, config)
     givers = [giver_of_places(each.anchors.positions, blocks, cameras, config) for each in trained]
     expected = [
         row
@@ -76,9 +75,9 @@ def test_the_merged_scene_is_a_disjoint_union(seed: int, config: MergeConfig):
         if giver == i
     ]  # fmt: skip
     assert rows(merged.anchors) == expected
-    assert [each["trained"] for each in facts] == [len(each.anchors) for each in trained]
-    assert all(each["kept"] + each["dropped"] == each["trained"] for each in facts)
-    assert sum(each["kept"] for each in facts) == len(merged.anchors)
+    assert [each.trained for each in became] == [len(each.anchors) for each in trained]
+    assert all(each.kept + each.dropped == each.trained for each in became)
+    assert sum(each.kept for each in became) == len(merged.anchors)
 
 
 @pytest.mark.parametrize("config", [OWNER, BEST_SEEN])
@@ -95,12 +94,12 @@ def test_untrained_blocks_give_the_coarse_scene_back(config: MergeConfig):
 def test_the_owner_gives():
     blocks, coarse = quadrants(), scattered(300)
     trained = [scattered(300, seed=i + 1) for i in range(4)]
-    merged, facts = merge(coarse, trained, blocks, NO_CAMERAS, OWNER)
+    merged, became = merge(coarse, trained, blocks, NO_CAMERAS, OWNER)
     expected = [
         row for i, each in enumerate(trained) for row in rows(part(each, quadrant_of(places(each)) == i).anchors)
     ]
     assert rows(merged.anchors) == expected
-    assert all(each["unseen"] == each["kept"] for each in facts)
+    assert all(each.unseen == each.kept for each in became)
 
 
 def test_a_merged_plane_is_drawn_as_the_coarse_one():
@@ -124,9 +123,9 @@ def test_what_the_owner_did_not_see_is_coarse_still():
         features = torch.where(seen[:, None], own.anchors.features + 1, own.anchors.features)
         trained.append(replace(own, anchors=replace(own.anchors, features=features)))
         unseen.append(int((~seen).sum()))
-    merged, facts = merge(coarse, trained, blocks, cameras, OWNER)
+    merged, became = merge(coarse, trained, blocks, cameras, OWNER)
     assert min(unseen) > 0
-    assert [each["unseen"] for each in facts] == unseen
+    assert [each.unseen for each in became] == unseen
     assert len(set(rows(merged.anchors)) & set(rows(coarse.anchors))) == sum(unseen)
 
 
@@ -166,10 +165,10 @@ def test_coarse_anchors_stand_in_for_a_missing_block(config: MergeConfig):
     trained: list[AnchorModel | None] = [scattered(300, seed=i + 1) for i in range(4)]
     trained[2] = None
     cameras = [[camera_above(0, 0, 8.0)] * (2 if i == 3 else 1) for i in range(4)]
-    merged, facts = merge(coarse, trained, blocks, cameras, config, allow_missing=True)
+    merged, became = merge(coarse, trained, blocks, cameras, config, allow_missing=True)
     stood_in = rows(part(coarse, quadrant_of(places(coarse)) == 2).anchors)
     assert set(rows(merged.anchors)) & set(rows(coarse.anchors)) == set(stood_in)
-    assert facts[2]["from_coarse"] == facts[2]["kept"] + facts[2]["from_coarse"] == len(stood_in)
+    assert became[2].from_coarse == became[2].kept + became[2].from_coarse == len(stood_in)
     others = part(merged, quadrant_of(places(merged)) == 2).anchors
     assert sorted(rows(others)) == sorted(stood_in)  # nobody else gives there
 
@@ -186,9 +185,9 @@ def test_a_missing_block_is_given_nothing_of_others():
 
 def test_all_blocks_missing_is_the_coarse_scene():
     coarse = scattered()
-    merged, facts = merge(coarse, [None] * 4, quadrants(), NO_CAMERAS, OWNER, allow_missing=True)
+    merged, became = merge(coarse, [None] * 4, quadrants(), NO_CAMERAS, OWNER, allow_missing=True)
     assert sorted(rows(merged.anchors)) == sorted(rows(coarse.anchors))
-    assert sum(each["from_coarse"] for each in facts) == len(coarse.anchors)
+    assert sum(each.from_coarse for each in became) == len(coarse.anchors)
 
 
 def test_a_block_of_another_coarse_model_is_refused():

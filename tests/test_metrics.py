@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import convolve2d
 
-from evaluation_support import noisy, photograph, real_photographs
+from evaluation_support import noisy, photograph, psnr, real_photographs, ssim
 from vdgs.evaluation import metrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram, quantile_groups, view_bins
 
@@ -37,9 +37,9 @@ def direct_ssim_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 def test_psnr_of_a_known_error():
     black = np.zeros((7, 9, 3), np.uint8)
     one_level = np.ones_like(black)
-    assert metrics.psnr(one_level, black) == pytest.approx(20 * math.log10(255))
-    assert metrics.psnr(np.full_like(black, 255), black) == pytest.approx(0.0)
-    assert metrics.psnr(black, black) == math.inf
+    assert psnr(one_level, black) == pytest.approx(20 * math.log10(255))
+    assert psnr(np.full_like(black, 255), black) == pytest.approx(0.0)
+    assert psnr(black, black) == math.inf
 
 
 def test_psnr_equals_the_definition():
@@ -47,7 +47,7 @@ def test_psnr_equals_the_definition():
     reference = photograph(rng)
     image = noisy(reference, rng)
     error = np.mean((image / 255 - reference / 255) ** 2)
-    assert metrics.psnr(image, reference) == pytest.approx(-10 * math.log10(error), rel=1e-12)
+    assert psnr(image, reference) == pytest.approx(-10 * math.log10(error), rel=1e-12)
 
 
 def test_masked_pixels_change_no_metric():
@@ -57,7 +57,7 @@ def test_masked_pixels_change_no_metric():
     mask = np.ones(reference.shape[:2], bool)
     mask[10:30, 20:50] = False
     ruined = np.where(mask[..., None], image, 0).astype(np.uint8)
-    for metric in (metrics.psnr, metrics.ssim):
+    for metric in (psnr, ssim):
         assert metric(ruined, reference, mask) == metric(image, reference, mask)
         assert metric(ruined, reference) < metric(image, reference)
         assert math.isnan(metric(image, reference, np.zeros_like(mask)))
@@ -70,24 +70,24 @@ def test_ssim_equals_the_direct_computation():
         image = noisy(reference, rng, 0.1)
         expected = direct_ssim_map(image, reference)
         np.testing.assert_allclose(metrics.ssim_map(image, reference), expected, atol=1e-10)
-        assert metrics.ssim(image, reference) == pytest.approx(expected.mean(), abs=1e-10)
+        assert ssim(image, reference) == pytest.approx(expected.mean(), abs=1e-10)
 
 
 def test_ssim_is_one_only_for_the_same_image_and_symmetric():
     rng = np.random.default_rng(3)
     reference = photograph(rng)
     image = noisy(reference, rng)
-    assert metrics.ssim(reference, reference) == pytest.approx(1.0, abs=1e-12)
-    assert metrics.ssim(image, reference) == pytest.approx(metrics.ssim(reference, image), abs=1e-12) != 1.0
+    assert ssim(reference, reference) == pytest.approx(1.0, abs=1e-12)
+    assert ssim(image, reference) == pytest.approx(ssim(reference, image), abs=1e-12) != 1.0
 
 
 def test_wrong_images_are_refused():
     good = np.zeros((8, 8, 3), np.uint8)
     refused = (ValueError, TypeError)  # the latter from the check of annotations, where that runs
     with pytest.raises(refused, match=r"(?i)uint8"):
-        metrics.psnr(good.astype(np.float32), good)
+        psnr(good.astype(np.float32), good)
     with pytest.raises(refused):
-        metrics.ssim(good, good[:4])
+        ssim(good, good[:4])
 
 
 def test_rounding_to_8_bits():
@@ -153,6 +153,6 @@ def test_views_by_visibility():
 def test_on_a_photograph():
     (reference,) = real_photographs("copr", 1)
     image = noisy(reference, np.random.default_rng(5), 0.03)
-    assert metrics.psnr(image, reference) == pytest.approx(-20 * math.log10(0.03), abs=0.2)
+    assert psnr(image, reference) == pytest.approx(-20 * math.log10(0.03), abs=0.2)
     expected = direct_ssim_map(image, reference).mean()
-    assert metrics.ssim(image, reference) == pytest.approx(expected, abs=1e-10)
+    assert ssim(image, reference) == pytest.approx(expected, abs=1e-10)

@@ -73,7 +73,8 @@ def test_all_figures_of_all_scenes(tmp_path: Path, name: str) -> None:
     cut, assigned = grid(blocks), scores > 0.7
     compare = grid(blocks + 1) if blocks > 1 else None
     file = tmp_path / "figure.png"
-    figures.draw_blocks(file, positions, views, cut, cameras, assigned, "m", compare, "λ_vis = 1")
+    cuts = [("λ_vis = 1", cut)] + ([] if compare is None else [(figures.BY_PLACE, compare)])
+    figures.draw_blocks(file, positions, views, cameras, assigned, cuts, "m")
     check(file)
     figures.draw_block_facts(file, positions, views, cut, assigned, "m", compare)
     check(file)
@@ -87,10 +88,11 @@ def test_the_comparison_stands_beside_or_below(tmp_path: Path) -> None:
     positions, views, cameras, scores = scene(300, 5, 2)
     alone, both, wide = (tmp_path / f"{name}.png" for name in ("alone", "both", "wide"))
     cut, assigned = grid(2), scores > 0.5
-    figures.draw_blocks(alone, positions, views, cut, cameras, assigned, "m", None, "not cut")
-    figures.draw_blocks(both, positions, views, cut, cameras, assigned, "m", grid(2), "λ_vis = 1")
+    figures.draw_blocks(alone, positions, views, cameras, assigned, [("not cut", cut)], "m")
+    compared = [("λ_vis = 1", cut), (figures.BY_PLACE, grid(2))]
+    figures.draw_blocks(both, positions, views, cameras, assigned, compared, "m")
     stretched = positions * np.float32([10, 1, 1])
-    figures.draw_blocks(wide, stretched, views, cut, cameras, assigned, "m", grid(2), "λ_vis = 1")
+    figures.draw_blocks(wide, stretched, views, cameras, assigned, compared, "m")
     one, two, three = (check(file).shape for file in (alone, both, wide))
     assert two[1] > 1.5 * one[1]
     assert two[0] == one[0]
@@ -150,7 +152,7 @@ def test_many_anchors_are_thinned_and_the_heading_counts_cameras_beyond_the_map(
     far[0, 3] = -500.0
     cameras.append(Camera(far, 400, 400, 200, 150, 400, 300))
     assigned = np.ones((4, 1), bool)
-    figures.draw_blocks(tmp_path / "blocks.png", positions, views, grid(1), cameras, assigned, "m", None, "not cut")
+    figures.draw_blocks(tmp_path / "blocks.png", positions, views, cameras, assigned, [("not cut", grid(1))], "m")
     assert headings[0][1] == "60,001 anchors (60,000 drawn)  ·  4 training cameras (1 beyond the map)"
 
 

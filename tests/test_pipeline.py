@@ -86,13 +86,13 @@ def test_blocks_draw_parts_of_photographs_and_the_pixels_that_were_asked_for(unb
     """So many photographs' worth of pixels in more steps, or so many steps with fewer pixels: by the setting."""
     for index, folder in enumerate(RunFolder(unbroken).block_folders()):
         status, cameras = folder.status(), load_scores(unbroken / "partition" / "scores.npz")[2].cameras
-        assert status["iteration"] > 1.04 * BLOCK_ITERATIONS
-        assert status["photographs"] == pytest.approx(BLOCK_ITERATIONS, abs=1)
+        assert status.iteration > 1.04 * BLOCK_ITERATIONS
+        assert status.photographs == pytest.approx(BLOCK_ITERATIONS, abs=1)
         assert len(json.loads((folder.path / "crops.json").read_text())["crops"]) == cameras[:, index].sum()
     train_each(copied, "--block.crop", "steps")
     for folder in RunFolder(copied).block_folders():
-        assert folder.status()["iteration"] == BLOCK_ITERATIONS
-        assert folder.status()["photographs"] < 0.96 * BLOCK_ITERATIONS
+        assert folder.status().iteration == BLOCK_ITERATIONS
+        assert folder.status().photographs < 0.96 * BLOCK_ITERATIONS
         assert model(copied, folder.model) != model(unbroken, folder.model.relative_to(copied))
 
 
@@ -193,7 +193,9 @@ def test_other_settings_are_refused_where_they_cost_training(capture, copied):
 
 def test_a_changed_setting_redoes_exactly_what_depends_on_it(capture, copied):
     before = moments(copied)
-    redone = vdgs("run", capture, "--output", copied, *SETTINGS, "--block.compensation.beta-g", "0", "--redo")
+    redone = vdgs(
+        "run", capture, "--output", copied, *SETTINGS, "--block.compensation.beta-g", "0", "--redo", tasks_here=True
+    )
     assert redone.returncode == 0, redone.stderr
     changed = {name.split("/")[0] for name in changed_files(copied, before)}
     assert changed == {"config.yaml", "blocks", "merged", "evaluation", "report.html"}
@@ -260,7 +262,7 @@ def test_a_missing_block_stops_the_merge_unless_the_coarse_model_may_stand_in(co
 
 def test_one_block_is_the_whole_scene_and_merging_it_the_identity(copied):
     for command in (("partition", copied, "--no-blocking", "--redo"), ("train", copied), ("merge", copied)):
-        done = vdgs(*command)
+        done = vdgs(*command, tasks_here=True)
         assert done.returncode == 0, done.stderr
     assert [path.name for path in (copied / "blocks").iterdir()] == ["00"]
     merged, block = (AnchorModel.load(copied / name) for name in (MERGED, "blocks/00/model.safetensors"))

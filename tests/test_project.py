@@ -15,7 +15,7 @@ from vdgs.kernels.constants import DILATION_PX2
 from vdgs.kernels.native import module
 from vdgs.kernels.native.project import project as native_project
 from vdgs.kernels.reference.project import project as twin_project
-from vdgs.kernels.reference.project import rotation_matrices
+from vdgs.kernels.rotations import rotation_matrices
 
 CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
 

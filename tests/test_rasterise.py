@@ -14,12 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from rasterise_scenes import Scene, make_scene
+from rasterise_scenes import Scene, make_scene, splats_of
 from vdgs.kernels import constants
 from vdgs.kernels.native.module import load, supported
 from vdgs.kernels.native.rasterise import rasterise
 from vdgs.kernels.reference.rasterise import rasterise as reference
-from vdgs.kernels.types import Raster
+from vdgs.kernels.types import Raster, Splats
 
 ISAS = supported()
 NAMES = ("means_px", "conics", "colours", "opacities", "depths", "background")
@@ -40,7 +40,7 @@ SCENES = {
 
 
 def draw(scene: Scene, isa: str, depth: bool = True) -> Raster:
-    return rasterise(*scene.tensors, scene.width, scene.height, depth=depth, module=load(isa))
+    return rasterise(*splats_of(scene.tensors), scene.width, scene.height, depth=depth, module=load(isa))
 
 
 def weights_of(raster: Raster, seed: int = 1) -> list[Tensor]:
@@ -71,7 +71,7 @@ def test_constants_are_those_of_python(isa: str) -> None:
 @pytest.mark.parametrize("name", SCENES)
 def test_picture_and_gradients_equal_the_reference(name: str, isa: str) -> None:
     exact_scene, scene = SCENES[name].to(torch.float64), SCENES[name].to(torch.float32)
-    exact = reference(*exact_scene.tensors, scene.width, scene.height, depth=True)
+    exact = reference(*splats_of(exact_scene.tensors), scene.width, scene.height, depth=True)
     actual = draw(scene, isa)
     for a, e in zip(actual, exact, strict=True):
         assert_close(a, e, 2e-5)
@@ -95,7 +95,7 @@ def test_any_scene_equals_the_reference(
     n: int, width: int, height: int, seed: int, size: float, opacity: float
 ) -> None:
     scene = make_scene(n, width, height, seed, size=size, opacity=opacity)
-    exact = reference(*scene.to(torch.float64).tensors, width, height, depth=True)
+    exact = reference(*splats_of(scene.to(torch.float64).tensors), width, height, depth=True)
     for a, e in zip(draw(scene, ISAS[0]), exact, strict=True):
         assert_close(a, e, 1e-4)
 
@@ -115,7 +115,7 @@ def test_gradients_equal_finite_differences_in_float64(isa: str) -> None:
             losses = []
             for sign in (1, -1):
                 moved = [x.detach() + sign * step if x is e else x.detach() for x in exact.tensors]
-                losses.append(float(loss_of(reference(*moved, scene.width, scene.height, depth=True))))
+                losses.append(float(loss_of(reference(*splats_of(moved), scene.width, scene.height, depth=True))))
             slope = (losses[0] - losses[1]) / (2 * float(step.norm()))
             assert float((t.grad * direction).sum()) == pytest.approx(slope, rel=2e-3, abs=2e-4 * float(t.grad.norm()))
 
@@ -138,7 +138,7 @@ def test_slabs_change_nothing(isa: str, hole: bool) -> None:
     assert counted["sorted"] < 0.9 * counted["candidates"], "what is hidden is not sorted"
     actual = draw(scene, isa)
     assert all(torch.equal(a, p) for a, p in zip(actual, picture, strict=True))
-    exact = reference(*exact_scene.tensors, 20, 18, depth=True)
+    exact = reference(*splats_of(exact_scene.tensors), 20, 18, depth=True)
     loss_of(actual).backward()
     loss_of(exact).backward()
     for a, e in zip(actual, exact, strict=True):
@@ -196,10 +196,10 @@ def test_several_python_threads_draw_at_once(isa: str) -> None:
 def test_a_forked_child_draws_the_same() -> None:
     scene = make_scene(3000, 80, 60)
     args = [t.detach() for t in scene.tensors]
-    expected = rasterise(*args, 80, 60).image
+    expected = rasterise(*splats_of(args), 80, 60).image
     child = os.fork()
     if child == 0:
-        same = torch.equal(rasterise(*args, 80, 60).image, expected)
+        same = torch.equal(rasterise(*splats_of(args), 80, 60).image, expected)
         os._exit(0 if same else 1)
     assert os.waitpid(child, 0)[1] == 0
 
@@ -217,14 +217,14 @@ def test_rows_that_are_not_finite_are_not_drawn(isa: str, value: float) -> None:
         spoiled.append(t.requires_grad_())
     actual = draw(Scene(tuple(spoiled), 40, 30), isa)
     without = [t.detach()[kept] if len(t) == 60 else t.detach() for t in scene.tensors]
-    expected = rasterise(*without, 40, 30, depth=True, module=load(isa))
+    expected = rasterise(*splats_of(without), 40, 30, depth=True, module=load(isa))
     for a, e in zip(actual, expected, strict=True):
         assert torch.equal(a, e)
     loss_of(actual).backward()
     for t in spoiled[:5]:
         assert t.grad.isfinite().all()
         assert not t.grad[~kept].any()
-    twin = reference(*[t.detach().double() for t in spoiled], 40, 30)
+    twin = reference(*splats_of(tuple(t.detach().double() for t in spoiled)), 40, 30)
     assert_close(actual.image, twin.image, 1e-5)
 
 
@@ -246,7 +246,7 @@ def test_opacity_outside_its_range(isa: str, opacity: float) -> None:
     one = (torch.tensor([[9.0, 6.0]]), conic, torch.ones(1, 3), torch.tensor([opacity]), torch.ones(1))
     scene = Scene((*one, torch.zeros(3)), 30, 20)
     exact_scene, scene = scene.to(torch.float64), scene.to(torch.float32)
-    exact, actual = reference(*exact_scene.tensors, 30, 20, depth=True), draw(scene, isa)
+    exact, actual = reference(*splats_of(exact_scene.tensors), 30, 20, depth=True), draw(scene, isa)
     loss_of(exact).backward()
     loss_of(actual).backward()
     assert_close(actual.image, exact.image, 1e-5)
@@ -268,7 +268,7 @@ def test_order_of_the_rows_does_not_matter() -> None:
     scene = make_scene(500, 50, 40)
     order = torch.randperm(500, generator=torch.Generator().manual_seed(0))
     shuffled = [t.detach()[order] if len(t) == 500 else t.detach() for t in scene.tensors]
-    assert torch.equal(rasterise(*shuffled, 50, 40).image, draw(scene, ISAS[0]).image)
+    assert torch.equal(rasterise(*splats_of(shuffled), 50, 40).image, draw(scene, ISAS[0]).image)
 
 
 def test_inputs_may_be_strided() -> None:
@@ -280,7 +280,7 @@ def test_inputs_may_be_strided() -> None:
     assert not strided[0].is_contiguous()
     assert not strided[3].is_contiguous()
     strided = [t.requires_grad_() for t in strided]
-    raster = rasterise(*strided, 40, 30)
+    raster = rasterise(*splats_of(strided), 40, 30)
     assert torch.equal(raster.image, draw(scene, ISAS[0]).image)
     raster.image.transpose(0, 1).square().sum().backward()
     draw(scene, ISAS[0]).image.square().sum().backward()
@@ -291,9 +291,9 @@ def test_inputs_may_be_strided() -> None:
 def test_only_what_is_asked_for_gets_gradients() -> None:
     scene = make_scene(100, 30, 30)
     tensors = [t.detach() for t in scene.tensors]
-    assert not rasterise(*tensors, 30, 30).image.requires_grad
+    assert not rasterise(*splats_of(tensors), 30, 30).image.requires_grad
     tensors[2].requires_grad_()
-    raster = rasterise(*tensors, 30, 30)
+    raster = rasterise(*splats_of(tensors), 30, 30)
     assert raster.depth is None
     raster.alpha.sum().backward()
     assert not tensors[2].grad.any(), "alpha does not depend on colours"
@@ -327,15 +327,18 @@ def test_backward_may_be_repeated_but_not_differentiated() -> None:
 def test_wrong_tensors_are_named(change, error: type[Exception], message: str) -> None:
     tensors = [t.detach() for t in make_scene(9, 10, 10).tensors]
     change(tensors)
+    splats = object.__new__(Splats)  # without the run-time types of the tests, here and below
+    for name, tensor in zip(("means_px", "conics", "colours", "opacities", "depths"), tensors[:5], strict=True):
+        object.__setattr__(splats, name, tensor)
     with pytest.raises(error, match=message):
-        inspect.unwrap(rasterise)(*tensors, 10, 10)  # without the run-time types of the tests
+        inspect.unwrap(rasterise)(splats, tensors[5], 10, 10)
 
 
 @pytest.mark.parametrize(("width", "height"), [(0, 5), (5, -1), (2**20, 1)])
 def test_impossible_pictures_are_refused(width: int, height: int) -> None:
     tensors = [t.detach() for t in make_scene(3, 10, 10).tensors]
     with pytest.raises(ValueError, match="must be from 1 to"):
-        rasterise(*tensors, width, height)
+        rasterise(*splats_of(tensors), width, height)
 
 
 def test_frames_are_reused_across_sizes() -> None:

@@ -8,6 +8,7 @@ import pytest
 from vdgs.errors import RunError
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.keys import SINCE, stage_keys
+from vdgs.runs.status import Status
 from vdgs.settings.checks import validate
 from vdgs.settings.method import BlockConfig, GrowthConfig, MethodConfig, TrainConfig, with_iterations
 from vdgs.settings.plain import differences, from_dict, to_dict
@@ -61,7 +62,7 @@ def test_the_log_is_cut_at_the_state_that_training_continues_from(tmp_path):
     folder = StageFolder(tmp_path)
     lines = [json.dumps({"iteration": i}) for i in (50, 100, 150)]
     folder.log.write_text("\n".join(lines) + '\n{"iterat')
-    folder.cut_log(100)
+    folder.truncate_log(100)
     assert folder.log.read_text() == lines[0] + "\n" + lines[1] + "\n"
 
 
@@ -88,40 +89,40 @@ def test_a_change_that_costs_trained_work_needs_redo(tmp_path):
     run = RunFolder(tmp_path / "run")
     run.begin(settings())
     other = settings() | {"partition": settings()["partition"] | {"lambda_vis": 0.7}}
-    run.change(other, redo=False)  # nothing is trained yet
-    run.block(0).claim(run.keys().blocks)
+    run.change_settings(other, redo=False)  # nothing is trained yet
+    run.block(0).discard_unless(run.keys().blocks)
     run.block(0).model.write_bytes(b"a trained block")
     with pytest.raises(RunError, match=r"partition\.lambda_vis: 0\.7 -> 1\.0(?s:.*)a block useless. Add --redo"):
-        run.change(settings(), redo=False)
+        run.change_settings(settings(), redo=False)
     assert run.settings() == other
-    assert run.change(settings(), redo=True) == ["partition.lambda_vis: 0.7 -> 1.0"]
+    assert run.change_settings(settings(), redo=True) == ["partition.lambda_vis: 0.7 -> 1.0"]
     assert run.settings() == settings()
 
 
 def test_a_stage_deletes_what_was_made_for_other_settings_and_nothing_else(tmp_path):
     folder = StageFolder(tmp_path / "stage")
-    folder.claim("a")
+    folder.discard_unless("a")
     folder.model.write_bytes(b"model")
-    folder.set_status("done", iteration=3)
-    folder.claim("a")
+    folder.set_status(Status("done", iteration=3))
+    folder.discard_unless("a")
     assert folder.is_done("a")
     assert not folder.is_done("b")
-    folder.claim("b")
+    folder.discard_unless("b")
     assert not folder.model.exists()
-    assert folder.status() == {"state": "new"}
+    assert folder.status() == Status("new")
     assert folder.key() == "b"
 
 
 def test_work_of_unknown_settings_is_not_taken_over(tmp_path):
     folder = StageFolder(tmp_path / "stage")
-    folder.claim("a")
+    folder.discard_unless("a")
     folder.model.write_bytes(b"model")
-    folder.set_status("done")
+    folder.set_status(Status("done"))
     folder.status_file.unlink()  # as the message about a damaged one advises: the key stays known
-    folder.claim("a")
+    folder.discard_unless("a")
     assert folder.model.exists()
     folder.key_file.unlink()
-    folder.claim("a")
+    folder.discard_unless("a")
     assert not folder.model.exists()
 
 

@@ -42,10 +42,7 @@ def test_the_splats_of_a_block_draw_what_the_block_alone_draws(instructions):
         for index in range(3):
             reached = torch.from_numpy(blocks.reaches(index, places))
             some = select_splats(splats, reached[anchor].nonzero().squeeze(1))
-            ours = kernels.rasterise(
-                some.means_px, some.conics, some.colours, some.opacities, some.depths, torch.zeros(3),
-                view.width, view.height,
-            )  # fmt: skip
+            ours = kernels.rasterise(some, torch.zeros(3), view.width, view.height)
             alone = render(replace(model, anchors=model.anchors.select(reached)), view, background=(0.0, 0.0, 0.0))
             assert torch.equal(ours.image, alone.image)
             assert torch.equal(ours.alpha, alone.alpha)

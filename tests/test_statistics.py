@@ -6,6 +6,7 @@ import torch
 import vdgs.kernels.native.statistics as native
 import vdgs.kernels.reference.statistics as reference
 from native_choice import every_instruction_set, on_threads, using
+from vdgs.kernels.types import Statistics
 
 
 def view(seed: int, n: int = 3000, k: int = 7):
@@ -14,7 +15,8 @@ def view(seed: int, n: int = 3000, k: int = 7):
     source = torch.nonzero(torch.rand(len(visible) * k, generator=g) < 0.4)[:, 0].int()
     m = len(source)
     sums = [torch.rand(n, k, generator=g), torch.rand(n, k, generator=g), torch.rand(n, generator=g), torch.rand(n)]
-    return (visible, source, torch.rand(m, generator=g), torch.randn(m, 2, generator=g), 400, 300), sums
+    inside = torch.rand(len(visible), generator=g) < 0.7
+    return (visible, inside, source, torch.rand(m, generator=g), torch.randn(m, 2, generator=g), 400, 300), sums
 
 
 @every_instruction_set
@@ -22,12 +24,12 @@ def view(seed: int, n: int = 3000, k: int = 7):
 def test_native_equals_twin(instructions, seed):
     inputs, sums = view(seed)
     expected = [s.clone() for s in sums]
-    reference.add_view_statistics(*inputs, *expected)
+    reference.add_view_statistics(Statistics(*expected), *inputs)
     results = []
     for threads in (1, 2, 3):
         ours = [s.clone() for s in sums]
         with using(instructions), on_threads(threads):
-            native.add_view_statistics(*inputs, *ours)
+            native.add_view_statistics(Statistics(*ours), *inputs)
         results.append(ours)
     for ours in results:
         for mine, twin, first in zip(ours, expected, results[0], strict=True):
@@ -36,11 +38,13 @@ def test_native_equals_twin(instructions, seed):
 
 
 @pytest.mark.parametrize("room", [native, reference])
-def test_nothing_drawn_counts_only_the_visible(room):
+def test_nothing_drawn_counts_only_the_visible_that_are_inside(room):
     sums = [torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4), torch.zeros(4)]
     nothing = torch.zeros(0, dtype=torch.int32)
-    room.add_view_statistics(torch.tensor([1, 3]), nothing, torch.zeros(0), torch.zeros(0, 2), 8, 8, *sums)
-    assert [float(s.sum()) for s in sums] == [0, 0, 0, 2]
+    visible, inside = torch.tensor([0, 1, 3]), torch.tensor([True, False, True])
+    room.add_view_statistics(Statistics(*sums), visible, inside, nothing, torch.zeros(0), torch.zeros(0, 2), 8, 8)
+    assert not any(bool(s.any()) for s in sums[:3])
+    assert sums[3].tolist() == [1, 0, 0, 1]
 
 
 @pytest.mark.parametrize("room", [native, reference])
@@ -48,5 +52,20 @@ def test_a_source_beyond_the_visible_is_refused(room):
     sums = [torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4), torch.zeros(4)]
     source = torch.tensor([0, 6], dtype=torch.int32)
     with pytest.raises(IndexError):
-        room.add_view_statistics(torch.tensor([1, 3]), source, torch.zeros(2), torch.zeros(2, 2), 8, 8, *sums)
+        room.add_view_statistics(
+            Statistics(*sums), torch.tensor([1, 3]), torch.ones(2, dtype=torch.bool), source, torch.zeros(2),
+            torch.zeros(2, 2), 8, 8,
+        )  # fmt: skip
+    assert float(sums[3].sum()) == 0
+
+
+@pytest.mark.parametrize("room", [native, reference])
+def test_a_mask_that_does_not_fit_is_refused(room):
+    sums = [torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4), torch.zeros(4)]
+    nothing = torch.zeros(0, dtype=torch.int32)
+    for inside in (torch.ones(3, dtype=torch.bool), torch.ones(2)):
+        with pytest.raises((ValueError, TypeError), match="inside"):
+            room.add_view_statistics(
+                Statistics(*sums), torch.tensor([1, 3]), inside, nothing, torch.zeros(0), torch.zeros(0, 2), 8, 8
+            )
     assert float(sums[3].sum()) == 0

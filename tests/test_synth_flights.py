@@ -25,7 +25,7 @@ from vdgs.synth.sparse import SparseCloud
 from vdgs.synth.surveying import count_visibility, surface_places, view_truth
 from vdgs.synth.town import Town, build_town
 from vdgs.synth.tracing import Tracer
-from vdgs.synth.truth import load_truth, pack_depth, unpack_depth, visibility_map_from_truth
+from vdgs.synth.truth import load_truth, pack_depth, unpack_depth
 
 pytestmark = pytest.mark.xdist_group("synth_flights")
 
@@ -142,14 +142,14 @@ def test_truth_is_read_back_at_the_size_in_use(capture: Path) -> None:
     whole = load_capture(capture, CaptureOptions(up="z"))
     half = load_capture(capture, CaptureOptions(up="z", downscale=2))
     for view, small in zip(whole.test_views, half.test_views, strict=True):
-        visibility = visibility_map_from_truth(view)
+        visibility = truth.visibility_map(view)
         assert visibility.shape == (48, 64)
         np.testing.assert_array_equal(np.isnan(visibility), np.isinf(truth.depth(view.name)))
         assert np.nanmax(visibility) <= 24
         assert np.nanmean(visibility > 0) > 0.6
         assert truth.visibility_maps(half)(small.camera).shape == (24, 32)
     with pytest.raises(VdgsError, match="test and validation"):
-        visibility_map_from_truth(whole.train_views[0])
+        truth.visibility_map(whole.train_views[0])
     with pytest.raises(VdgsError, match="no truth"):
         load_truth(capture / "images")
 

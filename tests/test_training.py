@@ -10,14 +10,16 @@ from hypothesis import strategies as st
 
 from checkerboard import Photographs
 from vdgs.errors import TrainingDiverged, VdgsError
+from vdgs.kernels import native
 from vdgs.kernels.native.module import set_threads, threads
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
 from vdgs.model.render import render
 from vdgs.model.start import initial_anchors
-from vdgs.settings.method import AnchorConfig, GrowthConfig, TrainConfig
+from vdgs.settings.method import AnchorConfig, GrowthConfig, RateConfig, TrainConfig
 from vdgs.storage.checkpoints import load_newest, save_state
 from vdgs.training import Stage, downscale_at, from_saved, start_state, to_saved, train, train_step, view_at
+from vdgs.training.crops import Crop, crop_at
 
 pytestmark = pytest.mark.xdist_group("training")
 
@@ -144,6 +146,63 @@ def test_anchors_that_no_camera_sees_keep_their_bits():
     run(state, stage(), until=9)
     after = state.anchors.select(state.anchors.positions[:, 0] > 500)
     assert all(torch.equal(before.tensors()[name], after.tensors()[name]) for name in before.tensors())
+
+
+@pytest.mark.parametrize("crops", [None, (Crop(0.0, 0.1, 0.5, 0.6),) * 8])
+def test_anchors_are_seen_by_the_pictures_that_hold_their_centres(crops):
+    config = replace(CONFIG, growth=replace(CONFIG.growth, statistics_from=0, start=1000))
+    seen_by = replace(stage(config), crops=crops)
+    state = start(config)
+    expected = torch.zeros(len(state.anchors))
+    for iteration in range(12):
+        camera = Photographs().camera(view_at(iteration, 8, 0), downscale_at(iteration, config))
+        crop = crop_at(crops, 0, iteration)
+        part = camera.cropped(*crop.pixels(camera.width, camera.height))
+        expected += torch.from_numpy(part.sees(state.anchors.positions.double().numpy()))
+        train_step(state, seen_by)
+    assert torch.equal(state.statistics.seen, expected)
+    assert 0 < float(expected.mean()) < 12
+
+
+def test_transparent_anchors_go_where_they_are_seen_and_stay_just_outside_of_all_pictures():
+    config = replace(CONFIG, growth=replace(CONFIG.growth, threshold=1e9))
+    state, nothing = start(config), replace(stage(config), frozen_decoder=True)
+    with torch.no_grad():
+        state.decoder.weights.opacity.w2[:] = 0.0
+        state.decoder.weights.opacity.b2[:] = -1.0  # no Gaussian is drawn
+    for tensor in state.decoder.tensors().values():
+        tensor.requires_grad_(False)
+    before = state.anchors.positions.clone()
+    cameras = Photographs().cameras
+    times = native.count_visibility(before, cameras)
+    beside = torch.zeros(len(before), dtype=torch.bool)
+    for camera in cameras:
+        beside[native.cull(before, state.anchors.log_scales, camera)] = True
+    beside &= times == 0
+    run(state, nothing)
+    left = {tuple(place) for place in state.anchors.positions.tolist()}
+    stays = torch.tensor([tuple(place) in left for place in before.tolist()])
+    assert beside.sum() > 3
+    assert stays[times == 0].all()
+    assert not stays[times > 1].any()
+    assert (times > 1).sum() > 100
+
+
+@pytest.mark.parametrize("first_seen", [0, 10_000])
+def test_the_first_step_of_an_anchor_is_the_same_whenever_it_is_seen_first(first_seen):
+    """An anchor that was never seen keeps everything; seen first, it moves as it would have at once."""
+    config = replace(CONFIG, iterations=20_000, rates=RateConfig(features=(0.01, 0.01), log_scales=(0.01, 0.01)))
+    state = start(config)
+    state.iteration = first_seen
+    before = state.anchors.select(torch.arange(len(state.anchors)))
+    one_view = replace(stage(replace(config, growth=replace(config.growth, until=0.0))), image_count=1)
+    train_step(state, one_view)
+    updates = state.optimiser.updates
+    assert set(updates.tolist()) == {0, 1}
+    for name, rate in (("features", 0.01), ("log_scales", 0.01)):
+        moved = (getattr(state.anchors, name) - getattr(before, name)).abs()
+        assert not moved[updates == 0].any()
+        assert 0.99 * rate < float(moved.max()) < 1.01 * rate
 
 
 def test_a_parameter_that_is_not_a_number_stops_training():

@@ -13,6 +13,7 @@ constexpr int64_t kTaskAnchors = 512;
 
 struct View {
   const int64_t* visible;
+  const uint8_t* inside;  // of each visible anchor: whether it counts as seen
   const int32_t* source;
   const float* opacities;
   const float* gradient_px;
@@ -41,18 +42,20 @@ void add_anchors(const View& view, const Sums& sums, int64_t splats, int64_t beg
       opacity += view.opacities[splat];
     }
     sums.opacity[anchor] += opacity;
-    sums.seen[anchor] += 1.0f;
+    sums.seen[anchor] += view.inside[row] ? 1.0f : 0.0f;
   }
 }
 
 using Vector = Array<float, nb::ndim<1>>;
 using Matrix = Array<float, nb::ndim<2>>;
 
-void bound(Array<const int64_t, nb::ndim<1>> visible, Array<const int32_t, nb::ndim<1>> source,
-           Array<const float, nb::ndim<1>> opacities, Array<const float, nb::ndim<2>> gradient_px, float half_width,
-           float half_height, Matrix gradient, Matrix drawn, Vector opacity, Vector seen) {
+void bound(Array<const int64_t, nb::ndim<1>> visible, Array<const uint8_t, nb::ndim<1>> inside,
+           Array<const int32_t, nb::ndim<1>> source, Array<const float, nb::ndim<1>> opacities,
+           Array<const float, nb::ndim<2>> gradient_px, float half_width, float half_height, Matrix gradient,
+           Matrix drawn, Vector opacity, Vector seen) {
   nb::gil_scoped_release release;
-  const View view{visible.data(), source.data(), opacities.data(), gradient_px.data(), half_width, half_height};
+  const View view{visible.data(),   inside.data(), source.data(), opacities.data(), gradient_px.data(),
+                  half_width, half_height};
   const Sums sums{gradient.data(), drawn.data(), opacity.data(), seen.data(), static_cast<int64_t>(gradient.shape(1))};
   const int64_t anchors = static_cast<int64_t>(visible.shape(0)), splats = static_cast<int64_t>(source.shape(0));
   parallel_for((anchors + kTaskAnchors - 1) / kTaskAnchors, [&](int64_t task) {
@@ -64,7 +67,7 @@ void bound(Array<const int64_t, nb::ndim<1>> visible, Array<const int32_t, nb::n
 }  // namespace
 
 VDGS_BIND(add_view_statistics) {
-  m.def("add_view_statistics", &bound, nb::arg("visible"), nb::arg("source"), nb::arg("opacities"),
+  m.def("add_view_statistics", &bound, nb::arg("visible"), nb::arg("inside"), nb::arg("source"), nb::arg("opacities"),
         nb::arg("gradient_px"), nb::arg("half_width"), nb::arg("half_height"), nb::arg("gradient"), nb::arg("drawn"),
         nb::arg("opacity"), nb::arg("seen"));
 }

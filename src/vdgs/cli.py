@@ -58,14 +58,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(verb: str, arguments: list[str]) -> int:
     from vdgs import verbs
-    from vdgs.errors import VdgsError
+    from vdgs.errors import Stopped, VdgsError
 
     action: Callable[[list[str]], Any] = getattr(verbs, verb)
     try:
         return int(action(arguments) or 0)
     except VdgsError as error:
         print(f"vdgs {verb}: {error}", file=sys.stderr)
-        return 130 if getattr(error, "stopped", False) else 1
+        return 130 if isinstance(error, Stopped) else 1
     except KeyboardInterrupt:
         print(f"vdgs {verb}: interrupted", file=sys.stderr)
         return 130

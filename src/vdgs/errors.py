@@ -20,4 +20,8 @@ class RunError(VdgsError):
 
 
 class TrainingDiverged(VdgsError):
-    """The loss or a parameter is no longer a finite number; the last good state is kept on disk."""
+    """The loss or a parameter is no longer a finite number; the last good checkpoint is kept."""
+
+
+class Stopped(VdgsError):
+    """Work was asked to stop; what it had done is saved."""

@@ -32,11 +32,11 @@ def run_all(asked: RunRequest, console: Console) -> None:
         raise VdgsError("--jobs must not be negative and --bins must be at least 1")
     run, capture = begin_run(asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo)
     _title(console, "coarse model")
-    train_coarse(run, capture, asked.watching, console)
+    train_coarse(run, capture, asked.watching, console, asked.device)
     measure_visibility(run, console)
     _measure(run, "coarse", asked, console)
     _title(console, "blocks")
-    partition_run(run, console)
+    partition_run(run, console, asked.device)
     _title(console, "block training")
     try:
         train_blocks(run.path, asked.watching, asked.jobs, console, asked.device)
@@ -61,7 +61,7 @@ def _measure(run: RunFolder, which: Literal["coarse", "merged"], asked: RunReque
     if is_measured(run, which, asked.lpips_weights, asked.bins):
         console.print(f"{evaluation_folder(run, which)}: already measured; nothing to do", highlight=False)
         return
-    evaluate_stage(run.path, which, asked.lpips_weights, asked.bins, console)
+    evaluate_stage(run.path, which, asked.lpips_weights, asked.bins, console, device=asked.device)
 
 
 def _verdict(run: RunFolder, console: Console) -> None:

@@ -177,10 +177,14 @@ class IntoSteps {
         !all_finite(offsets_, n * steps_.offsets.width))
       return finite_.store(false, std::memory_order_relaxed);
     int64_t rows[kLanes];
-    for (int i = 0; i < count; ++i) rows[i] = anchors_.row(first + i);
-    adam_update(steps_.features, rows, n, features_);
-    adam_update(steps_.offsets, rows, n, offsets_);
-    adam_update(steps_.log_scales, rows, n, log_scales_);
+    int32_t updates[kLanes];
+    for (int i = 0; i < count; ++i) {
+      rows[i] = anchors_.row(first + i);
+      updates[i] = ++steps_.updates[rows[i]];
+    }
+    adam_update(steps_.features, rows, n, features_, updates);
+    adam_update(steps_.offsets, rows, n, offsets_, updates);
+    adam_update(steps_.log_scales, rows, n, log_scales_, updates);
   }
 
  private:

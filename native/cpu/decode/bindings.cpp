@@ -17,8 +17,9 @@ using MaybeGradient = std::optional<Array<const float>>;
 using MaybeIndices = std::optional<Array<const int64_t>>;
 // Positions, features, offsets and log-scales.
 using AnchorTensors = std::array<Rows<const float>, 4>;
-// Parameter, first and second moment, and the factors of AdamStep in their order.
-using StepArguments = std::tuple<Rows<float>, Rows<float>, Rows<float>, std::array<double, 5>>;
+// Parameter, first and second moment, and the members of AdamStep: rates and roots, then betas and epsilon.
+using StepArguments = std::tuple<Rows<float>, Rows<float>, Rows<float>, Rows<const float>, Rows<const float>,
+                                 std::array<double, 3>>;
 
 AnchorArrays anchor_arrays(const AnchorTensors& t, const MaybeIndices& rows) {
   const int64_t total = static_cast<int64_t>(t[0].shape(0));
@@ -121,15 +122,17 @@ void backward(const AnchorTensors& tensors, const nb::list& weights, const Rows<
 }
 
 AdamRows adam_rows(const StepArguments& arguments, int width) {
-  const auto& [parameter, first, second, f] = arguments;
-  return {parameter.data(), first.data(), second.data(), static_cast<size_t>(width), {f[0], f[1], f[2], f[3], f[4]}};
+  const auto& [parameter, first, second, rates, roots, f] = arguments;
+  const AdamStep step{rates.data(), roots.data(), static_cast<int64_t>(rates.size()), f[0], f[1], f[2]};
+  return {parameter.data(), first.data(), second.data(), static_cast<size_t>(width), step};
 }
 
 bool backward_adam(const AnchorTensors& tensors, const Array<const int64_t>& rows, const nb::list& weights,
                    const Rows<const float>& camera, const Rows<const int32_t>& source,
                    const Rows<const float>& colours, const Rows<const float>& opacities,
                    const std::array<Rows<const float>, 4>& gradients, float volume,
-                   const std::array<StepArguments, 3>& steps, const std::optional<nb::list>& weights_out) {
+                   const std::array<StepArguments, 3>& steps, const Rows<int32_t>& updates,
+                   const std::optional<nb::list>& weights_out) {
   const AnchorArrays anchors = anchor_arrays(tensors, rows);
   const WeightLayout layout{anchors.k};
   const Floats packed = pack_weights(weights, layout);
@@ -139,7 +142,7 @@ bool backward_adam(const AnchorTensors& tensors, const Array<const int64_t>& row
                              gradients[3].data(), nullptr, volume, colours.data(), opacities.data(), source.data(),
                              static_cast<int64_t>(source.shape(0))};
   const AnchorSteps moves = {adam_rows(steps[0], kFeatures), adam_rows(steps[1], 3 * anchors.k),
-                             adam_rows(steps[2], 6)};
+                             adam_rows(steps[2], 6), updates.data()};
   bool finite;
   {
     const nb::gil_scoped_release unlocked;
@@ -158,6 +161,6 @@ VDGS_BIND(decode) {
   m.def("decode_backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
         nb::arg(), nb::arg().none());
   m.def("decode_backward_adam", &backward_adam, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
-        nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none());
+        nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none());
   m.attr("max_offsets") = kMaxOffsets;
 }

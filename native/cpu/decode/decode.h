@@ -39,9 +39,10 @@ struct AnchorGradients {
 void decode_backward(const AnchorArrays& anchors, WeightLayout layout, const float* weights, const Camera& camera,
                      const SplatGradients& in, const AnchorGradients& out, float* weight_gradients);
 
-// The anchors' parameters, on their way to the next step.
+// The anchors' parameters, on their way to the next step, and how many each anchor has made: counted up with them.
 struct AnchorSteps {
   AdamRows features, offsets, log_scales;
+  int32_t* updates;
 };
 
 // As decode_backward, but the visible anchors make their step of Adam as soon as their gradients are known, so

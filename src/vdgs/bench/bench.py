@@ -10,6 +10,7 @@ OUTPUT/
 from __future__ import annotations
 
 import fcntl
+import sys
 import time
 import typing
 from collections.abc import Iterator, Mapping
@@ -26,7 +27,6 @@ from vdgs.bench.grids import grids_of
 from vdgs.bench.measure import GROUPS_FILE, measure_groups
 from vdgs.bench.notes import notes_of
 from vdgs.bench.plan import Choices, Plan, PlannedRun, make_plan
-from vdgs.bench.processes import Ended, Task, run_tasks
 from vdgs.bench.renders import check_renders
 from vdgs.bench.results import Result, as_json, gather
 from vdgs.bench.seen import Seen, seen_by_model, seen_truly
@@ -34,15 +34,17 @@ from vdgs.bench.verdict import verdict
 from vdgs.bench.worker import RECORD, Job
 from vdgs.bench.writing import latex, markdown, tidy_csv
 from vdgs.captures.loading import load_capture
-from vdgs.errors import VdgsError
-from vdgs.evaluation.saving import write_json
+from vdgs.errors import Stopped, VdgsError
+from vdgs.executors.executor import Outcome, Task
+from vdgs.executors.lines import Lines
+from vdgs.executors.local import LocalExecutor
+from vdgs.executors.table import STYLES
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.keys import counted
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.plain import differences, to_dict
-from vdgs.storage.files import read_json, write_text
+from vdgs.storage.files import jsonable, read_json, write_json, write_text
 from vdgs.synth import SynthOptions, generate
-from vdgs.watching.watch import Stopped
 
 
 @dataclass(frozen=True)
@@ -87,21 +89,23 @@ def run_bench(settings: BenchSettings, console: Console) -> list[Result]:
     return results
 
 
-def _captures(plan: Plan, settings: BenchSettings, console: Console) -> tuple[dict[str, Path], dict[str, Ended]]:
+def _captures(plan: Plan, settings: BenchSettings, console: Console) -> tuple[dict[str, Path], dict[str, Outcome]]:
     """The folder of every scene, generated where there is none yet; the runs of those that cannot be had, failed."""
-    found, lost = {}, dict[str, Ended]()
+    found, lost = {}, dict[str, Outcome]()
     for scene in plan.scenes:
         try:
             found[scene.name] = _capture(scene, settings, console)
         except VdgsError as error:
             names = [run.name for run in plan.coarse + plan.runs if run.scene == scene.name]
-            lost |= {name: Ended(name, "failed", why=str(error)) for name in names}
+            lost |= {name: Outcome(name, "failed", why=str(error)) for name in names}
     if not found:
         raise VdgsError(next(iter(lost.values())).why)
     return found, lost
 
 
 def _capture(scene: Scene, settings: BenchSettings, console: Console) -> Path:
+    if scene.folder is not None:
+        return scene.folder
     if scene.capture is not None:
         if settings.data is None:
             raise VdgsError(f"{scene.name}: say where the data is: --data FOLDER. {scene.note}")
@@ -121,9 +125,9 @@ def _capture(scene: Scene, settings: BenchSettings, console: Console) -> Path:
     return folder
 
 
-def _train(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings, console: Console) -> dict[str, Ended]:
+def _train(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings, console: Console) -> dict[str, Outcome]:
     """Every run whose scene is there, trained or found finished."""
-    done, tasks = dict[str, Ended](), list[Task]()
+    done, tasks = dict[str, Outcome](), list[Task]()
     wanted = [run for run in plan.coarse + plan.runs if run.scene in captures]
     cores = psutil.cpu_count() or 1
     threads = max(1, cores // settings.jobs)
@@ -132,32 +136,43 @@ def _train(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings, co
     for run in wanted:
         job = _job(run, plan, captures[run.scene], settings, threads)
         if _is_done(settings.output, run, job.key):
-            done[run.name] = Ended(run.name, "done")
+            done[run.name] = Outcome(run.name, "done")
             continue
         _check_renders(run, plan, captures[run.scene], settings)
         stem = settings.output / "jobs" / run.name.replace("/", "__")
         job.write(stem.with_name(stem.name + ".json"))
         after = None if run.coarse_from is None else str(run.coarse_from.relative_to("runs"))
-        after = after if after not in done else None
-        tasks.append(Task(run.name, stem.with_name(stem.name + ".json"), stem.with_name(stem.name + ".log"), after))
+        command = [sys.executable, "-m", "vdgs.bench.worker", str(stem.with_name(stem.name + ".json"))]
+        output = stem.with_name(stem.name + ".log")
+        tasks.append(Task(run.name, command, output, {"OMP_WAIT_POLICY": "PASSIVE"}, after=after))
     if done:
         console.print(f"{len(done)} of {len(wanted)} runs are finished already", highlight=False)
-    left, total = len(tasks), len(tasks)
+    outcomes = LocalExecutor(settings.jobs).run(tasks, _Teller(len(tasks), console))
+    return done | {outcome.name: outcome for outcome in outcomes}
 
-    def tell(name: str, result: Ended | None) -> None:
-        nonlocal left
-        if result is None:
-            console.print(f"started  {name}", highlight=False, style="dim")
+
+class _Teller(Lines):
+    """One line when a run starts and one when it ended."""
+
+    def __init__(self, total: int, console: Console):
+        super().__init__(self._print)
+        self._left, self._total, self._console = total, total, console
+
+    def started(self, task: Task, attempt: int) -> None:
+        self.say(f"started  {task.name}", "dim")
+
+    def ended(self, task: Task, outcome: Outcome) -> None:
+        self._left -= 1
+        if outcome.state == "stopped" and not outcome.attempts:
             return
-        left -= 1
-        style = {"done": "green", "failed": "red", "stopped": "yellow"}[result.state]
-        console.print(
-            f"{result.state:8} {name}  {result.seconds:.0f} s  ({total - left} of {total}) {result.why}",
-            style=style, highlight=False, markup=False,
-        )  # fmt: skip
-        console.file.flush()  # also into a file that someone follows
+        count = f"({self._total - self._left} of {self._total})"
+        self.say(
+            f"{outcome.state:8} {task.name}  {outcome.seconds:.0f} s  {count} {outcome.why}", STYLES[outcome.state]
+        )
 
-    return done | run_tasks(tasks, settings.jobs, tell)
+    def _print(self, text: str, style: str) -> None:
+        self._console.print(text, style=style, highlight=False, markup=False)
+        self._console.file.flush()  # also into a file that someone follows
 
 
 def _check_renders(run: PlannedRun, plan: Plan, capture: Path, settings: BenchSettings) -> None:
@@ -192,7 +207,7 @@ def _job(run: PlannedRun, plan: Plan, capture: Path, settings: BenchSettings, th
     return Job(
         capture.resolve(), options, to_dict(run.config), run.stages, (settings.output / run.folder).resolve(),
         None if run.coarse_from is None else (settings.output / run.coarse_from).resolve(),
-        run.key({"options": options, "scene": dict(scene.synth) or scene.capture}, measured),
+        run.key({"options": options, "scene": dict(scene.synth or scene.contents) or scene.capture}, measured),
         settings.lpips_weights and settings.lpips_weights.resolve(), settings.bins, threads,
         threads if settings.jobs == 1 else 1, settings.redo,
         run.renders and run.renders.resolve(),
@@ -213,10 +228,10 @@ def _is_done(output: Path, run: PlannedRun, key: str) -> bool:
 
 
 def _measure(
-    plan: Plan, captures: Mapping[str, Path], ended: Mapping[str, Ended], settings: BenchSettings, console: Console
-) -> dict[str, Ended]:
+    plan: Plan, captures: Mapping[str, Path], ended: Mapping[str, Outcome], settings: BenchSettings, console: Console
+) -> dict[str, Outcome]:
     """Groups by visibility of every finished run, scene by scene; runs that cannot be measured, as failed."""
-    failed = dict[str, Ended]()
+    failed = dict[str, Outcome]()
     for scene in [scene for scene in plan.scenes if scene.name in captures]:
         done = [run for run in plan.runs if run.scene == scene.name and ended[run.name].state == "done"]
         if not done:
@@ -235,11 +250,13 @@ def _measure(
                     lambda text, scene=scene, status=status: status.update(f"{scene.name}: {text}"),  # type: ignore[misc]
                 )  # fmt: skip
         except VdgsError as error:
-            failed |= {run.name: Ended(run.name, "failed", why=str(error)) for run in done}
+            failed |= {run.name: Outcome(run.name, "failed", why=str(error)) for run in done}
     return failed
 
 
-def _seen(plan: Plan, scene: Scene, capture: Path, ended: Mapping[str, Ended], settings: BenchSettings) -> Seen | None:
+def _seen(
+    plan: Plan, scene: Scene, capture: Path, ended: Mapping[str, Outcome], settings: BenchSettings
+) -> Seen | None:
     """By truth where the capture has it, else by a reference model; None without either."""
     truly = seen_truly(capture, _options(scene, settings))
     if truly is not None:
@@ -255,12 +272,12 @@ def _write(plan: Plan, results: list[Result], settings: BenchSettings, console: 
     output.mkdir(exist_ok=True)
     write_json(
         output / "results.json",
-        {
+        jsonable({
             "table": plan.table.name, "title": plan.table.title, "seeds": plan.seeds,
             "budgets": {name: vars(budget) | {"total": budget.total} for name, budget in plan.budgets.items()},
-            "choices": vars(settings.choices), "results": as_json(results),
+            "choices": to_dict(settings.choices), "results": as_json(results),
             "verdict": [vars(line) for line in lines],
-        },
+        }),
     )  # fmt: skip
     text = "\n".join(map(str, lines)) or "This table asks no question."
     drawn = draw_groups(output / "groups.png", plan, results)

@@ -72,7 +72,7 @@ class Method:
 
 @dataclass(frozen=True)
 class Scene:
-    """A place to reconstruct: generated (`synth`) or a folder under --data (`capture`)."""
+    """A place to reconstruct: generated (`synth`), a folder under --data (`capture`) or any folder (`folder`)."""
 
     name: str
     title: str
@@ -80,6 +80,9 @@ class Scene:
     preset: PresetName = "laptop"
     #: Path below --data; None for a generated scene.
     capture: str | None = None
+    #: Where it lies, if it was given as a folder, and its fingerprint (`captures.facts`): folders may share a name.
+    folder: Path | None = None
+    contents: Mapping[str, int] = field(default_factory=dict)
     #: SynthOptions by name.
     synth: Mapping[str, Any] = field(default_factory=dict)
     #: CaptureOptions by name.

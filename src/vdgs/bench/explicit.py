@@ -29,12 +29,12 @@ def gaussians_config(method: MethodConfig) -> GaussiansConfig:
 
 def train_explicit(run: RunFolder, capture: Capture, lpips_weights: Path | None, console: Console) -> None:
     """Train, or continue, 3DGS for the settings of a run and measure it. What was trained for other settings or on
-    another choice of photographs goes first (that it may go was asked before: `RunFolder.change`).
+    another choice of photographs goes first (that it may go was asked before: `RunFolder.change_settings`).
 
     Raises what `run_gaussians` raises.
     """
     config = gaussians_config(run.method())
     made_for = json.dumps([run.keys().coarse, to_dict(config)], sort_keys=True)
     with run.locked():
-        run.gaussians.claim(hashlib.sha256(made_for.encode()).hexdigest()[:16])
+        run.gaussians.discard_unless(hashlib.sha256(made_for.encode()).hexdigest()[:16])
     run_gaussians(run, capture, config, console, lpips_weights=lpips_weights)

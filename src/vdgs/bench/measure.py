@@ -23,8 +23,8 @@ from vdgs.evaluation import metrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
 from vdgs.evaluation.colour import correct_colours
 from vdgs.evaluation.of_run import EVALUATION_IMAGES_BYTES
-from vdgs.evaluation.saving import file_stems, jsonable
-from vdgs.storage.files import read_json, write_json
+from vdgs.evaluation.saving import file_stems
+from vdgs.storage.files import jsonable, read_json, write_json
 
 #: In a run folder: its figures by visibility, and the V and the key of the run that they hold for.
 GROUPS_FILE = "by_visibility.json"

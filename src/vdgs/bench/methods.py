@@ -71,7 +71,11 @@ def as_printed(config: MethodConfig, _budget: Budget) -> MethodConfig:
         config,
         assignment=replace(config.assignment, threshold=plain.assignment.threshold),
         block=replace(
-            plain.block, iterations=scene.iterations, scale_iterations=scene.scale_iterations, growth=scene.growth
+            plain.block,
+            iterations=scene.iterations,
+            scale_iterations=scene.scale_iterations,
+            growth=scene.growth,
+            max_anchors_total=scene.max_anchors_total,
         ),
     )
 
@@ -183,7 +187,7 @@ def _sweep(
 #: What the partitions leave out beyond what `partition.strategies` says of each.
 _COMMON = ("training schedule and losses of their own: blocks are trained as ours, but with plain growth",)
 _3DGS = "Kerbl et al., 3D Gaussian Splatting for Real-Time Radiance Field Rendering, SIGGRAPH 2023"
-#: As the docstring of `comparators.gaussians` has it.
+#: As the docstring of `comparators.gaussians.run` has it.
 _3DGS_LEAVES_OUT = (
     "pruning by footprint in the image (its section 5.2)",
     "its own image formation (alpha at most 0.999, near plane at 0.01 and extent by opacity are as for all methods)",
@@ -195,7 +199,7 @@ _3DGS_SCHEDULE = (
     f"often than every {LEAST_INTERVAL} iterations"
 )
 _ABLATIONS = [
-    Method("full", "VDGS (full)", full, cites="VDGS, sections III-B and III-C"),
+    Method("full", "VDGS (full)", full, cites="VDGS, sections IV-B and IV-C"),
     Method("baseline", "baseline: coarse alone", coarse_alone, COARSE_ONLY, cites="VDGS, Table II (a)"),
     Method(
         "baseline-mean",
@@ -217,7 +221,7 @@ _ABLATIONS = [
         "printed",
         "VDGS, blocks as printed",
         as_printed,
-        cites="VDGS, sections III-B and III-C",
+        cites="VDGS, sections IV-B and IV-C",
         differs="blocks of the paper: frozen decoder, even use of photographs, damped rates, full size, no mean of "
         "models, whole photographs, share of 0.45, its compensation; growth, coarse stage and cut as `full`",
     ),

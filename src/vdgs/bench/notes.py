@@ -82,8 +82,9 @@ def _limit(plan: Plan) -> str:
     """--max-anchors, for methods with anchors and for 3DGS."""
     per_anchor = plan.runs[0].config.training.anchors.offsets
     return (
-        f"At most {plan.max_anchors:,} anchors for a whole scene (a block its share of them); for 3DGS {per_anchor} "
-        f"Gaussians for each of them, {plan.max_anchors * per_anchor:,}, as many as they decode to."
+        f"At most {plan.max_anchors:,} anchors for a whole scene, or as many as it starts with (a block may grow to "
+        "its share, in proportion to the coarse anchors it owns; nothing is removed to keep to it); for 3DGS "
+        f"{per_anchor} Gaussians for each of them, {plan.max_anchors * per_anchor:,}, as many as they decode to."
     )
 
 

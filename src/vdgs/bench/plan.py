@@ -5,18 +5,19 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from vdgs.bench.definitions import EXPLICIT, Budget, Method, Scene, Table
 from vdgs.bench.explicit import gaussians_config
+from vdgs.bench.folders import scenes_of
 from vdgs.bench.methods import METHODS
 from vdgs.bench.renders import folder_of, foreign_method, identity
-from vdgs.bench.scenes import SCENES
 from vdgs.bench.tables import TABLES
 from vdgs.errors import VdgsError
 from vdgs.runs.keys import counted
+from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.checks import validate
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import to_dict
@@ -35,6 +36,8 @@ class Choices:
     validation: bool = False
     #: NAME=FOLDER of renders by other programs.
     renders: tuple[str, ...] = ()
+    #: How scenes that are folders are read; `validation` above is that of all scenes.
+    options: CaptureOptions = field(default_factory=CaptureOptions)
 
 
 @dataclass(frozen=True)
@@ -98,10 +101,11 @@ class Plan:
 
 
 def make_plan(name: str, choices: Choices) -> Plan:
-    """Raises VdgsError for a scene or method that does not exist and for settings that do not work."""
+    """Raises VdgsError for a scene or method that does not exist and for settings that do not work, CaptureError for a
+    folder that is no capture."""
     table = TABLES[name]
-    scenes = tuple(_named(SCENES, each, "scene") for each in choices.scenes or table.scenes)
-    methods = tuple(_named(METHODS, each, "method") for each in choices.methods or table.methods)
+    scenes = scenes_of(choices.scenes or table.scenes, choices.options, choices.validation)
+    methods = tuple(_method(each) for each in choices.methods or table.methods)
     seeds = table.seeds if choices.seeds is None else tuple(range(choices.seeds))
     if not seeds:
         raise VdgsError("--seeds must be at least 1")
@@ -157,10 +161,10 @@ def _digest(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
-def _named(known: Mapping[str, Any], name: str, kind: str) -> Any:
-    if name not in known:
-        raise VdgsError(f"there is no {kind} {name!r}. There are: {', '.join(known)}")
-    return known[name]
+def _method(name: str) -> Method:
+    if name not in METHODS:
+        raise VdgsError(f"there is no method {name!r}. There are: {', '.join(METHODS)}")
+    return METHODS[name]
 
 
 def _budget(scene: Scene, choices: Choices) -> Budget:
@@ -173,24 +177,19 @@ def _budget(scene: Scene, choices: Choices) -> Budget:
 
 
 def _limited(config: MethodConfig, choices: Choices) -> MethodConfig:
-    """With --max-anchors: a scene may hold so many, a block its share of them."""
+    """With --max-anchors: a scene may hold so many, all its blocks together too."""
     if not choices.max_anchors:
         return config
     training, block = config.training, config.block
     return replace(
         config,
         training=replace(training, growth=replace(training.growth, max_anchors=choices.max_anchors)),
-        block=replace(block, growth=replace(block.growth, max_anchors=choices.max_anchors)),
+        block=replace(block, max_anchors_total=choices.max_anchors),
     )
 
 
 def _planned(scene: Scene, method: Method, budget: Budget, base: MethodConfig, seed: int) -> PlannedRun:
     config = method.settings(base, budget)
-    if config.block.growth.max_anchors and config.partition.blocks != "auto":
-        share = -(-config.block.growth.max_anchors // config.partition.blocks)
-        config = replace(
-            config, block=replace(config.block, growth=replace(config.block.growth, max_anchors=share))
-        )  # fmt: skip
     problems = validate(config)
     if problems:
         raise VdgsError(f"{method.name} on {scene.name}: these settings do not work:\n  " + "\n  ".join(problems))

@@ -10,9 +10,9 @@ from typing import Any
 from vdgs.bench.definitions import EXPLICIT
 from vdgs.bench.measure import GROUPS_FILE, evaluated
 from vdgs.bench.plan import Plan, PlannedRun
-from vdgs.bench.processes import Ended
 from vdgs.bench.worker import RECORD
 from vdgs.errors import VdgsError
+from vdgs.executors.executor import Outcome
 from vdgs.runs.folder import RunFolder
 from vdgs.storage.files import read_json
 
@@ -40,7 +40,7 @@ class Result:
     seen_by: str = ""
 
 
-def gather(plan: Plan, output: Path, ended: Mapping[str, Ended]) -> list[Result]:
+def gather(plan: Plan, output: Path, ended: Mapping[str, Outcome]) -> list[Result]:
     """The results of every (scene, method, seed) of a plan, from its run folders."""
     results = []
     for (scene, method, seed), run in plan.answers.items():
@@ -92,25 +92,20 @@ def _costs(run: RunFolder, names: Sequence[str], stages: Mapping[str, float]) ->
     blocks = "blocks" in names
     coarse = (run.gaussians if tuple(names) == EXPLICIT else run.coarse).status()
     trained = [folder.status() for folder in run.block_folders()] if blocks else []
-    rows = run.partition_facts().get("blocks", []) if blocks else []
-    seconds = [float(each.get("seconds") or 0) for each in trained]
-    peaks = [each.get("peak_memory_bytes") or 0 for each in [coarse, *trained]]
+    rows = run.partition_record().blocks if blocks else ()
+    seconds = [float(each.seconds or 0) for each in trained]
+    peaks = [each.peak_memory_bytes or 0 for each in [coarse, *trained]]
     return {
-        "iterations": coarse.get("iteration", 0) + sum(each.get("iteration", 0) for each in trained),
-        "photographs": _drawn(coarse) + sum(_drawn(each) for each in trained),
-        "coarse_seconds": coarse.get("seconds"),
+        "iterations": (coarse.iteration or 0) + sum(each.iteration or 0 for each in trained),
+        "photographs": coarse.photographs_drawn + sum(each.photographs_drawn for each in trained),
+        "coarse_seconds": coarse.seconds,
         "block_seconds": sum(seconds) if blocks else None,
         "longest_block_seconds": max(seconds, default=None),
-        "seconds": float(coarse.get("seconds") or 0) + sum(seconds),
+        "seconds": float(coarse.seconds or 0) + sum(seconds),
         "partition_seconds": stages.get("partition"),
         "peak_memory_bytes": max(peaks),
         "block_memory_bytes": max(peaks[1:], default=None),
         "blocks": len(trained) if blocks else None,
-        "coarse_anchors": coarse.get("anchors"),
-        "cameras_per_block": sum(row["cameras"] for row in rows) / len(rows) if rows else None,
+        "coarse_anchors": coarse.anchors,
+        "cameras_per_block": sum(row.cameras for row in rows) / len(rows) if rows else None,
     }
-
-
-def _drawn(status: Mapping[str, Any]) -> float:
-    """How many photographs' worth of pixels a stage drew: fewer than its steps where these draw parts."""
-    return float(status.get("photographs", status.get("iteration", 0)))

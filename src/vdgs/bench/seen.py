@@ -64,4 +64,4 @@ def _where_seen(
 def seen_by_model(reference: Path) -> Seen:
     """V as the coarse model of a run draws it. Raises RunError if it is not trained."""
     opened = open_run(reference, "coarse")
-    return Seen(opened.capture, visibility_map(opened), "model", str(opened.status.get("model")))
+    return Seen(opened.capture, visibility_map(opened), "model", str(opened.status.model))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vdgs.errors import VdgsError
+from vdgs.errors import Stopped, VdgsError
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import from_dict
 from vdgs.storage.files import read_json, write_json
@@ -146,13 +146,11 @@ def take_coarse(source: Path, target: Path) -> None:
 
 def work(job: Job) -> None:
     """All stages of a job, noting how long each took; the record says done only at the end."""
-    import torch
     from rich.console import Console
 
-    from vdgs.kernels.native.module import set_threads
+    from vdgs.kernels import set_threads
 
     set_threads(job.threads)
-    torch.set_num_threads(job.threads)
     working = _Working(job, *_opened(job), Console(soft_wrap=True))
     record = _record(job)
     write_json(job.output / RECORD, record)  # what an interrupted run leaves is not what it was before
@@ -198,7 +196,7 @@ def main(arguments: list[str]) -> int:
         work(Job.read(Path(arguments[0])))
     except VdgsError as error:
         print(f"vdgs bench: {error}", file=sys.stderr)
-        return 130 if getattr(error, "stopped", False) else 1
+        return 130 if isinstance(error, Stopped) else 1
     except KeyboardInterrupt:
         return 130
     return 0

@@ -39,10 +39,6 @@ class GroundFrame:
         """Source points [n, 3] to the ground frame."""
         return self.scale * points @ self.rotation.T + self.translation
 
-    def to_source(self, points: np.ndarray) -> np.ndarray:
-        """The inverse of `to_ground`."""
-        return ((points - self.translation) / self.scale) @ self.rotation
-
 
 @dataclass(frozen=True, eq=False)
 class View:

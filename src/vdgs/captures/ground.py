@@ -11,7 +11,7 @@ Where the up axis and the scale come from, in this order:
 
 All arithmetic is float64. Choice: in a frame that is not georeferenced the origin is the median sparse point,
 so z = 0 is the median height of the ground; where metres are unknown the median camera flies at
-`CAMERA_HEIGHT`.
+`CAMERA_HEIGHT`, or is so far from the points where it is not above them (`heights`).
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from vdgs.captures.capture import GroundFrame
 from vdgs.captures.formats.source import KnownWorld, SourceCapture
 from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.captures.georeference import match_gps, read_georef, read_gps
+from vdgs.captures.heights import reach
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
 
@@ -218,18 +219,15 @@ def rotation_to_z(up: np.ndarray) -> np.ndarray:
 
 def _unscaled(scene: _Scene, rotation: np.ndarray, how: str, warnings: list[str]) -> GroundFrame:
     """A frame without metres: the median camera flies at `CAMERA_HEIGHT` above the median point."""
-    heights = scene.centres @ rotation[2]
-    height = float(np.median(heights) - np.median(scene.points @ rotation[2]))
-    distance = float(np.median(np.linalg.norm(scene.centres - geometric_median(scene.points), axis=1)))
-    if height <= 0.02 * distance:
+    length, is_height = reach(scene.centres, scene.points, rotation[2])
+    if not is_height:
         warnings.append(
             "the cameras are not above the points; the scale is set by their distance instead. "
             "If the scene is upside down, give --up."
         )
-        height = distance
-    if not height > 0:
+    if not length > 0:
         raise CaptureError("all cameras and points lie in one place; this is no scene. Check the sparse model.")
-    return _centred(scene, rotation, CAMERA_HEIGHT / height, False, f"{how}; median camera height = 10 units")
+    return _centred(scene, rotation, CAMERA_HEIGHT / length, False, f"{how}; median camera height = 10 units")
 
 
 def _promised(scene: _Scene, world: KnownWorld, warnings: list[str]) -> GroundFrame:

@@ -17,7 +17,7 @@ from vdgs.captures.formats.transforms import read_transforms
 from vdgs.captures.ground import find_ground_frame, transform_pose
 from vdgs.captures.photographs import Names, find_images, find_mask, read_header
 from vdgs.captures.splits import choose_splits, nearest_to_middle
-from vdgs.captures.undistortion import Photograph, undistort
+from vdgs.captures.undistortion import ImageFile, undistort
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
 
@@ -26,11 +26,11 @@ FAR_POINT = 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Photograph:
+class _FoundView:
     """A view whose image was found."""
 
     view: SourceView
-    file: Photograph
+    file: ImageFile
 
 
 def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
@@ -170,7 +170,7 @@ def _without_bad_points(source: SourceCapture, warnings: list[str]) -> SourceCap
 
 def _find_photographs(
     root: Path, source: SourceCapture, options: CaptureOptions, warnings: list[str]
-) -> list[_Photograph]:
+) -> list[_FoundView]:
     """Every view with its image file; images without a camera become a warning, the reverse an error."""
     folder = root / source.images
     available = Names(find_images(folder)) if folder.is_dir() else Names({})
@@ -199,13 +199,13 @@ def _find_photographs(
     return _fitted(root, source, paths, options)
 
 
-def _fitted(root: Path, source: SourceCapture, paths: list[Path], options: CaptureOptions) -> list[_Photograph]:
+def _fitted(root: Path, source: SourceCapture, paths: list[Path], options: CaptureOptions) -> list[_FoundView]:
     """The views with their images, masks and intrinsics at the images' sizes; collects what does not fit."""
     photographs, problems = [], []
     for view, path in zip(source.views, paths, strict=True):
         mask = view.mask_path or find_mask(root / options.masks, view.name)
         try:
-            photographs.append(_Photograph(view, Photograph(view.name, path, mask, fit_to_image(view, path))))
+            photographs.append(_FoundView(view, ImageFile(view.name, path, mask, fit_to_image(view, path))))
         except CaptureError as error:
             problems.append(str(error))
     if len(problems) > 1:
@@ -248,8 +248,8 @@ def scaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
 
 
 def _undistorted(
-    root: Path, photographs: list[_Photograph], options: CaptureOptions, warnings: list[str]
-) -> list[_Photograph]:
+    root: Path, photographs: list[_FoundView], options: CaptureOptions, warnings: list[str]
+) -> list[_FoundView]:
     """Pinhole photographs only: undistorts on request, else refuses lens distortion."""
     bent = [photo for photo in photographs if photo.file.intrinsics.distorted]
     if not bent:
@@ -264,10 +264,10 @@ def _undistorted(
     folder = options.undistorted_folder or root / "undistorted" / (options.images or "images")
     straight = undistort(folder, [photo.file for photo in photographs])
     warnings.append(f"{len(bent)} photographs were undistorted into {folder}.")
-    return [_Photograph(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
+    return [_FoundView(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
 
 
-def _view(photo: _Photograph, options: CaptureOptions, ground: GroundFrame) -> View:
+def _view(photo: _FoundView, options: CaptureOptions, ground: GroundFrame) -> View:
     intrinsics = photo.file.intrinsics
     (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.principal_point
     width, height = intrinsics.width, intrinsics.height

@@ -20,7 +20,7 @@ JPEG_QUALITY = 95
 
 
 @dataclass(frozen=True)
-class Photograph:
+class ImageFile:
     """A photograph on disk: name, image, mask where there is one, intrinsics at the image's size."""
 
     name: str
@@ -29,7 +29,7 @@ class Photograph:
     intrinsics: Intrinsics
 
 
-def undistort(folder: Path, photographs: list[Photograph]) -> list[Photograph]:
+def undistort(folder: Path, photographs: list[ImageFile]) -> list[ImageFile]:
     """Pinhole versions of the photographs and their masks.
 
     Files are written under `folder`, each image beside a small JSON that says from which files, of which
@@ -39,7 +39,7 @@ def undistort(folder: Path, photographs: list[Photograph]) -> list[Photograph]:
     """
     targets = {photo.intrinsics: pinhole_for(photo.intrinsics) for photo in photographs if photo.intrinsics.distorted}
 
-    def one(photo: Photograph) -> Photograph:
+    def one(photo: ImageFile) -> ImageFile:
         target = targets.get(photo.intrinsics)
         return photo if target is None else _undistort_one(folder, photo, target)
 
@@ -82,7 +82,7 @@ def sampling_map(distorted: Intrinsics, pinhole: Intrinsics) -> np.ndarray:
     return (pixels - 0.5).reshape(pinhole.height, pinhole.width, 2).astype(np.float32)
 
 
-def _undistort_one(folder: Path, photo: Photograph, pinhole: Intrinsics) -> Photograph:
+def _undistort_one(folder: Path, photo: ImageFile, pinhole: Intrinsics) -> ImageFile:
     plain = photo.name if photo.name.lower().endswith((".jpg", ".jpeg")) else photo.name + ".jpg"
     target = folder / plain
     mask_target, stamp_file = (target.with_name(target.name + suffix) for suffix in (".mask.png", ".json"))
@@ -97,10 +97,10 @@ def _undistort_one(folder: Path, photo: Photograph, pinhole: Intrinsics) -> Phot
         _write(stamp_file, json.dumps({"made_from": stamp, "mask": keep}).encode())
         known = {"mask": keep}
     mask = mask_target if known.get("mask") and mask_target.is_file() else None
-    return Photograph(photo.name, target, mask, pinhole)
+    return ImageFile(photo.name, target, mask, pinhole)
 
 
-def _write_straight(photo: Photograph, pinhole: Intrinsics, target: Path, mask_target: Path) -> bool:
+def _write_straight(photo: ImageFile, pinhole: Intrinsics, target: Path, mask_target: Path) -> bool:
     """Write the straightened image, and its mask if there is one (from a file or from transparency)."""
     pixels, keep = decode_photograph(photo.path)
     if photo.mask is not None:

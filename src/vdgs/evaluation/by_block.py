@@ -38,10 +38,10 @@ def label_map(drawn: Raster, camera: Camera, blocks: Blocks) -> Int16[np.ndarray
     """
     if drawn.depth is None:
         raise ValueError("labels need a render with depth")
-    alpha = drawn.alpha.double().numpy()
+    alpha = drawn.alpha.double().cpu().numpy()
     seen = alpha > DRAWN_ALPHA
     labels = np.full(alpha.shape, NOTHING, np.int16)
-    depth = drawn.depth.double().numpy()[seen] / alpha[seen]
+    depth = drawn.depth.double().cpu().numpy()[seen] / alpha[seen]
     labels[seen] = blocks.owner(_back_projected(np.argwhere(seen), depth, camera)[:, :2])
     return labels
 

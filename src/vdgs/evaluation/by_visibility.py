@@ -1,6 +1,6 @@
 """Quality by visibility: the claim is about poorly seen places, so it is measured there.
 
-V is the number of training cameras that see a place (section III-B); rendered per pixel it is a map
+V is the number of training cameras that see a place (section IV-B); rendered per pixel it is a map
 [h, w], NaN where the model shows nothing. Pixels of all test views are pooled and cut into quantiles
 of V. Nothing is kept but a histogram: one pass, memory bounded whatever the number of test views.
 """

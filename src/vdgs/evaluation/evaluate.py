@@ -31,8 +31,9 @@ from vdgs.evaluation import metrics, pictures, saving
 from vdgs.evaluation.by_visibility import QUANTILE_BINS, VisibilityHistogram, mean_or_none, view_bins
 from vdgs.evaluation.colour import correct_colours
 from vdgs.evaluation.lpips import MIN_SIDE_PX, Lpips
-from vdgs.evaluation.photographs import Photographs
+from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.tables import metrics_table
+from vdgs.storage.files import jsonable, write_json
 
 RAW = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")
 CORRECTED = tuple(f"{name}_cc" for name in RAW)
@@ -91,7 +92,7 @@ class EvaluationSettings:
 class _Inputs:
     """What every view is measured with."""
 
-    photographs: Photographs
+    photographs: ReferenceViews
     model: MeasuredModel
     lpips: Lpips | None
     settings: EvaluationSettings
@@ -118,7 +119,7 @@ class _Pair:
 
 
 def evaluate(
-    photographs: Photographs,
+    photographs: ReferenceViews,
     model: MeasuredModel,
     output: Path,
     *,
@@ -186,7 +187,7 @@ def _evaluate_view(view: View, stem: str, on_sheet: bool, inputs: _Inputs, gathe
 
 
 def _photograph(
-    view: View, photographs: Photographs
+    view: View, photographs: ReferenceViews
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
     reference, mask = photographs.load_image(view), photographs.load_mask(view)
     wanted = (view.camera.height, view.camera.width)
@@ -308,7 +309,7 @@ def _summary(
         settings.title.replace(" ", "_"): len(rows),
         "notes": notes,
     }
-    return saving.jsonable(result)
+    return jsonable(result)
 
 
 def _write(output: Path, result: Mapping[str, Any], gathered: _Gathered, title: str) -> None:
@@ -319,5 +320,5 @@ def _write(output: Path, result: Mapping[str, Any], gathered: _Gathered, title: 
         ssim = "SSIM –" if result["ssim"] is None else f"SSIM {result['ssim']:.3f}"
         sheet = pictures.contact_sheet(gathered.cells, f"{shown} {title} · {psnr} · {ssim}")
         saving.write_png(output / "contact_sheet.png", np.asarray(sheet))
-    saving.write_json(output / "per_view.json", gathered.rows)
-    saving.write_json(output / "metrics.json", result)  # last: where it stands, the rest is complete
+    write_json(output / "per_view.json", jsonable(gathered.rows))
+    write_json(output / "metrics.json", result)  # last: where it stands, the rest is complete

@@ -41,18 +41,6 @@ def psnr_of(mean_squared_error: float) -> float:
     return float(-10.0 * np.log10(mean_squared_error))
 
 
-def psnr(
-    image: UInt8[np.ndarray, "h w 3"],
-    reference: UInt8[np.ndarray, "h w 3"],
-    mask: Bool[np.ndarray, "h w"] | None = None,
-) -> float:
-    """Peak signal-to-noise ratio in dB over all kept pixels and channels.
-
-    inf for identical images, NaN where the mask keeps nothing.
-    """
-    return psnr_of(masked_mean(squared_error(image, reference), mask))
-
-
 def ssim_map(
     image: UInt8[np.ndarray, "h w 3"],
     reference: UInt8[np.ndarray, "h w 3"],
@@ -69,15 +57,6 @@ def ssim_map(
     for channel in range(3):
         total += _ssim_channel(shown[..., channel] / 255.0, reference[..., channel] / 255.0)
     return total / 3.0
-
-
-def ssim(
-    image: UInt8[np.ndarray, "h w 3"],
-    reference: UInt8[np.ndarray, "h w 3"],
-    mask: Bool[np.ndarray, "h w"] | None = None,
-) -> float:
-    """Mean of `ssim_map` over the kept pixels; NaN where the mask keeps nothing."""
-    return masked_mean(ssim_map(image, reference, mask), mask)
 
 
 def shown_within(

@@ -17,7 +17,7 @@ from vdgs.captures.images import ImageCache
 from vdgs.errors import RunError
 from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import load_lpips
-from vdgs.evaluation.photographs import Photographs
+from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import render, render_values
 from vdgs.runs.folder import RunFolder
@@ -27,7 +27,7 @@ from vdgs.runs.visibility import visibility_of_run
 #: Photographs kept decoded during an evaluation, which needs one at a time.
 EVALUATION_IMAGES_BYTES = 256_000_000
 
-#: What to measure on. Training views say what a model has learnt by heart: good there and not on the test views.
+#: What to measure on. A model that is good on training views and not on test views overfits.
 Views = Literal["test", "training"]
 
 
@@ -43,8 +43,8 @@ def evaluate_run(
         model=run.name,
         n_anchors=len(run.model.anchors),
         model_bytes=run.model_path.stat().st_size,
-        train_seconds=run.status.get("seconds"),
-        peak_memory_bytes=run.status.get("peak_memory_bytes"),
+        train_seconds=run.status.seconds,
+        peak_memory_bytes=run.status.peak_memory_bytes,
     )
     model = MeasuredModel(lambda camera: render(run.model, camera), visibility_map(run), facts)
     chosen = run.capture.test_views if views == "test" else run.capture.train_views
@@ -58,7 +58,7 @@ def evaluate_run(
 
 
 @contextmanager
-def cached_photographs(views: Sequence[View]) -> Iterator[Photographs]:
+def cached_photographs(views: Sequence[View]) -> Iterator[ReferenceViews]:
     """The photographs and masks of views, decoded when they are asked for."""
     index = {view.name: i for i, view in enumerate(views)}
     with ImageCache(views, EVALUATION_IMAGES_BYTES) as images:
@@ -67,7 +67,7 @@ def cached_photographs(views: Sequence[View]) -> Iterator[Photographs]:
             mask = images.get(index[view.name]).mask
             return None if mask is None else mask.numpy() > 0
 
-        yield Photographs(views, lambda view: images.get(index[view.name]).image.numpy(), load_mask)
+        yield ReferenceViews(views, lambda view: images.get(index[view.name]).image.numpy(), load_mask)
 
 
 def evaluation_folder(run: RunFolder, name: str, views: Views = "test") -> Path:
@@ -82,8 +82,9 @@ def visibility_map(run: TrainedRun) -> Callable[[Camera], np.ndarray]:
 
     So the same pixels are compared between the models of a run.
     """
-    coarse = (
-        run if run.name == "coarse" else replace(run, model=AnchorModel.load(run.folder.coarse.model), name="coarse")
-    )
+    coarse = run
+    if run.name != "coarse":
+        model = AnchorModel.load(run.folder.coarse.model).to(run.device)
+        coarse = replace(run, model=model, name="coarse")
     visibility = visibility_of_run(coarse).float()
-    return lambda camera: render_values(coarse.model, visibility, camera).numpy()
+    return lambda camera: render_values(coarse.model, visibility, camera).cpu().numpy()

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from vdgs.errors import VdgsError
-from vdgs.storage import files
+from vdgs.storage.files import write_bytes
 
 _LONGEST_NAME = 120
 
@@ -23,25 +21,7 @@ def write_png(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
     done, content = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
     if not done:
         raise VdgsError(f"{path} cannot be encoded as PNG from an image of size {list(picture.shape)}.")
-    files.write_bytes(path, content.tobytes())
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Strict JSON, atomically: what is not a finite number becomes null."""
-    files.write_json(path, jsonable(value))
-
-
-def jsonable(value: Any) -> Any:
-    """The value with numpy scalars as Python numbers and NaN or infinity as None."""
-    if isinstance(value, Mapping):
-        return {str(key): jsonable(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [jsonable(each) for each in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    write_bytes(path, content.tobytes())
 
 
 def file_stems(names: Sequence[str]) -> list[str]:

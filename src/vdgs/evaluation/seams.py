@@ -34,10 +34,11 @@ from vdgs.evaluation.by_block import (
     label_map,
 )
 from vdgs.evaluation.metrics import masked_mean, psnr_of, squared_error, to_8bit
-from vdgs.evaluation.photographs import Photographs
+from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.tables import shown
 from vdgs.kernels.types import Raster
 from vdgs.partition.blocks import Blocks
+from vdgs.storage.files import jsonable, write_json
 
 #: Renders that are measured by block: without blocks, the block as it was trained, all blocks together.
 RENDERS = ("coarse", "alone", "merged")
@@ -70,7 +71,7 @@ class SeamView:
 class _Inputs:
     """Where the images of a view come from."""
 
-    photographs: Photographs
+    photographs: ReferenceViews
     render_coarse: Callable[[Camera], Raster]
     render_merged: Callable[[Camera], Raster]
     render_block: Callable[[int, Camera], Raster | None]
@@ -88,7 +89,7 @@ class _Gathered:
 
 
 def evaluate_blocks(
-    photographs: Photographs,
+    photographs: ReferenceViews,
     render_coarse: Callable[[Camera], Raster],
     render_merged: Callable[[Camera], Raster],
     render_block: Callable[[int, Camera], Raster | None],
@@ -109,7 +110,7 @@ def evaluate_blocks(
     gathered = _Gathered(BlockMetrics(len(blocks), RENDERS))
     for view, stem in zip(views, saving.file_stems([view.name for view in views]), strict=True):
         _measure(view, stem, inputs, gathered)
-    result = saving.jsonable(
+    result = jsonable(
         {
             "blocks": gathered.by_block.rows(),
             "all": gathered.by_block.everywhere(),
@@ -119,7 +120,7 @@ def evaluate_blocks(
     )
     for seen in gathered.worth_seeing:
         saving.write_png(output / "seams" / f"{seen.stem}.png", np.asarray(seam_picture(seen)))
-    saving.write_json(output / "by_block.json", result)  # last: where it stands, the pictures are complete
+    write_json(output / "by_block.json", result)  # last: where it stands, the pictures are complete
     return result
 
 

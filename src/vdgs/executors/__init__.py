@@ -1,1 +1,1 @@
-"""Where blocks are trained: commands that can be repeated, started side by side and watched through their files."""
+"""Commands that can be repeated, run side by side by an engine (`executor`) and watched through their files."""

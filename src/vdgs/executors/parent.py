@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 
-#: Environment variable with the process id of the driver; set for each job that a driver starts.
+#: Environment variable with the process id of the driver; set for each task that a driver starts.
 PARENT = "VDGS_PARENT"
 
 
@@ -16,7 +16,7 @@ def stop_when_parent_dies(poll_seconds: float = 1.0) -> threading.Thread | None:
 
     Does nothing (None) where no driver did. The variable is removed, so that processes which this one starts do not
     take its parent for theirs. Polling is enough and, unlike PR_SET_PDEATHSIG, works on every POSIX system, needs no
-    code between fork and exec, and does not end the job with the driver's thread.
+    code between fork and exec, and does not end the task with the driver's thread.
     """
     try:
         parent = int(os.environ.pop(PARENT, ""))

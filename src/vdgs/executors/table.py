@@ -1,4 +1,4 @@
-"""What a person sees of jobs that run side by side: a live table on a terminal, lines elsewhere."""
+"""What a person sees of blocks that run side by side: a live table on a terminal, lines elsewhere."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from vdgs.executors.jobs import JobProgress, State, seconds_left_overall
+from vdgs.executors.progress import BlockProgress, State, seconds_left_overall
 
 #: Seconds between two summary lines where there is no terminal to redraw.
 PLAIN_SECONDS = 15.0
-#: Lines of the table that are not rows of jobs: head, rules, totals, and one to spare for the prompt.
+#: Lines of the table that are not rows of blocks: head, rules, totals, and one to spare for the prompt.
 FRAME_LINES = 7
 STYLES: dict[State, str] = {"queued": "dim", "running": "cyan", "done": "green", "failed": "red", "stopped": "yellow"}
 
@@ -23,7 +23,7 @@ STYLES: dict[State, str] = {"queued": "dim", "running": "cyan", "done": "green",
 class Board:
     """Shows rows until it is closed. Everything printed meanwhile goes through it, above the table."""
 
-    def __init__(self, console: Console, rows: list[JobProgress], at_once: int):
+    def __init__(self, console: Console, rows: list[BlockProgress], at_once: int):
         self._console, self._rows, self._at_once = console, rows, at_once
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
         self._last_line = time.monotonic()
@@ -61,8 +61,8 @@ class Board:
         return any(row.state in ("queued", "running") for row in self._rows)
 
 
-def progress_table(rows: list[JobProgress], at_once: int, most: int) -> Table:
-    """One row for each job and one with totals; of more than `most` jobs, those that wait or are done are counted."""
+def progress_table(rows: list[BlockProgress], at_once: int, most: int) -> Table:
+    """One row for each block and one with totals; of more than `most`, those that wait or are done are counted."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), caption_justify="left")  # 80 columns
     for column in ("block", "state", "iteration", "PSNR", "anchors", "it/s", "left", "memory", "tries"):
         table.add_column(column, justify="left" if column == "state" else "right", no_wrap=True)
@@ -77,8 +77,8 @@ def progress_table(rows: list[JobProgress], at_once: int, most: int) -> Table:
     return table
 
 
-def progress_line(rows: list[JobProgress], at_once: int) -> str:
-    """The table in one line: counts, the jobs that run, the time left."""
+def progress_line(rows: list[BlockProgress], at_once: int) -> str:
+    """The table in one line: counts, the blocks that run, the time left."""
     running = [
         f"{row.index:02d}: {_iteration(row)}" + (f" {row.figures.psnr:.2f} dB" if row.figures.psnr is not None else "")
         for row in rows
@@ -95,7 +95,7 @@ def duration(seconds: float) -> str:
     return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
-def _chosen(rows: list[JobProgress], most: int) -> list[JobProgress]:
+def _chosen(rows: list[BlockProgress], most: int) -> list[BlockProgress]:
     if len(rows) <= most:
         return rows
     urgency = {"running": 0, "failed": 1, "stopped": 2, "queued": 3, "done": 4}
@@ -103,19 +103,19 @@ def _chosen(rows: list[JobProgress], most: int) -> list[JobProgress]:
     return [row for row in rows if row in urgent]
 
 
-def _states(rows: Sequence[JobProgress]) -> str:
+def _states(rows: Sequence[BlockProgress]) -> str:
     count = Counter(row.state for row in rows)
     return ", ".join(f"{count[state]} {state}" for state in STYLES if count[state])
 
 
-def _iteration(row: JobProgress) -> str:
+def _iteration(row: BlockProgress) -> str:
     figures = row.figures
     if figures.iteration is None:
         return "starting" if row.state == "running" else "–"
     return f"{figures.iteration:,}" + (f"/{figures.iterations:,}" if figures.iterations is not None else "")
 
 
-def _cells(row: JobProgress) -> list[str]:
+def _cells(row: BlockProgress) -> list[str]:
     figures, running = row.figures, row.state == "running"
     return [
         f"{row.index:02d}",
@@ -130,7 +130,7 @@ def _cells(row: JobProgress) -> list[str]:
     ]
 
 
-def _totals(rows: list[JobProgress], at_once: int) -> list[str]:
+def _totals(rows: list[BlockProgress], at_once: int) -> list[str]:
     running = [row for row in rows if row.state == "running"]
     done = sum(row.state == "done" for row in rows)
     speeds = [row.speed for row in running if row.speed is not None]
@@ -149,8 +149,8 @@ def _totals(rows: list[JobProgress], at_once: int) -> list[str]:
     ]
 
 
-def _percent(rows: list[JobProgress]) -> str:
-    """Share of the work done, a job that says nothing counting as one that has not begun."""
+def _percent(rows: list[BlockProgress]) -> str:
+    """Share of the work done, a block that says nothing counting as one that has not begun."""
     shares = []
     for row in rows:
         iteration, iterations = row.figures.iteration, row.figures.iterations

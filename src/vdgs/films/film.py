@@ -25,10 +25,13 @@ SLIDES_PER_SECOND = 2.0
 
 
 def render_run(asked: RenderRequest, console: Console) -> None:
-    """Render what was asked for. Raises VdgsError for an unusable path, codec or output."""
+    """Render what was asked for, on a device that is chosen already (`vdgs.kernels.devices`).
+
+    Raises VdgsError for an unusable path, codec or output.
+    """
     if min(asked.width, asked.fps, asked.seconds) < 0:
         raise VdgsError("--width, --fps and --seconds must not be negative")
-    run = open_run(asked.run, asked.model)
+    run = open_run(asked.run, asked.model, asked.device)
     named, fps = _cameras(asked, run)
     if asked.width:
         named = [(name, camera.resized(asked.width, _height(camera, asked.width))) for name, camera in named]
@@ -79,15 +82,15 @@ def _frames(
     span: tuple[float, float] | None = None if counts is None else (0.0, float(counts.max()))
     for name, camera in track(named, "rendering", console=console, disable=not console.is_terminal):
         if kind == "image":
-            yield name, to_8bit(render(run.model, camera).image.numpy())
+            yield name, to_8bit(render(run.model, camera).image.cpu().numpy())
             continue
         if counts is not None:
-            values = render_values(run.model, counts, camera).numpy()
+            values = render_values(run.model, counts, camera).cpu().numpy()
         else:
             raster = render(run.model, camera, depth=True)
             assert raster.depth is not None
-            alpha = raster.alpha.numpy()
-            values = np.where(alpha > 0.5, raster.depth.numpy() / np.maximum(alpha, 1e-6), np.nan)
+            alpha = raster.alpha.cpu().numpy()
+            values = np.where(alpha > 0.5, raster.depth.cpu().numpy() / np.maximum(alpha, 1e-6), np.nan)
             span = span or _span(values)
         yield name, coloured(values, span or (0.0, 1.0))
 

@@ -1,7 +1,7 @@
 """What a capture holds and where it looks thin, in numbers, before anyone trains.
 
 The visibility V of a sparse point is the number of *training* cameras whose frustum holds it (z > near,
-projected centre on the image; no occlusion), as in section III-B of the VDGS paper. Where V is small, a
+projected centre on the image; no occlusion), as in section IV-B of the VDGS paper. Where V is small, a
 scene trains badly.
 """
 

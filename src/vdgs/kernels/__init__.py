@@ -1,8 +1,8 @@
-"""The typed set of numerical operations, with interchangeable implementations.
+"""The numerical operations, in interchangeable implementations, behind one door: `choose(device)`.
 
-`reference` is readable torch (the oracle of the tests), `native` is C++ for the CPU. Both offer the
-functions below under the same names; "d" marks those that torch can differentiate. `cuda` is for NVIDIA GPUs and has
-some of them so far (`operations`).
+`native` is C++ for the CPU, `reference` readable torch for any device (and the oracle of the tests). `Operations` in
+`operations.py` is the typed set that both offer; "d" marks those that torch can differentiate. `cuda` is for NVIDIA
+GPUs and has some of them so far. Code outside this folder names no implementation.
 
 Names and dimensions, fixed once for all files in this folder:
 
@@ -13,16 +13,83 @@ Names and dimensions, fixed once for all files in this folder:
        cull(positions [n,3], log_scales [n,6], camera) -> int64 [v], ascending
     d  decode(positions [n,3], features [n,32], offsets [n,k,3], log_scales [n,6], weights, camera,
               rows [v]) -> Splats
-       decode_backward_adam(positions [n,3], moved, weights, camera, rows [v], splats, gradients, step)
-                 -> finite, gradients of the weights; anchors move in place
+       decode_backward_adam(positions [n,3], moved, weights, camera, rows [v], gradients, updates [n])
+                 -> finite, gradients of the weights; anchors move and their updates are counted, in place
     d  project(means [m,3], scales [m,3], quaternions [m,4], camera) -> Projected
     d  rasterise(means_px [m,2], conics [m,3], colours [m,3], opacities [m], depths [m],
                  background [3], width, height) -> Raster(image [h,w,3], alpha [h,w], depth [h,w])
+       rasterise_vjp(the same) -> Raster, and the function that takes gradients of it back to the splats
     d  photometric_loss(image [h,w,3], target uint8 [h,w,3], mask) -> Photometric(loss, l1, ssim)
        adam_rows(parameter [n,...], rows [v], gradient [v,...], moments, ...) -> finite; in place
-       add_view_statistics(visible [v], source [m], opacities [m], gradient_px [m,2], ..., sums) in place
+       add_view_statistics(visible [v], inside [v], source [m], opacities [m], gradient_px [m,2], ..., sums)
+                 in place
        count_visibility(points [n,3], cameras) -> int32 [n];  mark_visible(points [n,3], camera) -> bool [n]
        cell_keys, cell_centres, group_cells, group_max, contains, morton_order: the lattice of growth
 
-Constants shared by all implementations live in `constants.py`.
+Constants shared by all implementations live in `constants.py`. Nothing heavy is imported before it is asked for.
 """
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
+
+    from vdgs.kernels.operations import Operations
+
+#: Environment variable that takes another implementation than the device's own: `reference`, for tests and doubts.
+VARIABLE = "VDGS_KERNELS"
+
+
+def choose(device: torch.device) -> Operations:
+    """The operations for tensors on `device`: C++ on the CPU, torch elsewhere; torch everywhere if VDGS_KERNELS is
+    `reference`.
+
+    Raises VdgsError for another value of that variable.
+    """
+    return _implementation(device.type, os.environ.get(VARIABLE, ""))
+
+
+@cache
+def _implementation(device_type: str, wanted: str) -> Operations:
+    if wanted not in ("", "native", "reference"):
+        from vdgs.errors import VdgsError
+
+        raise VdgsError(f"{VARIABLE} must be native, reference or not set, not {wanted!r}.")
+    if device_type != "cpu" or wanted == "reference":
+        from vdgs.kernels import reference
+
+        return reference
+    from vdgs.kernels import native
+
+    return native
+
+
+def threads() -> int:
+    """How many threads the operations use on the CPU."""
+    from vdgs.kernels.native import module
+
+    return module.threads()
+
+
+def set_threads(count: int) -> None:
+    """Let the operations use up to `count` threads of the CPU, the calling one included; torch's own as well.
+
+    Raises ValueError below 1.
+    """
+    import torch
+
+    from vdgs.kernels.native import module
+
+    module.set_threads(count)
+    torch.set_num_threads(count)
+
+
+def release_idle_memory() -> None:
+    """Give back what implementations keep from picture to picture but do not use now."""
+    from vdgs.kernels.native import module
+
+    module.native().drop_idle_frames()

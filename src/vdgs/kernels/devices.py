@@ -23,9 +23,6 @@ class Choice:
     device: str
     why: str
 
-    def __str__(self) -> str:
-        return f"device: {self.device} ({self.why})"
-
 
 def choose(asked: str) -> Choice:
     """The device to use for `auto`, `cpu`, `cuda` or `cuda:i`.

@@ -6,8 +6,8 @@ Names as in `vdgs.kernels`: v visible anchors, k offsets per anchor, m splats.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, fields
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int32
@@ -91,17 +91,26 @@ class Projected:
 
 @dataclass(frozen=True, eq=False)
 class Splats:
-    """What an anchor model looks like from one camera, ready to be rasterised.
+    """Gaussians on the image plane, ready to be rasterised."""
+
+    #: Centres in pixels; the centre of the first pixel is (0.5, 0.5).
+    means_px: Float[Tensor, "m 2"]
+    #: (a, b, c) of a dx^2 + 2 b dx dy + c dy^2.
+    conics: Float[Tensor, "m 3"]
+    #: Along the viewing direction; equal ones are blended in the order of the rows.
+    depths: Float[Tensor, "m"]
+    colours: Float[Tensor, "m 3"]
+    opacities: Float[Tensor, "m"]
+
+
+@dataclass(frozen=True, eq=False)
+class AnchorSplats(Splats):
+    """What an anchor model looks like from one camera.
 
     `source` is (index among the visible anchors)·k + offset, ascending; `volumes` are the products
     of the three scales (world units cubed), which the loss keeps small.
     """
 
-    means_px: Float[Tensor, "m 2"]
-    conics: Float[Tensor, "m 3"]
-    depths: Float[Tensor, "m"]
-    colours: Float[Tensor, "m 3"]
-    opacities: Float[Tensor, "m"]
     volumes: Float[Tensor, "m"]
     source: Int32[Tensor, "m"]
 
@@ -116,7 +125,7 @@ class SplatGradients:
     opacities: Float[Tensor, "m"]
     #: By the volume of each: the same number for all.
     volume: float
-    #: The splats themselves: see `Splats`.
+    #: The splats themselves: see `AnchorSplats`.
     source: Int32[Tensor, "m"]
     colour_values: Float[Tensor, "m 3"]
     opacity_values: Float[Tensor, "m"]
@@ -141,3 +150,62 @@ class Raster(NamedTuple):
     #: Expected depth, the sum of w_i depth_i: not divided by alpha, 0 where nothing is drawn.
     #: None if it was not asked for.
     depth: Float[Tensor, "h w"] | None
+
+
+class RasterGradients(NamedTuple):
+    """Derivatives of a loss by what a picture was drawn from."""
+
+    means_px: Float[Tensor, "m 2"]
+    conics: Float[Tensor, "m 3"]
+    colours: Float[Tensor, "m 3"]
+    opacities: Float[Tensor, "m"]
+    #: None for a picture drawn without depth.
+    depths: Float[Tensor, "m"] | None
+    background: Float[Tensor, "3"]
+
+
+@runtime_checkable
+class RasterPullback(Protocol):
+    """From gradients by a picture to gradients by what it was drawn from."""
+
+    def __call__(
+        self,
+        image: Tensor | None,
+        alpha: Tensor | None = None,
+        depth: Tensor | None = None,
+        over: tuple[Tensor, Tensor] | None = None,
+    ) -> RasterGradients:
+        """Gradients by image [h,w,3], alpha [h,w] and depth [h,w]; None is zero. To be called once.
+
+        Those of means_px and conics overwrite the contiguous tensors `over` [m,2] and [m,3], if given.
+        """
+        ...
+
+
+class Photometric(NamedTuple):
+    """Scalars of one image. Only `loss` carries a gradient."""
+
+    loss: Float[Tensor, ""]
+    l1: Float[Tensor, ""]
+    ssim: Float[Tensor, ""]
+
+
+@dataclass
+class Statistics:
+    """What growth decides by: sums over the views since the last decision (float32; counts are exact up to 2^24)."""
+
+    #: Norm of dL/d(mean) in NDC units, and how often the offset was drawn.
+    gradient: Float[Tensor, "n k"]
+    drawn: Float[Tensor, "n k"]
+    #: Opacity of the anchor's Gaussians, summed over them, and how often its centre was in the picture.
+    opacity: Float[Tensor, "n"]
+    seen: Float[Tensor, "n"]
+
+    @staticmethod
+    def zeros(n: int, k: int, device: torch.device | None = None) -> Statistics:
+        """Those of anchors that no view has shown yet."""
+        return Statistics(*(torch.zeros(shape, device=device) for shape in ((n, k), (n, k), (n,), (n,))))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The four by name."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}

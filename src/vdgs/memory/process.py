@@ -12,7 +12,7 @@ from pathlib import Path
 
 import psutil
 
-from vdgs.kernels.native import module
+from vdgs.kernels import release_idle_memory
 
 #: How the libraries word it: torch on the CPU (Linux, Windows), C++, OpenCV.
 OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "Insufficient memory", "CUDA out of memory")
@@ -65,6 +65,6 @@ def return_unused() -> None:
     That is the rasteriser's idle memory and, with glibc, what was freed between pieces that are in use: after anchors
     were replaced by others, more than they take themselves. Costs some milliseconds: for once in a hundred steps.
     """
-    module.native().drop_idle_frames()
+    release_idle_memory()
     with suppress(OSError, AttributeError, TypeError):  # other C libraries have no such function, or no such handle
         ctypes.CDLL(None).malloc_trim(0)

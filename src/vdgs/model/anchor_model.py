@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -58,6 +58,11 @@ class AnchorModel:
         bounds = np.cumsum([0, *(part.count for part in self.parts)]).tolist()
         spans = [(a, b, part.decoder) for (a, b), part in zip(pairwise(bounds), self.parts, strict=True)]
         return spans or [(0, len(self.anchors), self.decoder)]
+
+    def to(self, device: torch.device) -> AnchorModel:
+        """The same model on a device."""
+        parts = tuple(replace(part, decoder=part.decoder.to(device)) for part in self.parts)
+        return replace(self, anchors=self.anchors.to(device), decoder=self.decoder.to(device), parts=parts)
 
     def save(self, path: Path) -> None:
         """Write one safetensors file, atomically."""

@@ -30,6 +30,10 @@ class Anchors:
     def tensors(self) -> dict[str, Tensor]:
         return {name: getattr(self, name) for name in ("positions", *TRAINED)}
 
+    def to(self, device: torch.device) -> Anchors:
+        """The same anchors on a device; themselves where they are on it."""
+        return Anchors(**{name: tensor.to(device) for name, tensor in self.tensors().items()})
+
     def select(self, rows: Tensor) -> Anchors:
         """The anchors of the given rows (indices or mask)."""
         return Anchors(**{name: tensor[rows] for name, tensor in self.tensors().items()})

@@ -56,6 +56,10 @@ class Decoder:
             named |= {"appearance": self.appearance, "appearance_weight": self.appearance_weight}
         return named
 
+    def to(self, device: torch.device) -> Decoder:
+        """The same numbers on a device; the same tensors where they are on it."""
+        return Decoder.from_tensors({name: tensor.to(device) for name, tensor in self.tensors().items()})
+
     def copy(self) -> Decoder:
         """The same numbers in tensors of their own."""
         return Decoder.from_tensors({name: tensor.detach().clone() for name, tensor in self.tensors().items()})

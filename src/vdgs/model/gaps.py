@@ -17,7 +17,7 @@ from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
 from vdgs.cameras import Camera
-from vdgs.kernels import native as kernels
+from vdgs.model.visibility import visibility_of
 
 #: Edge of a grid cell in voxels; about as far apart as growth's coarsest cells can bridge.
 CELL_VOXELS = 4.0
@@ -67,4 +67,4 @@ def _at_seen_heights(
     _, nearest = tree.query(centres, k=min(NEIGHBOURS, len(points)), workers=1)
     heights = np.median(points[np.asarray(nearest).reshape(len(centres), -1), 2], axis=1)
     lifted = np.column_stack([centres, heights])
-    return lifted[kernels.count_visibility(torch.from_numpy(lifted), cameras).numpy() > 0]
+    return lifted[visibility_of(torch.from_numpy(lifted), cameras).numpy() > 0]

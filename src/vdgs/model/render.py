@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from itertools import pairwise
 
 import torch
@@ -10,32 +10,35 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels import native as kernels
-from vdgs.kernels.types import DecoderWeights, Raster, Splats
+from vdgs.kernels import choose
+from vdgs.kernels.types import AnchorSplats, DecoderWeights, Raster, Splats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 
 
-def decode_rows(anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera) -> Splats:
+def decode_rows(anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera) -> AnchorSplats:
     """Splats of the anchors of the given rows, as this camera sees them."""
-    return kernels.decode(
+    return choose(anchors.positions.device).decode(
         anchors.positions, anchors.features, anchors.offsets, anchors.log_scales, weights, camera, rows
     )
 
 
 def visible_rows(anchors: Anchors, camera: Camera) -> Int64[Tensor, " v"]:
     """Rows of the anchors that may touch a view, ascending."""
-    return kernels.cull(anchors.positions, anchors.log_scales, camera)
+    return choose(anchors.positions.device).cull(anchors.positions, anchors.log_scales, camera)
 
 
-def decode_view(model: AnchorModel, camera: Camera, image: int | None = None) -> tuple[Int64[Tensor, " v"], Splats]:
+def decode_view(
+    model: AnchorModel, camera: Camera, image: int | None = None
+) -> tuple[Int64[Tensor, " v"], AnchorSplats]:
     """The rows that may touch a view and what they look like, each anchor by its own decoder; `source` counts rows.
 
     `image`: as in `render`.
     """
     rows = visible_rows(model.anchors, camera)
     spans = model.spans()
-    bounds = torch.searchsorted(rows, torch.tensor([first for first, _, _ in spans] + [len(model.anchors)])).tolist()
+    starts = rows.new_tensor([first for first, _, _ in spans] + [len(model.anchors)])
+    bounds = torch.searchsorted(rows, starts).tolist()
     shown = [
         (first, last, decoder)
         for (first, last), (_, _, decoder) in zip(pairwise(bounds), spans, strict=True) if first < last
@@ -47,23 +50,28 @@ def decode_view(model: AnchorModel, camera: Camera, image: int | None = None) ->
     return rows, _joined(pieces, model.anchors.offsets.shape[1])
 
 
-def _joined(pieces: list[tuple[int, Splats]], k: int) -> Splats:
+def _joined(pieces: list[tuple[int, AnchorSplats]], k: int) -> AnchorSplats:
     """Splats of consecutive rows as one, in order; each piece with the place of its first row."""
     if len(pieces) == 1:
         return pieces[0][1]
     named = {
         field.name: torch.cat([getattr(splats, field.name) for _, splats in pieces])
-        for field in fields(Splats) if field.name != "source"
+        for field in fields(AnchorSplats) if field.name != "source"
     }  # fmt: skip
-    return Splats(**named, source=torch.cat([splats.source + first * k for first, splats in pieces]))
+    return AnchorSplats(**named, source=torch.cat([splats.source + first * k for first, splats in pieces]))
+
+
+def joined(first: Splats, second: Splats) -> Splats:
+    """Splats followed by others."""
+    return Splats(
+        **{field.name: torch.cat([getattr(first, field.name), getattr(second, field.name)]) for field in fields(Splats)}
+    )
 
 
 def draw(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:
     """Splats to image, alpha and (on request) expected depth; differentiable."""
-    return kernels.rasterise(
-        splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths,
-        background, camera.width, camera.height, depth=depth,
-    )  # fmt: skip
+    kernels = choose(splats.means_px.device)
+    return kernels.rasterise(splats, background, camera.width, camera.height, depth=depth)
 
 
 @torch.no_grad()
@@ -81,7 +89,7 @@ def render(
     None takes the mean appearance.
     """
     _, splats = decode_view(model, camera, image)
-    return draw(splats, camera, torch.tensor(background or model.background), depth)
+    return draw(splats, camera, splats.means_px.new_tensor(background or model.background), depth)
 
 
 @torch.no_grad()
@@ -92,11 +100,9 @@ def paint(
     of the pixel, and alpha, the sum of the parts."""
     rows, splats = decode_view(model, camera)
     k = model.anchors.offsets.shape[1]
-    of_splat = values[rows][splats.source.long() // k].float()
-    painted = kernels.rasterise(
-        splats.means_px, splats.conics, of_splat[:, None].expand(-1, 3).contiguous(), splats.opacities,
-        splats.depths, torch.zeros(3), camera.width, camera.height,
-    )  # fmt: skip
+    of_splat = values.to(rows.device)[rows][splats.source.long() // k].float()
+    grey = replace(splats, colours=of_splat[:, None].expand(-1, 3).contiguous())
+    painted = draw(grey, camera, splats.means_px.new_zeros(3))
     return painted.image[..., 0], painted.alpha
 
 

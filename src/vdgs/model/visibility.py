@@ -1,4 +1,4 @@
-"""Visibility: how many training cameras hold each anchor in their frustum (sections III-B and III-C).
+"""Visibility: how many training cameras hold each anchor in their frustum (sections IV-B and IV-C).
 
 A frustum holds a point where z > near and the projected centre lies on the image. Nothing is hidden behind anything
 else: the paper counts frusta, not lines of sight. Symbols: V_i (views of anchor i), V̂_i (normalised), c_k (share of the
@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels import native as kernels
+from vdgs.kernels import choose
 
 #: Percentiles and limits by which visibility is described.
 QUANTILES = (5, 25, 50, 75, 95)
@@ -42,7 +42,7 @@ def visibility_of(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) ->
 
     Raises TypeError or ValueError unless positions are float32 or float64 [n, 3].
     """
-    return kernels.count_visibility(positions, cameras)
+    return choose(positions.device).count_visibility(positions, cameras)
 
 
 def votes_of(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> tuple[float, ...]:
@@ -63,7 +63,7 @@ def effective_count(shares: Sequence[float]) -> float:
 
 
 def normalised(visibility: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """V̂_i = (V_i - min V) / (max V - min V + 1e-8), float64 in [0, 1) (below eq. 5)."""
+    """V̂_i = (V_i - min V) / (max V - min V + 1e-8), float64 in [0, 1) (eq. 5)."""
     count = np.asarray(visibility, np.float64)
     if len(count) == 0:
         return count
@@ -71,7 +71,7 @@ def normalised(visibility: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 
 
 def share_in_cycle(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
-    """c_k of every anchor: the share of the distinct cameras of a growth cycle whose frustum holds it, float32.
+    """c_k of every anchor (eq. 8): the share of the distinct cameras of a growth cycle whose frustum holds it, float32.
 
     A view that was drawn twice in the cycle, or at two resolutions, counts once. All offsets of an anchor share its
     c_k. Raises ValueError without any camera.

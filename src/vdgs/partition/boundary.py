@@ -1,4 +1,4 @@
-"""From clusters of anchors to boundaries on the plane: components, α-shapes, disjoint cores, widening (fig. 3)."""
+"""From clusters of anchors to boundaries on the plane: components, α-shapes, disjoint cores, widening (fig. 4)."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def cores_of(
 
 
 def widen(core: shapely.Polygon, expansion: float) -> shapely.Polygon:
-    """The block's boundary: its core widened by `expansion` times the radius of a disc of its area (section III-B).
+    """The block's boundary: its core widened by `expansion` times the radius of a disc of its area (section IV-B).
 
     For a disc that is a factor of 1 + expansion about its centre (choice); it is defined for any other shape too, and
     always holds the core.

@@ -1,4 +1,4 @@
-"""The scene cut into blocks (section III-B, fig. 3): clusters, boundaries, and how many blocks there should be."""
+"""The scene cut into blocks (section IV-B, fig. 4): clusters, boundaries, and how many blocks there should be."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def choose_block_count(
 ) -> int:
     """The number of blocks that `config` asks for; for "auto" it follows from the scene and the memory.
 
-    Choice: as few as keep a block within `block_memory_gb` in training by `memory_estimate`, with the rest of the scene
+    Choice: as few as keep a block within `block_memory_gb` in training by `memory.estimate`, with the rest of the scene
     about it and half of all anchors in view, photographs aside; but never fewer than 50 photographs for an average
     block. Few, because blocks cost steps: of one total, each place gets fewer the more there are (docs/findings.md).
     """

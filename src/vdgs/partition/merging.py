@@ -3,14 +3,13 @@
 Merging is a selection by place: no anchor is changed, averaged or added. A block's training moves, grows and prunes
 only what its cameras see; where they see nothing, its anchors are the coarse ones still, and so is the merged scene.
 
-Symbols: V_i, the number of cameras that hold anchor i in their frustum (section III-B of the paper).
+Symbols: V_i, the number of cameras that hold anchor i in their frustum (section IV-B of the paper).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,11 +18,12 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
-from vdgs.kernels import native as kernels
 from vdgs.model.anchor_model import AnchorModel, Part
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
+from vdgs.model.visibility import visibility_of
 from vdgs.partition.blocks import Blocks, places_of
+from vdgs.partition.records import MergedBlock
 from vdgs.settings.method import MergeConfig
 
 
@@ -35,9 +35,8 @@ def merge(
     config: MergeConfig,
     *,
     allow_missing: bool = False,
-) -> tuple[AnchorModel, list[dict[str, Any]]]:
-    """One model from the trained blocks, and facts of each block: anchors trained, kept, dropped, from_coarse, and
-    unseen (kept, but in the frustum of none of the block's cameras).
+) -> tuple[AnchorModel, list[MergedBlock]]:
+    """One model from the trained blocks, and what became of the anchors of each block.
 
     A trained model holds the anchors that its block was free to move: those that it owns, and those of its ring unless
     that was frozen. The result keeps, block after block and in their order, the anchors of each block at the places
@@ -56,23 +55,22 @@ def merge(
         if model is not None:
             _check_origin(index, model, coarse)
     coarse_owner = blocks.owner(places_of(coarse.anchors.positions)) if missing else None
-    selected, pieces, facts = [], [], []
+    selected, pieces, became = [], [], []
     for index, model in enumerate(trained):
         if model is None:
             assert coarse_owner is not None
             piece = coarse.anchors.select(torch.from_numpy(coarse_owner == index))
-            counts = {"trained": 0, "kept": 0, "dropped": 0, "from_coarse": len(piece)}
+            trained_here, kept, from_coarse = 0, 0, len(piece)
         else:
             givers = giver_of_places(model.anchors.positions, blocks, cameras_of_block, config, missing)
             piece = model.anchors.select(torch.from_numpy(givers == index))
-            held = len(model.anchors)
-            counts = {"trained": held, "kept": len(piece), "dropped": held - len(piece), "from_coarse": 0}
-        unseen = int((kernels.count_visibility(piece.positions, cameras_of_block[index]) == 0).sum())
+            trained_here, kept, from_coarse = len(model.anchors), len(piece), 0
+        unseen = int((visibility_of(piece.positions, cameras_of_block[index]) == 0).sum())
         pieces.append(Part(len(piece), coarse.decoder if model is None else model.decoder))
         selected.append(piece)
-        facts.append({"block": index, **counts, "unseen": unseen})
+        became.append(MergedBlock(index, trained_here, kept, trained_here - kept, from_coarse, unseen))
     own = any(model is not None and has_own_decoder(model) for model in trained)
-    return replace(coarse, anchors=_joined(selected), parts=tuple(pieces) if own else ()), facts
+    return replace(coarse, anchors=_joined(selected), parts=tuple(pieces) if own else ()), became
 
 
 def has_own_decoder(model: AnchorModel) -> bool:
@@ -113,7 +111,7 @@ def giver_of_places(
 
 def _visibility(positions: Float[Tensor, "n 3"], rows: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """V_i of the given rows over these cameras."""
-    return kernels.count_visibility(positions[torch.from_numpy(rows)], cameras).numpy()
+    return visibility_of(positions[torch.from_numpy(rows)], cameras).numpy()
 
 
 def _joined(pieces: Sequence[Anchors]) -> Anchors:

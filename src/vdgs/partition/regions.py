@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels import native as kernels
 from vdgs.model.anchors import Anchors
+from vdgs.model.render import visible_rows
 from vdgs.partition.blocks import Blocks, places_of
 from vdgs.settings.method import BlockConfig
 
@@ -34,14 +34,15 @@ def split_anchors(anchors: Anchors, blocks: Blocks, index: int, config: BlockCon
     core, reached = blocks.owner(place) == index, blocks.reaches(index, place)
     own = core if config.ring == "frozen" else reached
     around = ~own if config.context else reached & ~own
-    return torch.from_numpy(own), torch.from_numpy(around)
+    device = anchors.positions.device
+    return torch.from_numpy(own).to(device), torch.from_numpy(around).to(device)
 
 
 def drawn_by(anchors: Anchors, cameras: Sequence[Camera]) -> Bool[Tensor, " n"]:
     """Which anchors one of the cameras may draw."""
-    drawn = torch.zeros(len(anchors), dtype=torch.bool)
+    drawn = torch.zeros_like(anchors.positions[:, 0], dtype=torch.bool)
     for camera in cameras:
-        drawn[kernels.cull(anchors.positions, anchors.log_scales, camera)] = True
+        drawn[visible_rows(anchors, camera)] = True
     return drawn
 
 
@@ -51,13 +52,13 @@ def holds(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor],
     def inside(positions: Float[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
         place = places_of(positions)
         kept = blocks.owner(place) == index if config.ring == "frozen" else blocks.reaches(index, place)
-        return torch.from_numpy(kept)
+        return torch.from_numpy(kept).to(positions.device)
 
     return inside
 
 
 def ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor] | None:
-    """How far anchors move where the ring is a ramp: 1 wherever the block owns the place, and where another does,
+    """The learning-rate mask of a ring that is a ramp: 1 wherever the block owns the place, and where another does,
     falling linearly from the core to 0 at the widened boundary.
 
     Read from a table over the block, since it is asked in every step.
@@ -74,11 +75,11 @@ def ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], 
     table = torch.from_numpy(share.astype(np.float32).reshape(RAMP_CELLS, RAMP_CELLS))
     origin, cell = torch.from_numpy(low), torch.from_numpy((high - low) / RAMP_CELLS)
 
-    def mobility(positions: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
+    def rate_mask(positions: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
         cells: Int64[Tensor, "p 2"] = ((positions[:, :2].double() - origin) / cell).floor().long()
         inside = ((cells >= 0) & (cells < RAMP_CELLS)).all(1)
         cells = cells.clamp(0, RAMP_CELLS - 1)
         # What the block moves beyond the table it owns.
         return torch.where(inside, table[cells[:, 0], cells[:, 1]], torch.ones(()))
 
-    return mobility
+    return rate_mask

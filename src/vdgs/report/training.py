@@ -99,7 +99,7 @@ def _states(statuses: list[tuple[str, Record]]) -> Html:
 
 
 def _growth(logs: list[Log]) -> list[Html]:
-    """Compensated growth (section III-C), cycle by cycle."""
+    """Compensated growth (section IV-C), cycle by cycle."""
     cycles = [
         (name, colour, found)
         for name, colour, records in logs

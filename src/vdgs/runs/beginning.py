@@ -29,8 +29,8 @@ def begin_run(
     """Open the capture and a new run of it, or the run that is there if it was started with the same settings.
 
     `redo` None compares the settings of the coarse stage only and refuses others; True or False is about changing
-    them (`RunFolder.change`). Raises CaptureError for a capture that cannot be used, RunError for other settings than
-    the run's, VdgsError for settings that do not work.
+    them (`RunFolder.change_settings`). Raises CaptureError for a capture that cannot be used, RunError for other
+    settings than the run's, VdgsError for settings that do not work.
     """
     problems = validate(method)
     if problems:
@@ -45,7 +45,7 @@ def begin_run(
         if redo is None or not run.config_file.exists():
             run.begin(settings, ("capture", "training"))
         else:
-            run.change(settings, redo)
+            run.change_settings(settings, redo)
     return run, capture
 
 

@@ -13,8 +13,8 @@ from vdgs.runs.folder import RunFolder
 
 def blocks_of(run: RunFolder) -> Blocks:
     """The blocks of a run, with cameras. Raises RunError unless they were made with the run's settings."""
-    facts, keys = run.partition_facts(), run.keys()
-    if (facts.get("key"), facts.get("assignment_key")) != (keys.partition, keys.assignment):
+    record, keys = run.partition_record(), run.keys()
+    if (record.key, record.assignment_key) != (keys.partition, keys.assignment):
         raise RunError(
             f"{run.path}: is not cut into blocks yet, or with other settings. Run: vdgs partition {run.path}"
         )

@@ -16,10 +16,13 @@ import yaml
 
 from vdgs import __version__
 from vdgs.errors import RunError, VdgsError
+from vdgs.partition.records import PartitionRecord
 from vdgs.runs.keys import StageKeys, stage_keys
+from vdgs.runs.status import Status
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import differences, from_dict, to_dict
 from vdgs.storage.files import read_json, write_json, write_text
+from vdgs.storage.records import known, record_of
 
 #: The parts of config.yaml.
 SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
@@ -27,7 +30,7 @@ SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
 
 @dataclass(frozen=True)
 class StageFolder:
-    """Where one stage (coarse, a block) keeps its states, log and model."""
+    """Where one stage (coarse, a block) keeps its checkpoints, log and model."""
 
     path: Path
 
@@ -47,18 +50,22 @@ class StageFolder:
     def status_file(self) -> Path:
         return self.path / "status.json"
 
-    def status(self) -> dict[str, Any]:
-        """What `set_status` wrote last; state "new" if nothing did."""
+    def status(self) -> Status:
+        """What `set_status` wrote last; state "new" if nothing did. RunError if the file is damaged."""
         if not self.status_file.exists():
-            return {"state": "new"}
-        status = read_json(self.status_file)
-        if not isinstance(status, dict) or not isinstance(status.get("state"), str):
-            raise RunError(f"{self.status_file}: is damaged. Delete this file and run the same command again.")
-        return status
+            return Status()
+        written = read_json(self.status_file)
+        try:
+            if isinstance(written, dict) and "state" not in written:
+                raise ValueError("it says no state")
+            return record_of(Status, written)
+        except ValueError as error:
+            raise RunError(
+                f"{self.status_file}: is damaged ({error}). Delete this file and run the same command again."
+            ) from error
 
-    def set_status(self, state: str, **facts: Any) -> None:
-        """`state` is queued, running, stopped, done or failed."""
-        write_json(self.status_file, {"state": state, **facts})
+    def set_status(self, status: Status) -> None:
+        write_json(self.status_file, known(status))
 
     @property
     def key_file(self) -> Path:
@@ -71,9 +78,12 @@ class StageFolder:
         except OSError:
             return None
 
-    def claim(self, key: str) -> None:
-        """Let this folder work for these settings from now on; what is there for others, or for unknown ones, is
-        deleted first and the key is written last: a folder never holds what its key does not say."""
+    def discard_unless(self, key: str) -> None:
+        """Delete what is here unless it was made for these settings, and let the folder work for them from now on.
+
+        What was made for other or unknown settings goes first and the key is written last: a folder never holds what
+        its key does not say.
+        """
         if self.key() == key:
             return
         if self.path.exists():
@@ -90,8 +100,7 @@ class StageFolder:
 
     def is_done(self, key: str | None = None) -> bool:
         """Trained to the end, for the settings of `key` where one is given."""
-        status = self.status()
-        return status["state"] == "done" and self.model.exists() and key in (None, self.key())
+        return self.status().state == "done" and self.model.exists() and key in (None, self.key())
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -99,7 +108,15 @@ class StageFolder:
         with _lock(self.path, fcntl.LOCK_EX):
             yield
 
-    def cut_log(self, iteration: int) -> None:
+    def is_held(self) -> bool:
+        """Another process works on this stage. A folder that cannot be written is held by none."""
+        try:
+            with self.locked():
+                return False
+        except RunError as error:
+            return isinstance(error.__cause__, BlockingIOError)
+
+    def truncate_log(self, iteration: int) -> None:
         """Drop log lines after `iteration` (and a half-written last one), so that a continued run repeats none."""
         if not self.log.exists():
             return
@@ -147,16 +164,13 @@ class RunFolder:
     def partition(self) -> Path:
         return self.path / "partition"
 
-    def partition_facts(self) -> dict[str, Any]:
-        """What partition.json says; empty if the scene is not cut yet. RunError if the file is damaged."""
+    def partition_record(self) -> PartitionRecord:
+        """What partition.json says; nothing if the scene is not cut yet. RunError if the file is damaged."""
         file = self.partition / "partition.json"
         try:
-            facts = read_json(file) if file.exists() else {}
-        except VdgsError:
-            facts = None
-        if not isinstance(facts, dict):
-            raise RunError(f"{file}: is damaged. Cut the scene again: vdgs partition {self.path}")
-        return facts
+            return record_of(PartitionRecord, read_json(file)) if file.exists() else PartitionRecord()
+        except (VdgsError, ValueError) as error:
+            raise RunError(f"{file}: is damaged. Cut the scene again: vdgs partition {self.path}") from error
 
     @property
     def merged(self) -> StageFolder:
@@ -201,11 +215,11 @@ class RunFolder:
             )
         self._write(settings)
 
-    def change(self, settings: dict[str, Any], redo: bool) -> list[str]:
+    def change_settings(self, settings: dict[str, Any], redo: bool) -> list[str]:
         """Give a run other settings; returns what changed, one line each.
 
         Raises RunError, with the differences, if trained work depends on what changed, unless `redo` allows to
-        lose it. Stages delete what was made for other settings when they next run (`StageFolder.claim`).
+        lose it. Stages delete what was made for other settings when they next run (`StageFolder.discard_unless`).
         """
         old = self.settings()
         changed = differences(old, settings)
@@ -226,7 +240,7 @@ class RunFolder:
             )  # fmt: skip
         self._write(settings)
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
-            self.coarse.claim(after.coarse)
+            self.coarse.discard_unless(after.coarse)
         return changed
 
     def _write(self, settings: dict[str, Any]) -> None:
@@ -264,7 +278,7 @@ class RunFolder:
 
     def coarse_identity(self) -> str | None:
         """What tells the coarse model from any other; None while there is none."""
-        return self.coarse.status().get("model")
+        return self.coarse.status().model
 
     @contextmanager
     def locked(self, shared: bool = False) -> Iterator[None]:

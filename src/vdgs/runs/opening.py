@@ -6,12 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import refuse_another_capture
 from vdgs.captures.loading import load_capture
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.runs.folder import RunFolder
+from vdgs.runs.status import Status
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.requests import ModelName
 
@@ -26,11 +29,19 @@ class TrainedRun:
     model_path: Path
     #: Which model it is, "coarse" or "merged", and the status of the stage that made it.
     name: str
-    status: dict[str, Any]
+    status: Status
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model is."""
+        return self.model.anchors.positions.device
 
 
-def open_run(path: Path, which: ModelName = "best") -> TrainedRun:
-    """Open a run. Raises RunError if it is none or not trained, CaptureError if its photographs are gone."""
+def open_run(path: Path, which: ModelName = "best", device: torch.device | str = "cpu") -> TrainedRun:
+    """Open a run, its model on a device.
+
+    Raises RunError if it is none or not trained, CaptureError if its photographs are gone.
+    """
     folder = RunFolder(path)
     capture = open_capture(folder)
     name = which
@@ -46,10 +57,10 @@ def open_run(path: Path, which: ModelName = "best") -> TrainedRun:
             )
         verb = "vdgs merge RUN" if name == "merged" else "the same `vdgs coarse` or `vdgs run` command"
         raise RunError(
-            f"{path}: has no {name} model of its settings yet (state: {stage.status()['state']}). Run {verb} (again): "
-            "training continues from the last saved state."
+            f"{path}: has no {name} model of its settings yet (state: {stage.status().state}). Run {verb} (again): "
+            "training continues from the last checkpoint."
         )
-    model = AnchorModel.load(stage.model)
+    model = AnchorModel.load(stage.model).to(torch.device(device))
     refuse_another_capture(stage.model, model.facts.get("capture", {}), capture)
     return TrainedRun(folder, capture, model, stage.model, name, stage.status())
 

@@ -26,7 +26,7 @@ def visibility_of_run(opened: TrainedRun) -> Int32[Tensor, " n"]:
     merged model are others: theirs is counted.
     """
     kept = _read(opened.folder) if opened.name == "coarse" else None
-    return _count(opened) if kept is None or len(kept) != len(opened.model.anchors) else kept
+    return _count(opened) if kept is None or len(kept) != len(opened.model.anchors) else kept.to(opened.device)
 
 
 def keep_visibility(opened: TrainedRun) -> Int32[Tensor, " n"]:

@@ -19,6 +19,8 @@ def validate(config: MethodConfig) -> list[str]:
     if min(block.offset_rate, block.scale_rate, block.feature_rate) <= 0:
         problems.append("block.offset_rate, block.scale_rate and block.feature_rate must be positive")
     problems += [f"block.{each}" for each in _validate_average(block.average, block.growth, block.resolutions)]
+    if block.max_anchors_total < 0:
+        problems.append("block.max_anchors_total must not be negative; 0 is no limit")
     if config.partition.blocks != "auto" and config.partition.blocks < 1:
         problems.append(f"blocks is {config.partition.blocks}; it must be at least 1, or auto")
     if min(config.partition.lambda_vis, config.partition.expansion) < 0 or config.partition.block_memory_gb <= 0:

@@ -79,7 +79,7 @@ class GrowthConfig:
     prune_views: float = 0.8
     """... and it was seen more often than this share of the interval."""
     max_anchors: int = 0
-    """No growth beyond this many anchors; 0 for no limit."""
+    """No growth beyond this many anchors; 0 for no limit. Nothing is removed to keep to it."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,8 @@ class CompensationConfig:
     hold it in their frustum."""
     t_low_quantile: float = 0.0
     """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on
-    a large scene nearly every anchor is below a fixed share)."""
+    a large scene nearly every anchor is below a fixed share). Anchors that tie there are in L all or none, whichever
+    comes nearer to the quantile."""
     beta_g: float = 2.0
     """beta_g: weight of a cycle's mean gradient in the cache g. With the paper's 2, g is a sum that grows to twenty
     times the gradients it is made of; with 1 - gamma (the preset `laptop`) it is a mean over cycles."""
@@ -129,7 +130,7 @@ class TrainConfig:
 
     iterations: int = 100_000
     """Number of steps, one photograph each; 0 takes sixty for each training photograph, but at least 3000 and at
-    most 30 000 (choice: few photographs are soon learnt by heart, many need their time)."""
+    most 30 000 (choice: with few photographs a model soon overfits, many need their time)."""
     sampling: Literal["even", "shares", "roots"] = "even"
     """How often each photograph is used. `even`: all alike (the paper). `shares`: every anchor has one vote, divided
     among the cameras that see it, and a photograph is used in proportion to its votes: most where few others look.
@@ -227,14 +228,19 @@ class BlockConfig:
     """As in the loss of the coarse stage, but for blocks: there the ground is opaque already (choice)."""
     decoder: Literal["frozen", "own"] = "frozen"
     """`frozen`: as the coarse stage left it (the paper). `own`: each block trains its copy, which its anchors keep in
-    the merged scene (choice: with a frozen decoder what few cameras see is learnt by heart sooner)."""
+    the merged scene (choice: with a frozen decoder blocks overfit sooner where few cameras see them)."""
     ring: Literal["frozen", "ramp", "free"] = "frozen"
     """Anchors between core and widened boundary: `frozen` are drawn and never move (choice for "gradients at the
-    boundary are suppressed"); `ramp` move less the farther out they are; `free` as those of the core."""
+    boundary are suppressed"); `ramp`: their learning rate falls linearly to zero at the widened boundary; `free`
+    move as those of the core."""
     context: bool = True
     """Draw the anchors outside the block too, frozen. Off: what the block's cameras see there is empty."""
     growth: GrowthConfig = field(default_factory=lambda: GrowthConfig(start=1000))
     """Growth and pruning of anchors."""
+    max_anchors_total: int = 0
+    """No growth beyond this many anchors of all blocks together; 0 for no limit. Each block has a share in proportion
+    to the coarse anchors it owns. A block that starts with more grows none, and none of its anchors is removed for
+    it: the merged scene has at most this many, or as many as the coarse model."""
     compensation: CompensationConfig = field(default_factory=CompensationConfig)
     """Compensated growth (eqs. 8-10)."""
 
@@ -271,6 +277,17 @@ COARSE_STEPS, BLOCK_STEPS = (60, 3_000, 30_000), (15, 500, 15_000)
 def with_iterations(config: TrainConfig, training_views: int) -> TrainConfig:
     """The settings with `iterations = 0` replaced by what the number of training photographs asks for."""
     return replace(config, iterations=config.iterations or _steps(training_views, *COARSE_STEPS))
+
+
+def block_limit(config: BlockConfig, anchors: int, of: int) -> int:
+    """Up to how many anchors a block may grow that owns so many of all (`of`) coarse anchors; 0 for no limit.
+
+    Shares are rounded down, so that together they are never more than the total. At least 1: no anchor of its own and
+    no limit are different things.
+    """
+    share = max(1, config.max_anchors_total * anchors // of) if config.max_anchors_total else 0
+    limits = [limit for limit in (config.growth.max_anchors, share) if limit]
+    return min(limits, default=0)
 
 
 def block_training(config: MethodConfig, views: int) -> TrainConfig:

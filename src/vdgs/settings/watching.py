@@ -12,7 +12,7 @@ class WatchOptions:
     """What does not change the result: how training is watched and saved."""
 
     save_every: int = 1000
-    """Iterations between two saved states."""
+    """Iterations between two checkpoints."""
     image_memory_gb: float = 0.0
     """Memory for decoded images; 0 takes a quarter of what is free."""
     tensorboard: bool = False

@@ -1,4 +1,4 @@
-"""Block training (section III-B): one block, from the coarse anchors of its place, with its own cameras.
+"""Block training (section IV-B): one block, from the coarse anchors of its place, with its own cameras.
 
 The decoder is frozen, or each block trains a copy of its own. What lies around the block's core is drawn and never
 moves: the ring out to its widened boundary and, as context, all else that its cameras see (choice: else every pixel
@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import torch
 from rich.console import Console
 
 from vdgs import __version__
@@ -26,7 +27,8 @@ from vdgs.partition.regions import drawn_by, holds, ramp, split_anchors
 from vdgs.runs.cut import blocks_of, views_of_block
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.opening import open_run
-from vdgs.settings.method import block_training
+from vdgs.runs.status import Status
+from vdgs.settings.method import block_limit, block_training
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.tensors import identity
 from vdgs.training import Stage, Surroundings, start_state
@@ -36,8 +38,8 @@ from vdgs.watching.anchors import continue_or_start, finish, note_without_growth
 from vdgs.watching.images import image_budget
 
 
-def train_block(path: Path, index: int, options: WatchOptions, console: Console) -> None:
-    """Train, or continue, one block of a run; nothing if it is finished.
+def train_block(path: Path, index: int, options: WatchOptions, console: Console, device: str = "cpu") -> None:
+    """Train, or continue, one block of a run on a device; nothing if it is finished.
 
     Works beside other blocks of the run, in this or in other processes. Raises RunError if the run is not cut into
     blocks or has no such block, and what training raises (see `train_watched`).
@@ -53,12 +55,14 @@ def train_block(path: Path, index: int, options: WatchOptions, console: Console)
             if folder.is_done(key):
                 console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
                 return
-            folder.claim(key)
-            _train(run, index, blocks, options, console)
+            folder.discard_unless(key)
+            _train(run, index, blocks, options, console, torch.device(device))
 
 
-def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, console: Console) -> None:
-    opened, folder, method = open_run(run.path, "coarse"), run.block(index), run.method()
+def _train(
+    run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, console: Console, device: torch.device
+) -> None:
+    opened, folder, method = open_run(run.path, "coarse", device), run.block(index), run.method()
     capture, coarse = opened.capture, opened.model
     chosen = views_of_block(run, capture, index)
     views = [capture.train_views[i] for i in chosen]
@@ -69,7 +73,10 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
     if not views or not len(anchors):
         _keep_coarse(folder, replace(coarse, anchors=anchors, facts=facts), len(views), console)
         return
+    owned = [each.anchors_core for each in run.partition_record().blocks]
     config = block_training(method, len(views))
+    limit = block_limit(method.block, owned[index], sum(owned))
+    config = replace(config, growth=replace(config.growth, max_anchors=limit))
     shares = shares_for(config, anchors, [view.camera for view in views])
     began = time.monotonic()
     crops = None
@@ -84,8 +91,9 @@ def _train(run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, co
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
     with ImageCache(views, image_budget(options), downscales=factors) as images:
         stage = Stage(
-            config, images, len(views), coarse.voxel, camera_height(capture), coarse.background,
-            frozen_decoder=method.block.decoder == "frozen", surroundings=Surroundings(surroundings, coarse.decoder),
+            config, images, len(views), coarse.voxel, camera_height(capture), kind="block",
+            background=coarse.background, device=device, frozen_decoder=method.block.decoder == "frozen",
+            surroundings=Surroundings(surroundings, coarse.decoder),
             may_hold=holds(blocks, index, method.block), mobility=ramp(blocks, index, method.block),
             appearance_of=chosen, shares=shares, crops=crops,
         )  # fmt: skip
@@ -117,8 +125,9 @@ def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: C
     """A block that cannot be trained keeps what the coarse model has there, and says why."""
     why = "no camera sees it" if not views else "it holds no anchor"
     model.save(folder.model)
-    folder.set_status(
+    status = Status(
         "done", iteration=0, iterations=0, anchors=len(model.anchors), seconds=0.0, why=why,
         model=identity(folder.model),
     )  # fmt: skip
+    folder.set_status(status)
     console.print(f"[yellow]note[/] this block stays as the coarse model has it: {why}", highlight=False)

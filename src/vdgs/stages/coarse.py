@@ -25,8 +25,10 @@ from vdgs.watching.anchors import continue_or_start, finish, note_without_growth
 from vdgs.watching.images import image_budget
 
 
-def train_coarse(run: RunFolder, capture: Capture, options: WatchOptions, console: Console) -> None:
-    """Train, or continue, the coarse model of a run; nothing if it is finished.
+def train_coarse(
+    run: RunFolder, capture: Capture, options: WatchOptions, console: Console, device: str = "cpu"
+) -> None:
+    """Train, or continue, the coarse model of a run on a device; nothing if it is finished.
 
     Raises CaptureError for damaged photographs, Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged (last
     good state kept).
@@ -43,11 +45,13 @@ def train_coarse(run: RunFolder, capture: Capture, options: WatchOptions, consol
         config = run.method().training
         note_without_growth(config, console)
         write_json(run.capture_file, capture_facts(capture))
-        folder.claim(key)
-        _train(run, capture, config, options, console)
+        folder.discard_unless(key)
+        _train(run, capture, config, options, console, torch.device(device))
 
 
-def _train(run: RunFolder, capture: Capture, config: TrainConfig, options: WatchOptions, console: Console) -> None:
+def _train(
+    run: RunFolder, capture: Capture, config: TrainConfig, options: WatchOptions, console: Console, device: torch.device
+) -> None:
     folder, views = run.coarse, capture.train_views
     # The voxel follows from the capture: recomputed when a run continues.
     anchors, voxel = initial_anchors(
@@ -59,14 +63,9 @@ def _train(run: RunFolder, capture: Capture, config: TrainConfig, options: Watch
         if config.loss.background != "black":
             background = mean_colour(images, len(views), factors[-1])
         stage = Stage(
-            config,
-            images,
-            len(views),
-            voxel,
-            camera_height(capture),
-            background,
-            shares=shares_for(config, anchors, [view.camera for view in views]),
-        )
+            config, images, len(views), voxel, camera_height(capture), background=background,
+            shares=shares_for(config, anchors, [view.camera for view in views]), device=device,
+        )  # fmt: skip
         state = continue_or_start(folder, stage, lambda: _start(anchors, stage), console)
         _announce(capture, state, config, console)
         train_watched(folder, state, stage, options, console)
@@ -80,7 +79,7 @@ def _start(anchors: Anchors, stage: Stage) -> TrainingState:
     decoder = Decoder.initial(
         config.anchors.offsets, config.anchors.distance, config.anchors.appearance, stage.image_count, generator
     )
-    return start_state(anchors, decoder, stage)
+    return start_state(anchors.to(stage.device), decoder.to(stage.device), stage)
 
 
 def _announce(capture: Capture, state: TrainingState, config: TrainConfig, console: Console) -> None:

@@ -13,7 +13,6 @@ from rich.console import Console
 
 from vdgs.cameras import Camera
 from vdgs.evaluation.of_run import Views, cached_photographs, evaluate_run, evaluation_folder
-from vdgs.evaluation.saving import write_json
 from vdgs.evaluation.seams import block_table, evaluate_blocks
 from vdgs.kernels.types import Raster
 from vdgs.memory.process import forget_peak, peak_memory_bytes
@@ -24,17 +23,23 @@ from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.settings.requests import ModelName
-from vdgs.storage.files import read_record
+from vdgs.storage.files import read_record, write_json
 
 #: Blocks are held assembled among their surroundings up to so many bytes (at least one): views show them in turn.
 HELD_BYTES = 2_000_000_000
 
 
 def evaluate_stage(
-    path: Path, which: ModelName, lpips_weights: Path | None, bins: int, console: Console, views: Views = "test"
+    path: Path,
+    which: ModelName,
+    lpips_weights: Path | None,
+    bins: int,
+    console: Console,
+    views: Views = "test",
+    device: str = "cpu",
 ) -> None:
     """Measure a model of a run; of the merged one, on test views, also block by block and at the seams."""
-    opened = open_run(path, which)
+    opened = open_run(path, which, device)
     output = evaluation_folder(opened.folder, opened.name, views)
     _forget(output)
     forget_peak()
@@ -58,7 +63,7 @@ def is_measured(run: RunFolder, name: str, lpips_weights: Path | None, bins: int
 
 def _record_of(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> dict[str, Any]:
     stage = run.merged if name == "merged" else run.coarse
-    return {"model": stage.status().get("model"), "lpips_weights": str(lpips_weights), "bins": bins}
+    return {"model": stage.status().model, "lpips_weights": str(lpips_weights), "bins": bins}
 
 
 def _forget(output: Path) -> None:
@@ -70,7 +75,7 @@ def _forget(output: Path) -> None:
 
 def _evaluate_blocks(opened: TrainedRun) -> dict[str, Any]:
     run = opened.folder
-    coarse, blocks = AnchorModel.load(run.coarse.model), blocks_of(run)
+    coarse, blocks = AnchorModel.load(run.coarse.model).to(opened.device), blocks_of(run)
     alone = BlocksAlone(run, coarse)
     with cached_photographs(opened.capture.test_views) as photographs:
         return evaluate_blocks(
@@ -106,7 +111,7 @@ class BlocksAlone:
 
     def assembled(self, index: int) -> AnchorModel:
         """A block's own anchors and what stood around them in its training, each with its decoder."""
-        own = AnchorModel.load(self._run.block(index).model)
+        own = AnchorModel.load(self._run.block(index).model).to(self._coarse.anchors.positions.device)
         around = self._coarse.anchors.select(self._around[index])
         parts = Part(len(own.anchors), own.decoder), Part(len(around), self._coarse.decoder)
         return replace(own, anchors=own.anchors.extended(around), parts=parts)

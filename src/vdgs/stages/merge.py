@@ -1,4 +1,4 @@
-"""Trained blocks become one scene (end of section III-B)."""
+"""Trained blocks become one scene (end of section IV-B)."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from vdgs.partition.merging import merge
 from vdgs.runs.cut import blocks_of, views_of_block
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
+from vdgs.runs.status import Status
 from vdgs.storage.tensors import identity
 
 
@@ -27,8 +28,8 @@ def merge_run(path: Path, incomplete: bool, console: Console) -> None:
         key, keys = run.keys().merge, run.keys()
         blocks = blocks_of(run)
         done = [run.block(index).is_done(keys.blocks) for index in range(len(blocks))]
-        models = [run.block(i).status().get("model") if whole else None for i, whole in enumerate(done)]
-        if run.merged.is_done(key) and run.merged.status().get("block_models") == models:
+        models = [run.block(i).status().model if whole else None for i, whole in enumerate(done)]
+        if run.merged.is_done(key) and run.merged.status().block_models == tuple(models):
             console.print(f"{run.merged.model}: already merged; nothing to do", highlight=False)
             return
         if not all(done) and not incomplete:
@@ -41,18 +42,20 @@ def merge_run(path: Path, incomplete: bool, console: Console) -> None:
             [capture.train_views[i].camera for i in views_of_block(run, capture, index)] for index in range(len(blocks))
         ]
         trained = [AnchorModel.load(run.block(i).model) if whole else None for i, whole in enumerate(done)]
-        merged, facts = merge(coarse, trained, blocks, cameras, run.method().merge, allow_missing=incomplete)
-        run.merged.claim(key)
+        merged, became = merge(coarse, trained, blocks, cameras, run.method().merge, allow_missing=incomplete)
+        run.merged.discard_unless(key)
         merged.save(run.merged.model)
         trained_in = [run.block(i).status() for i, whole in enumerate(done) if whole]
-        run.merged.set_status(
-            "done", anchors=len(merged.anchors), blocks_trained=sum(done), blocks=facts,
-            block_models=models, model=identity(run.merged.model),
-            seconds=opened.status.get("seconds", 0.0) + sum(each.get("seconds", 0.0) for each in trained_in),
-            iterations=opened.status.get("iteration", 0) + sum(each.get("iteration", 0) for each in trained_in),
-            peak_memory_bytes=max(each.get("peak_memory_bytes") or 0 for each in [opened.status, *trained_in]),
+        stages = [opened.status, *trained_in]
+        status = Status(
+            "done", anchors=len(merged.anchors), blocks_trained=sum(done), blocks=tuple(became),
+            block_models=tuple(models), model=identity(run.merged.model),
+            seconds=sum(each.seconds or 0.0 for each in stages),
+            iterations=sum(each.iteration or 0 for each in stages),
+            peak_memory_bytes=max(each.peak_memory_bytes or 0 for each in stages),
             merge_seconds=time.monotonic() - began, merge_peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
+        run.merged.set_status(status)
     console.print(
         f"merged {sum(done)} of {len(blocks)} blocks: {len(coarse.anchors):,} coarse anchors became "
         f"{len(merged.anchors):,}\nmodel: {run.merged.model}",
@@ -65,8 +68,8 @@ def _refuse(run: RunFolder, done: list[bool]) -> None:
     for index, whole in enumerate(done):
         if not whole:
             status = run.block(index).status()
-            state = "not trained yet" if status["state"] in ("new", "queued") else status["state"]
-            lines.append(f"block {index}: {state}" + (f" ({status['why']})" if status.get("why") else ""))
+            state = "not trained yet" if status.state in ("new", "queued") else status.state
+            lines.append(f"block {index}: {state}" + (f" ({status.why})" if status.why else ""))
     raise RunError(
         f"{run.path}: not all blocks are trained:\n  " + "\n  ".join(lines)
         + f"\nTrain them with `vdgs train {run.path}`, or give --incomplete to let the coarse model stand in for them."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import sys
 import time
@@ -11,15 +10,17 @@ from pathlib import Path
 
 from rich.console import Console
 
-from vdgs.errors import RunError, VdgsError
-from vdgs.executors.local import Job, default_jobs, run_jobs
-from vdgs.kernels.native.module import threads as threads_available
+from vdgs.errors import RunError, Stopped, VdgsError
+from vdgs.executors.blocks import BlockCommand, default_jobs, run_blocks
+from vdgs.executors.local import LocalExecutor
+from vdgs.kernels import threads as threads_available
 from vdgs.memory.estimate import Need, estimate, in_gb
 from vdgs.memory.process import available_bytes
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.status import Status
+from vdgs.settings.method import block_limit
 from vdgs.settings.watching import WatchOptions
-from vdgs.watching.watch import Stopped
 
 #: Share of a block's anchors that one photograph may see, for the estimate before a block is opened (choice).
 SEEN = 0.5
@@ -61,37 +62,42 @@ def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console,
             )
         began = time.monotonic()
         for index in left:
-            _queue(run.block(index), key)
-        commands = [_job(run, index, threads, budget / at_once, options, device) for index in left]
-        outcomes = run_jobs(commands, at_once=at_once, retries=2, console=console)
+            _mark_queued(run.block(index), key)
+        commands = [_command(run, index, threads, budget / at_once, options, device) for index in left]
+        outcomes = run_blocks(commands, LocalExecutor(at_once), console)
     if any(outcome.state == "stopped" for outcome in outcomes):
         raise Stopped("Stopped; every block that was training is saved. The same command continues.")
     failed = [outcome for outcome in outcomes if outcome.state != "done"]
     if failed:
         raise RunError(
             f"{path}: {len(failed)} of {len(blocks)} blocks failed:\n  "
-            + "\n  ".join(f"block {outcome.index}: {outcome.why}" for outcome in failed)
+            + "\n  ".join(f"{outcome.name}: {outcome.why}" for outcome in failed)
             + f"\nTheir output is in {path}/blocks/NN/output.log. The same command tries them again."
         )
     console.print(f"blocks trained in {(time.monotonic() - began) / 60:.1f} min", highlight=False)
 
 
-def _job(run: RunFolder, index: int, threads: int, image_gb: float, options: WatchOptions, device: str) -> Job:
+def _command(
+    run: RunFolder, index: int, threads: int, image_gb: float, options: WatchOptions, device: str
+) -> BlockCommand:  # fmt: skip
     command = [
         sys.executable, "-m", "vdgs.cli", "train", str(run.path), "--block", str(index), "--threads", str(threads),
         "--image-memory-gb", f"{image_gb:.3f}", "--save-every", str(options.save_every), "--device", device,
     ]  # fmt: skip
     if options.tensorboard:
         command.append("--tensorboard")
-    return Job(index, run.block(index), command, dict(os.environ))
+    return BlockCommand(index, run.block(index), command)
 
 
-def _queue(folder: StageFolder, key: str) -> None:
-    """Let a block wait for its turn, unless another process trains it already (its status is then its own)."""
+def _mark_queued(folder: StageFolder, key: str) -> None:
+    """Let a block say that it waits for its turn, and hold no work of other settings.
+
+    Not if another process trains it already: its status is then its own.
+    """
     with suppress(RunError), folder.locked():
-        folder.claim(key)
+        folder.discard_unless(key)
         if not folder.is_done(key):
-            folder.set_status("queued")
+            folder.set_status(Status("queued"))
 
 
 def _remove_beyond(run: RunFolder, count: int, console: Console) -> None:
@@ -105,9 +111,10 @@ def _remove_beyond(run: RunFolder, count: int, console: Console) -> None:
 def _block_bytes(run: RunFolder) -> int:
     """Memory by estimate that the largest block needs for the program, its anchors once they have grown, and those
     around it. Photographs have a budget of their own."""
-    method, anchors = run.method(), [each["anchors_core"] for each in run.partition_facts()["blocks"]]
+    method, anchors = run.method(), [each.anchors_core for each in run.partition_record().blocks]
+    limit = block_limit(method.block, max(anchors), sum(anchors))
     need = Need(
-        anchors=max(anchors), max_anchors=method.block.growth.max_anchors, offsets=method.training.anchors.offsets,
+        anchors=max(anchors), max_anchors=limit, offsets=method.training.anchors.offsets,
         seen=SEEN, pixels=0, images_bytes=0, surroundings=sum(anchors) - max(anchors),
     )  # fmt: skip
     return estimate(need).total

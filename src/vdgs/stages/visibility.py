@@ -1,4 +1,4 @@
-"""How many training cameras see each anchor of the coarse model (section III-B), as numbers and as a map.
+"""How many training cameras see each anchor of the coarse model (section IV-B), as numbers and as a map.
 
 RUN/visibility/  visibility.safetensors (V of every anchor), visibility.json (its distribution), map.png
 """

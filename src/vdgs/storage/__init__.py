@@ -1,1 +1,1 @@
-"""Files that are whole or absent: text and JSON, tensors, saved states."""
+"""Files that are whole or absent: text and JSON, tensors, checkpoints."""

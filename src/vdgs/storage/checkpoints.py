@@ -1,4 +1,4 @@
-"""Saved states of a stage: whole or absent, checked when read, the last two kept.
+"""Checkpoints of a stage: whole or absent, checked when read, the last two kept.
 
 A state is `NNNNNNNN.safetensors` (tensors) and, written after it, `NNNNNNNN.json` (iteration, facts, size and
 CRC-32 of the tensors' file). A state counts only if its JSON is there and the CRC agrees, so that a cut-off or
@@ -56,7 +56,7 @@ def load_newest(folder: Path) -> tuple[SavedState | None, list[str]]:
 
 
 def discard_after(folder: Path, iteration: int) -> None:
-    """Delete states beyond `iteration`: damaged ones, which would count among those that are kept."""
+    """Delete checkpoints beyond `iteration`: damaged ones, which would count among those that are kept."""
     for sidecar in folder.glob("*.json"):
         if sidecar.stem.isdecimal() and int(sidecar.stem) > iteration:
             sidecar.unlink()

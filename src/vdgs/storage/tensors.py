@@ -30,11 +30,11 @@ DTYPES = {
 _NAMES = {dtype: name for name, dtype in DTYPES.items()}
 _PIECE = 1 << 20
 #: What to do about a model that cannot be used.
-REBUILD = "Delete it and run the command that trained it again: it is rebuilt from the last saved state."
+REBUILD = "Delete it and run the command that trained it again: it is rebuilt from the last checkpoint."
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
-    """Write tensors on the CPU, with at most one extra copy of a tensor that is not contiguous.
+    """Write tensors, with at most one extra copy of a tensor that is not contiguous.
 
     Raises OSError if the disk refuses (what was written so far stays: see `files.write_atomically`), TypeError for a
     type outside DTYPES.
@@ -112,6 +112,7 @@ def checksum(tensors: Mapping[str, Tensor]) -> int:
 
 
 def _bytes_of(tensor: Tensor) -> memoryview:
-    """The memory of a contiguous tensor."""
+    """The memory of a contiguous tensor; of a copy of it where it is not in main memory."""
+    tensor = tensor.cpu()
     # An empty array has no memory to view; and numpy's types do not say that an array is a buffer.
     return memoryview(tensor.reshape(-1).view(torch.uint8).numpy() if tensor.numel() else bytearray())  # type: ignore[arg-type]

@@ -56,7 +56,7 @@ _TRUTH_NOTE = """- `truth/`: depth and true visibility (with occlusion) per pixe
 
 
 @dataclass(frozen=True, eq=False)
-class _Photographs:
+class _PlannedViews:
     """Names and true cameras of all photographs, the first `training` of which train; gains [n, 3]."""
 
     names: list[str]
@@ -117,7 +117,7 @@ def _fill(folder: Path, options: ResolvedOptions, tell: Progress) -> FlightImbal
     return found
 
 
-def _plan(town: Town, tracer: Tracer, options: ResolvedOptions) -> tuple[_Photographs, FlightImbalance]:
+def _plan(town: Town, tracer: Tracer, options: ResolvedOptions) -> tuple[_PlannedViews, FlightImbalance]:
     """The flight, the test and validation photographs, and how unevenly the flight sees the place."""
     training = fly(options, town)
     half = options.extent_m / 2
@@ -129,10 +129,10 @@ def _plan(town: Town, tracer: Tracer, options: ResolvedOptions) -> tuple[_Photog
         cameras += held_out_cameras(tracer, town.terrain, training, places, count, options, rng)
         names += [f"{kind}_{k + 1:04d}.jpg" for k in range(count)]
     gains = exposure_gains(len(cameras), options.exposure_stops, np.random.default_rng([options.seed, 5]))
-    return _Photographs(names, cameras, gains, len(training)), flight_imbalance(views, len(training))
+    return _PlannedViews(names, cameras, gains, len(training)), flight_imbalance(views, len(training))
 
 
-def _write_lists(folder: Path, photographs: _Photographs, options: ResolvedOptions) -> None:
+def _write_lists(folder: Path, photographs: _PlannedViews, options: ResolvedOptions) -> None:
     """`test.txt` and `validation.txt`, which loading a capture keeps to."""
     first = photographs.training
     test = photographs.names[first : first + options.test_images]
@@ -147,7 +147,7 @@ def _take_pictures(
     town: Town,
     tracer: Tracer,
     sky: SkyMap,
-    photographs: _Photographs,
+    photographs: _PlannedViews,
     options: ResolvedOptions,
     pool: Executor,
     tell: Progress,
@@ -178,7 +178,7 @@ def _write_model(
     folder: Path,
     town: Town,
     tracer: Tracer,
-    photographs: _Photographs,
+    photographs: _PlannedViews,
     seeds: list[Seeds],
     options: ResolvedOptions,
     tell: Progress,
@@ -199,7 +199,7 @@ def _write_model(
 def _write_truth(
     folder: Path,
     tracer: Tracer,
-    photographs: _Photographs,
+    photographs: _PlannedViews,
     cloud: SparseCloud,
     found: FlightImbalance,
     options: ResolvedOptions,

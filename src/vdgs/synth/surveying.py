@@ -1,6 +1,6 @@
 """Who truly sees what: lines of sight from cameras to places on the true surface, by ray casting.
 
-This is visibility with occlusion, the truth that V_i (frusta only, section III-B of the paper) stands in for.
+This is visibility with occlusion, the truth that V_i (frusta only, section IV-B of the paper) stands in for.
 """
 
 from __future__ import annotations

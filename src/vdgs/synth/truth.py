@@ -85,15 +85,6 @@ def load_truth(capture_root: Path) -> Truth:
     return Truth(folder)
 
 
-def visibility_map_from_truth(view: View) -> Float[np.ndarray, "h w"]:
-    """The true visibility of a test or validation view of a generated capture, at the size at which it is used.
-
-    [h, w] float32: training photographs that truly see the surface at the pixel, NaN for sky. Raises VdgsError where
-    there is no truth.
-    """
-    return load_truth(view.image_path.parents[1]).visibility_map(view)
-
-
 def pack_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Depth [h, w] in metres (inf: sky) as uint16 and its bounds [2]: log-spaced, so that the error is relative."""
     sky = ~np.isfinite(depth)

@@ -46,11 +46,6 @@ class Average:
         for name, mean in self.decoder.items():
             mean.lerp_(decoder.tensors()[name], 1 / self.count)
 
-    def reorder(self, order: Tensor) -> None:
-        """Put the anchors into another order, tensor by tensor."""
-        for name in self.anchors:
-            self.anchors[name] = self.anchors[name].index_select(0, order)
-
 
 def counts_in_mean(iteration: int, config: TrainConfig) -> bool:
     """Whether the model after `iteration` steps is one of those averaged: about `MODELS`, evenly spread over the last

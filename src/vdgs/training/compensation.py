@@ -6,7 +6,7 @@ Dimensions: n anchors, k offsets. A growth cycle is what lies between two growth
     update_cache(compensation, statistics, low, config)                      # g_k, eq. 10
     change = compensate(compensation, low, threshold, growth, config)
     decision = decide(..., compensated=change)                               # grows; resets what was judged
-    compensation = compensation.extended(len(decision.added)).select(kept)   # with anchors and statistics
+    remap(state, ...)                                                        # with all that is kept per anchor
     begin_cycle(compensation, statistics)                                    # the next cycle counts from here
 
 c_k belongs to the source anchor, hence L is a set of anchors; g_k belongs to the offset.
@@ -22,8 +22,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vdgs.kernels.types import Statistics
 from vdgs.settings.method import CompensationConfig, GrowthConfig
-from vdgs.training.growth import Compensated, Decision, Statistics
+from vdgs.training.growth import Compensated, Decision
 
 #: An offset of low visibility is judged only when it was drawn more often than this (choice).
 LEAST_GATE = 2.0
@@ -44,35 +45,38 @@ class Compensation:
     drawn_before: Float[Tensor, "n k"]
 
     @staticmethod
-    def zeros(n: int, k: int) -> Compensation:
-        return Compensation(torch.zeros(n, k), torch.zeros(n, k), torch.zeros(n, k))
+    def zeros(n: int, k: int, device: torch.device | None = None) -> Compensation:
+        return Compensation(*(torch.zeros(n, k, device=device) for _ in range(3)))
 
     def tensors(self) -> dict[str, Tensor]:
         return {item.name: getattr(self, item.name) for item in fields(self)}
-
-    def select(self, rows: Tensor) -> Compensation:
-        """Those of the given anchors (indices or mask)."""
-        return Compensation(**{name: tensor[rows] for name, tensor in self.tensors().items()})
-
-    def extended(self, count: int) -> Compensation:
-        """The same, followed by `count` anchors without history."""
-        return Compensation(
-            **{name: torch.cat([t, t.new_zeros(count, t.shape[1])]) for name, t in self.tensors().items()}
-        )
 
 
 def low_visibility(share: Float[Tensor, " n"], config: CompensationConfig) -> tuple[Bool[Tensor, " n"], float]:
     """The set L = {c_k < T_low} of anchors, and the T_low used.
 
     `share` is c_k: the share in [0, 1] of the cycle's cameras whose frustum holds the anchor. With `t_low_quantile`
-    above 0, T_low is that quantile of the shares above 0, and 0 where there are none (L is then empty).
+    above 0, T_low is that quantile of the shares above 0. Cycles of few cameras have few different shares, and many
+    anchors may have just T_low: L then takes in all anchors up to that share at which it comes nearest to the quantile
+    of those seen (choice; the larger of two that are as near). It is empty where no anchor is seen, and where nearly
+    all that are seen have the least share.
     """
-    threshold = config.t_low
-    if config.t_low_quantile > 0:
-        some = share[share > 0]
-        # Not torch.quantile, which refuses more than 16 million numbers.
-        threshold = float(np.quantile(some.numpy(), config.t_low_quantile)) if len(some) else 0.0
-    return share < threshold, threshold
+    if config.t_low_quantile <= 0:
+        return share < config.t_low, config.t_low
+    some = share[share > 0].cpu().numpy()
+    if not len(some):
+        return torch.zeros_like(share, dtype=torch.bool), 0.0
+    # Not torch.quantile, which refuses more than 16 million numbers.
+    return share <= _highest_of(some, config.t_low_quantile), float(np.quantile(some, config.t_low_quantile))
+
+
+def _highest_of(shares: Float[np.ndarray, " s"], quantile: float) -> float:
+    """The highest share in the set of lowest ones whose size is nearest to the quantile; 0 if that set is empty."""
+    values, counts = np.unique(shares, return_counts=True)
+    sizes = np.concatenate([[0], np.cumsum(counts)])
+    off = np.abs(sizes - quantile * len(shares))
+    nearest = int(np.flatnonzero(off == off.min())[-1])
+    return float(values[nearest - 1]) if nearest else 0.0
 
 
 def begin_cycle(compensation: Compensation, statistics: Statistics) -> None:
@@ -125,18 +129,25 @@ def compensate(
 
 
 def cycle_facts(
-    compensated: Compensated, threshold: float, decision: Decision, config: CompensationConfig
+    compensated: Compensated,
+    share: Float[Tensor, " n"],
+    threshold: float,
+    decision: Decision,
+    config: CompensationConfig,
 ) -> dict[str, Any]:
     """JSON-able facts of one cycle for the log.
 
-    `low_share`: share of the anchors that are of low visibility; `t_low`: the threshold used; `mean_cache`,
+    `low_share`: share of the anchors that are of low visibility; `low_share_of_seen`: the same of those that a camera
+    of the cycle sees, 0 where ties leave nothing near the wished quantile; `t_low`: the threshold used; `mean_cache`,
     `max_cache`: g over the offsets of L (null where L is empty), `capped`: how many of them are at the cap;
     `grown_low`, `grown_other`: new anchors in cells with a parent in L, and the others; `pruned`: anchors removed.
     """
     low, offsets = int(compensated.low.sum()), compensated.added.shape[1]
-    added = compensated.added.numpy()  # numpy sums in one order for any number of threads
+    seen = share > 0
+    added = compensated.added.cpu().numpy()  # numpy sums in one order for any number of threads
     return {
         "low_share": low / max(len(compensated.low), 1),
+        "low_share_of_seen": int((compensated.low & seen).sum()) / max(int(seen.sum()), 1),
         "t_low": threshold,
         "mean_cache": float(added.sum(dtype=np.float64)) / (low * offsets) if low else None,
         "max_cache": float(added.max()) if low else None,

@@ -76,7 +76,7 @@ def crops_of(model: AnchorModel, own: Bool[Tensor, " n"], cameras: Sequence[Came
 
 def _own_share(model: AnchorModel, own: Bool[Tensor, " n"], camera: Camera) -> Float[np.ndarray, "h w"]:
     """What share the anchors have in each pixel of a small picture."""
-    return paint(model, own.float(), camera.within(LONGEST_SIDE_PX))[0].numpy()
+    return paint(model, own.float(), camera.within(LONGEST_SIDE_PX))[0].cpu().numpy()
 
 
 def _crop(share: Float[np.ndarray, "h w"]) -> Crop:

@@ -1,7 +1,7 @@
 """Where anchors are added and removed: statistics, growing, pruning (Scaffold-GS section 4.2).
 
 Dimensions: n anchors, k offsets, v anchors visible in a view, m Gaussians drawn (splats), p parents.
-`Statistics` are kept per anchor and grow and shrink with them; the rest are pure functions.
+`Statistics` are kept per anchor and grow and shrink with them; all here are pure functions.
 Plain growth and compensated growth (`vdgs.training.compensation`) are one policy: the latter adds to the gradients.
 """
 
@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from vdgs.kernels import native as kernels
-from vdgs.kernels.types import FEATURE_SIZE
+from vdgs.kernels import choose
+from vdgs.kernels.types import FEATURE_SIZE, Statistics
 from vdgs.model.anchors import Anchors
 from vdgs.settings.method import GrowthConfig
 
@@ -27,46 +27,6 @@ RANDOM_CHUNK = 2**20
 
 #: Which places [p, 3] may get a new anchor, as a mask [p].
 MayHold = Callable[[Tensor], Tensor]
-
-
-@dataclass
-class Statistics:
-    """Sums over the views since the last decision (float32; counts are exact up to 2^24)."""
-
-    #: Norm of dL/d(mean) in NDC units, and how often the offset was drawn, [n, k].
-    gradient: Float[Tensor, "n k"]
-    drawn: Float[Tensor, "n k"]
-    #: Opacity of the anchor's Gaussians, summed over them, and how often the anchor was visible, [n].
-    opacity: Float[Tensor, " n"]
-    seen: Float[Tensor, " n"]
-
-    @staticmethod
-    def zeros(n: int, k: int) -> Statistics:
-        return Statistics(torch.zeros(n, k), torch.zeros(n, k), torch.zeros(n), torch.zeros(n))
-
-    def tensors(self) -> dict[str, Tensor]:
-        return {item.name: getattr(self, item.name) for item in fields(self)}
-
-    def select(self, rows: Tensor) -> Statistics:
-        return Statistics(**{name: tensor[rows] for name, tensor in self.tensors().items()})
-
-    def extended(self, count: int) -> Statistics:
-        """The same, followed by `count` anchors without history."""
-        return Statistics(
-            **{name: torch.cat([t, t.new_zeros(count, *t.shape[1:])]) for name, t in self.tensors().items()}
-        )
-
-    def add_view(
-        self,
-        visible: Int64[Tensor, " v"],
-        source: Tensor,
-        opacities: Float[Tensor, " m"],
-        gradient_px: Float[Tensor, "m 2"],
-        width: int,
-        height: int,
-    ) -> None:
-        """Count one view; see `kernels.add_view_statistics`."""
-        kernels.add_view_statistics(visible, source, opacities, gradient_px, width, height, *self.tensors().values())
 
 
 @dataclass(frozen=True)
@@ -165,7 +125,7 @@ def _parents(
     if compensated is not None:
         gradient += compensated.added
     index = (judged & (gradient >= threshold)).reshape(-1).nonzero()[:, 0]
-    low = torch.zeros(len(index), dtype=torch.bool)
+    low = torch.zeros_like(index, dtype=torch.bool)
     if compensated is not None:
         low = compensated.low[index // gradient.shape[1]]
     return _Parents(index, gradient.reshape(-1)[index], low)
@@ -181,7 +141,7 @@ def _grow(
     may_hold: MayHold | None,
 ) -> tuple[Anchors, int]:
     """New anchors, at the centres of empty cells that hold a parent's Gaussian, and how many have a parent in L."""
-    grown, grown_low = anchors.select(torch.zeros(0, dtype=torch.int64)), 0
+    grown, grown_low = anchors.select(parents.index[:0]), 0
     for level in range(config.levels):
         parents = parents.select(parents.gradient >= config.threshold * 2.0**level)
         room = config.max_anchors - len(anchors) - len(grown) if config.max_anchors else None
@@ -197,14 +157,14 @@ def _grow(
 
 def _random(index: Int64[Tensor, " p"], count: int, generator: torch.Generator) -> Float[Tensor, " p"]:
     """The numbers at `index` (ascending) of `count` uniform random numbers."""
-    numbers = torch.empty(len(index))
+    here, numbers = index.cpu(), torch.empty(len(index))  # drawn on the CPU: the same numbers for any device
     done = 0
     for start in range(0, count, RANDOM_CHUNK):
         chunk = torch.rand(min(RANDOM_CHUNK, count - start), generator=generator)
-        end = int(torch.searchsorted(index, start + len(chunk)))
-        numbers[done:end] = chunk[index[done:end] - start]
+        end = int(torch.searchsorted(here, start + len(chunk)))
+        numbers[done:end] = chunk[here[done:end] - start]
         done = end
-    return numbers
+    return numbers.to(index.device)
 
 
 def _fill_cells(
@@ -220,13 +180,13 @@ def _fill_cells(
     Where `room` is short, the cells with the largest gradients are served first. Also says how many of the cells
     have a parent in L.
     """
-    k = anchors.offsets.shape[1]
+    kernels, k = choose(anchors.positions.device), anchors.offsets.shape[1]
     rows = parents.index // k
     means = anchors.positions[rows] + anchors.offsets[rows, parents.index % k] * anchors.log_scales[rows, :3].exp()
     within = _within_lattice(means, cell)
     parents, means = parents.select(within), means[within]
     # Cells are centred on multiples of their edge (upstream rounds), hence the origin at half a cell.
-    origin = torch.full((3,), -0.5 * cell)
+    origin = means.new_full((3,), -0.5 * cell)
     cells, group = kernels.group_cells(kernels.cell_keys(means, cell, origin))
     chosen = ~_hold_any(cells, taken, cell, origin)
     if may_hold is not None:
@@ -244,12 +204,12 @@ def _anchors_at(
     centres: Float[Tensor, "c 3"], place: Int64[Tensor, " p"], parents: _Parents, anchors: Anchors, cell: float
 ) -> tuple[Anchors, int]:
     """New anchors at `centres`, the features the maximum of their parents', and how many have a parent in L."""
-    k, count = anchors.offsets.shape[1], len(centres)
+    kernels, k, count = choose(centres.device), anchors.offsets.shape[1], len(centres)
     new = Anchors(
         positions=centres,
         features=kernels.group_max(anchors.features[parents.index // k], place, count).reshape(count, FEATURE_SIZE),
-        offsets=torch.zeros(count, k, 3),
-        log_scales=torch.full((count, 6), math.log(cell)),
+        offsets=centres.new_zeros(count, k, 3),
+        log_scales=centres.new_full((count, 6), math.log(cell)),
     )
     return new, len(place[parents.low].unique())
 
@@ -258,7 +218,7 @@ def _hold_any(
     cells: Int64[Tensor, " c"], points: Sequence[Float[Tensor, "_ 3"]], cell: float, origin: Float[Tensor, "3"]
 ) -> Bool[Tensor, " c"]:
     """Which of the cells hold any of the points."""
-    full = torch.zeros(len(cells), dtype=torch.bool)
+    kernels, full = choose(cells.device), torch.zeros_like(cells, dtype=torch.bool)
     for some in points:
         within = _within_lattice(some, cell)
         some = some if bool(within.all()) else some[within]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.errors import TrainingDiverged
-from vdgs.kernels import native as kernels
+from vdgs.kernels import choose
 from vdgs.kernels.types import DecoderWeights, SplatGradients, Splats
 from vdgs.model.render import decode_rows, visible_rows
 from vdgs.training.averaging import Average, counts_in_mean
@@ -54,6 +54,7 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
             decode_rows(state.anchors, rows, weights, camera), camera, background_at(stage, iteration), around
         )
     image = drawn.image.requires_grad_(True)
+    kernels = choose(stage.device)
     photometric = kernels.photometric_loss(image, target, mask, ssim_weight=config.loss.ssim_weight)
     volume_weight = _volume_weight(stage)
     loss = photometric.loss.detach()
@@ -72,7 +73,11 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
 
     growing = iteration + 1 <= config.growth.until * config.iterations
     if growing and iteration + 1 > config.growth.statistics_from:
-        state.statistics.add_view(rows, drawn.source, drawn.opacities, gradients.means_px, *camera.whole_size)
+        # Seen is what V counts too: an anchor beside the picture may touch it, but is not to blame for showing nothing.
+        inside = kernels.mark_visible(state.anchors.positions[rows], camera)
+        kernels.add_view_statistics(
+            state.statistics, rows, inside, drawn.source, drawn.opacities, gradients.means_px, *camera.whole_size
+        )
     state.iteration += 1
     report = StepReport(value, float(photometric.l1), float(photometric.ssim), len(rows), len(drawn.source))
     if growing and state.iteration >= config.growth.start and state.iteration % config.growth.interval == 0:
@@ -94,6 +99,7 @@ def _photograph(stage: Stage, view: int, downscale: int, iteration: int) -> tupl
     within its window of the part's border, where it sees nothing beyond).
     """
     target, mask = stage.images.get(view, downscale)
+    target, mask = target.to(stage.device), None if mask is None else mask.to(stage.device)
     camera = stage.images.camera(view, downscale)
     crop = crop_at(stage.crops, view, iteration)
     if crop == WHOLE:
@@ -133,7 +139,8 @@ def _move(
     """One step of Adam for the visible anchors and the decoder."""
     config, step = stage.config, state.iteration + 1
     rates = rates_at(config.rates, state.iteration / config.iterations)
-    finite = move_anchors(state.anchors, rows, gradients, weights, camera, state.optimiser, rates, step, stage.mobility)
+    states, updates = state.optimiser.anchor_states(state.anchors, rates), state.optimiser.updates
+    finite = move_anchors(state.anchors, rows, gradients, weights, camera, states, updates, stage.mobility)
     finite &= state.optimiser.update_decoder(state.decoder, rates, step)
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")

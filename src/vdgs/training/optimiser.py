@@ -5,30 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Int32
 from torch import Tensor
 
-from vdgs.kernels import native as kernels
+from vdgs.kernels import choose
 from vdgs.kernels.types import AdamState
 from vdgs.model.anchors import TRAINED, Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.settings.method import RateConfig
-
-
-def rebuild(tensors: dict[str, Tensor], more: dict[str, Tensor], kept: Tensor) -> None:
-    """Append to each tensor the rows of its name in `more`, then keep the `kept` rows (mask or order); in place.
-
-    Each old tensor is let go before the next is made: if nothing else holds it, no more than one is there twice.
-    """
-    for name in list(tensors):
-        before, added = tensors.pop(name), more[name]
-        if kept.dtype != torch.bool:
-            tensors[name] = (torch.cat([before, added]) if len(added) else before).index_select(0, kept)
-            continue
-        old, new = kept[: len(before)], kept[len(before) :]
-        stays, comes = int(old.sum()), int(new.sum())
-        tensors[name] = before.new_empty(stays + comes, *before.shape[1:])
-        torch.index_select(before, 0, old.nonzero()[:, 0], out=tensors[name][:stays])
-        torch.index_select(added, 0, new.nonzero()[:, 0], out=tensors[name][stays:])
 
 
 @dataclass
@@ -45,26 +29,23 @@ class Moments:
             {name: torch.zeros_like(p) for name, p in parameters.items()},
         )
 
-    def rebuild(self, added: int, kept: Tensor) -> None:
-        """For anchors: append `added` rows without history, then keep only the `kept` rows (mask or order).
-
-        Tensor by tensor, so that no more than one is there twice.
-        """
-        for tensors in (self.first, self.second):
-            rebuild(tensors, {name: t.new_zeros(added, *t.shape[1:]) for name, t in tensors.items()}, kept)
-
 
 @dataclass
 class Optimiser:
-    """Moments of all parameters; `step` counts updates from 1 (for the bias correction)."""
+    """Moments of all parameters, and what the bias correction counts: the updates of each anchor, [n] int32.
+
+    The decoder moves in every step: its updates are the steps.
+    """
 
     anchors: Moments
     decoder: Moments
+    updates: Int32[Tensor, " n"]
 
     @staticmethod
     def start(anchors: Anchors, decoder: Decoder) -> Optimiser:
         trained = {name: tensor for name, tensor in anchors.tensors().items() if name in TRAINED}
-        return Optimiser(Moments.zeros(trained), Moments.zeros(decoder.tensors()))
+        updates = torch.zeros_like(anchors.positions[:, 0], dtype=torch.int32)
+        return Optimiser(Moments.zeros(trained), Moments.zeros(decoder.tensors()), updates)
 
     def anchor_states(self, anchors: Anchors, rates: dict[str, float]) -> list[AdamState]:
         """What moves of the anchors, in the order of `TRAINED`."""
@@ -74,14 +55,16 @@ class Optimiser:
         ]
 
     def update_decoder(self, decoder: Decoder, rates: dict[str, float], step: int) -> bool:
-        """Move the decoder's tensors by their `.grad`, in place. False: a gradient is not finite."""
+        """Move the decoder's tensors by their `.grad`, in place; `step` counts from 1.
+
+        False: a gradient is not finite.
+        """
         finite = True
         for name, tensor in decoder.tensors().items():
             if tensor.grad is not None:
-                finite &= kernels.adam_rows(
-                    tensor.detach(), None, tensor.grad, self.decoder.first[name], self.decoder.second[name],
-                    learning_rate=rates[name.split("_")[0]], step=step,
-                )  # fmt: skip
+                moments = self.decoder.first[name], self.decoder.second[name]
+                state = AdamState(tensor.detach(), *moments, rates[name.split("_")[0]])
+                finite &= choose(tensor.device).adam_rows(state, None, tensor.grad, step)
                 tensor.grad = None
         return finite
 

@@ -6,13 +6,15 @@ A state that is saved and loaded continues with the same bits.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
 from vdgs.cameras import Camera
+from vdgs.kernels.types import Statistics
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.settings.method import TrainConfig
@@ -20,8 +22,11 @@ from vdgs.storage.checkpoints import SavedState
 from vdgs.training.averaging import Average
 from vdgs.training.compensation import Compensation
 from vdgs.training.crops import Crop
-from vdgs.training.growth import Statistics
 from vdgs.training.optimiser import Moments, Optimiser
+from vdgs.training.per_anchor import Group
+
+#: What is trained: the whole scene, or one block of it.
+StageKind = Literal["coarse", "block"]
 
 
 @runtime_checkable
@@ -56,6 +61,36 @@ class TrainingState:
     #: False while a step changes tensors: one that is broken off there leaves no state that may be saved.
     whole: bool = True
 
+    def groups(self) -> dict[str, Group]:
+        """All that is kept per anchor, by the names under which it is saved."""
+        moments = self.optimiser.anchors
+        groups = {
+            "anchors": self.anchors.tensors(), "statistics": self.statistics.tensors(),
+            "first.anchors": moments.first, "second.anchors": moments.second,
+            "updates": {"anchors": self.optimiser.updates},
+        }  # fmt: skip
+        if self.compensation is not None:
+            groups["compensation"] = self.compensation.tensors()
+        if self.average is not None:
+            groups["average.anchors"] = self.average.anchors
+        return groups
+
+    def take_groups(self) -> dict[str, Group]:
+        """`groups`, which the state no longer holds: see `per_anchor.remap`."""
+        groups = {name: dict(group) for name, group in self.groups().items()}
+        self.put_groups({name: {key: t[:0] for key, t in group.items()} for name, group in groups.items()})
+        return groups
+
+    def put_groups(self, groups: dict[str, Group]) -> None:
+        """The inverse of `take_groups`."""
+        self.anchors, self.statistics = Anchors(**groups["anchors"]), Statistics(**groups["statistics"])
+        self.optimiser.anchors = Moments(groups["first.anchors"], groups["second.anchors"])
+        self.optimiser.updates = groups["updates"]["anchors"]
+        if self.compensation is not None:
+            self.compensation = Compensation(**groups["compensation"])
+        if self.average is not None:
+            self.average.anchors = groups["average.anchors"]
+
     def result(self) -> tuple[Anchors, Decoder]:
         """What training has arrived at: the mean of the last models where there is one, else the last one."""
         if self.average is None:
@@ -82,8 +117,11 @@ class Stage:
     images: TrainingImages
     image_count: int
     voxel: float
-    #: Median height of the cameras above the ground, in units of the ground frame.
+    #: How high the cameras fly above the ground, or how far they are from the scene (`captures.heights`), in units of
+    #: the ground frame.
     camera_height: float
+    #: Whether the whole scene is trained or one block of it.
+    kind: StageKind = "coarse"
     #: Colour behind the scene.
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     #: A block may leave the decoder as it is.
@@ -100,6 +138,8 @@ class Stage:
     shares: tuple[float, ...] | None = None
     #: The part of each view that is drawn; None: all of all.
     crops: tuple[Crop, ...] | None = None
+    #: Where the arithmetic is done. Photographs and places come to it.
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
 
 
 @dataclass(frozen=True)
@@ -119,29 +159,25 @@ class StepReport:
 
 def start_state(anchors: Anchors, decoder: Decoder, stage: Stage) -> TrainingState:
     """A state before the first step. The anchors' tensors are moved in place: give copies of what must stay."""
-    n, k = len(anchors), anchors.offsets.shape[1]
+    n, k, device = len(anchors), anchors.offsets.shape[1], anchors.positions.device
     for name, tensor in decoder.tensors().items():
         # A block sees some of the photographs: the mean appearance, in which others are drawn, must not drift apart.
-        shared = stage.surroundings is not None and name.startswith("appearance")
+        shared = stage.kind == "block" and name.startswith("appearance")
         tensor.requires_grad_(not stage.frozen_decoder and not shared)
-    compensation = Compensation.zeros(n, k) if stage.config.compensation.enabled else None
+    compensation = Compensation.zeros(n, k, device) if stage.config.compensation.enabled else None
     optimiser = Optimiser.start(anchors, decoder)
-    return TrainingState(0, anchors, decoder, Statistics.zeros(n, k), optimiser, compensation)
+    return TrainingState(0, anchors, decoder, Statistics.zeros(n, k, device), optimiser, compensation)
 
 
 def to_saved(state: TrainingState) -> SavedState:
     """The whole state as tensors and facts."""
-    tensors = {f"anchors.{k}": v for k, v in state.anchors.tensors().items()}
-    tensors |= {f"decoder.{k}": v.detach() for k, v in state.decoder.tensors().items()}
-    tensors |= {f"statistics.{k}": v for k, v in state.statistics.tensors().items()}
-    for group, moments in (("anchors", state.optimiser.anchors), ("decoder", state.optimiser.decoder)):
-        tensors |= {f"first.{group}.{k}": v for k, v in moments.first.items()}
-        tensors |= {f"second.{group}.{k}": v for k, v in moments.second.items()}
-    if state.compensation is not None:
-        tensors |= {f"compensation.{k}": v for k, v in state.compensation.tensors().items()}
+    groups: dict[str, Mapping[str, Tensor]] = {**state.groups()}
+    groups["decoder"] = {name: tensor.detach() for name, tensor in state.decoder.tensors().items()}
+    groups["first.decoder"] = state.optimiser.decoder.first
+    groups["second.decoder"] = state.optimiser.decoder.second
     if state.average is not None:
-        tensors |= {f"average.anchors.{k}": v for k, v in state.average.anchors.items()}
-        tensors |= {f"average.decoder.{k}": v for k, v in state.average.decoder.items()}
+        groups["average.decoder"] = state.average.decoder
+    tensors = {f"{name}.{key}": tensor for name, group in groups.items() for key, tensor in group.items()}
     facts = {"loss": repr(state.loss), "best_loss": repr(state.best_loss), "psnr": repr(state.psnr),
              "seconds": state.seconds, "peak_memory_bytes": state.peak_memory_bytes,
              "averaged": 0 if state.average is None else state.average.count}  # fmt: skip
@@ -149,23 +185,17 @@ def to_saved(state: TrainingState) -> SavedState:
 
 
 def from_saved(saved: SavedState, stage: Stage) -> TrainingState:
-    """The inverse of `to_saved`, bit for bit. Raises KeyError if a tensor is missing."""
+    """The inverse of `to_saved`, bit for bit, on the stage's device. Raises KeyError if a tensor is missing."""
 
-    def part(prefix: str) -> dict[str, Tensor]:
-        return {k.removeprefix(prefix): v for k, v in saved.tensors.items() if k.startswith(prefix)}
+    def group(name: str) -> dict[str, Tensor]:
+        start = f"{name}."
+        return {k.removeprefix(start): v.to(stage.device) for k, v in saved.tensors.items() if k.startswith(start)}
 
-    anchors = Anchors(**part("anchors."))
-    decoder = Decoder.from_tensors(part("decoder."))
-    state = start_state(anchors, decoder, stage)
-    state.statistics = Statistics(**part("statistics."))
-    state.optimiser = Optimiser(
-        Moments(part("first.anchors."), part("second.anchors.")),
-        Moments(part("first.decoder."), part("second.decoder.")),
-    )
-    if state.compensation is not None:
-        state.compensation = Compensation(**part("compensation."))
+    state = start_state(Anchors(**group("anchors")), Decoder.from_tensors(group("decoder")), stage)
+    state.optimiser.decoder = Moments(group("first.decoder"), group("second.decoder"))
     if averaged := saved.facts.get("averaged", 0):
-        state.average = Average(averaged, part("average.anchors."), part("average.decoder."))
+        state.average = Average(averaged, group("average.anchors"), group("average.decoder"))
+    state.put_groups({name: group(name) for name in state.groups()})
     state.iteration = saved.iteration
     state.loss, state.best_loss = float(saved.facts["loss"]), float(saved.facts["best_loss"])
     state.psnr, state.seconds = float(saved.facts["psnr"]), float(saved.facts["seconds"])

@@ -1,4 +1,4 @@
-"""A training step by hand: a view drawn, and the way back from its image to the anchors.
+"""A training step by hand: a view drawn, and the backward pass from its image to the anchors.
 
 Autograd would hold a copy of the anchors in view and gradients beside all that they belong to. By hand, anchors are
 read where they stand, gradients of splats take the place of what is no longer needed, and an anchor moves as soon as
@@ -7,7 +7,7 @@ its gradient is known. The bits are those of autograd through `decode` and `rast
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,16 +15,15 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels import native as kernels
-from vdgs.kernels.native.rasterise import Drawing, rasterise_by_hand
-from vdgs.kernels.types import DecoderWeights, SplatGradients, Splats
+from vdgs.kernels import choose
+from vdgs.kernels.types import AdamState, AnchorSplats, DecoderWeights, RasterPullback, SplatGradients, Splats
 from vdgs.model.anchors import TRAINED, Anchors
-from vdgs.training.optimiser import Optimiser
+from vdgs.model.render import joined
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingView:
-    """A picture for training, and what the way back needs of the m splats of the anchors that are trained."""
+    """A picture for training, and what the backward pass needs of the m splats of the anchors that are trained."""
 
     image: Float[Tensor, "h w 3"]
     source: Int32[Tensor, " m"]
@@ -32,7 +31,7 @@ class TrainingView:
     opacities: Float[Tensor, " m"]
     #: Mean volume of the splats; NaN if there are none.
     volume: Float[Tensor, ""]
-    drawing: Drawing
+    pullback: RasterPullback
     #: What the gradients of means_px and conics, of these splats and then of those around them, may overwrite.
     room: tuple[Tensor, Tensor]
 
@@ -40,7 +39,7 @@ class TrainingView:
     def backward(self, image: Float[Tensor, "h w 3"], volume_weight: float) -> SplatGradients:
         """Gradients of a loss: `image` by the picture, `volume_weight` by the mean volume. Call it once."""
         m = len(self.source)
-        means_px, conics, colours, opacities, *_ = self.drawing.backward(image, over=self.room)
+        means_px, conics, colours, opacities, *_ = self.pullback(image, over=self.room)
         # In float32, as autograd divides.
         volume = float(torch.tensor(volume_weight) / m) if m else 0.0
         return SplatGradients(
@@ -50,23 +49,16 @@ class TrainingView:
 
 @torch.no_grad()
 def draw_view(
-    splats: Splats, camera: Camera, background: Float[Tensor, "3"], around: Splats | None = None
+    splats: AnchorSplats, camera: Camera, background: Float[Tensor, "3"], around: Splats | None = None
 ) -> TrainingView:
     """Draw the splats of trained anchors with those `around` them. The tensors of `splats` are the view's from now on:
     their memory is used again."""
-
-    def both(name: str) -> Tensor:
-        own: Tensor = getattr(splats, name)
-        return own if around is None else torch.cat([own, getattr(around, name)])
-
-    means_px, conics = both("means_px"), both("conics")
-    raster, drawing = rasterise_by_hand(
-        means_px, conics, both("colours"), both("opacities"), both("depths"), background,
-        width=camera.width, height=camera.height,
-    )  # fmt: skip
+    drawn = splats if around is None else joined(splats, around)
+    kernels = choose(drawn.means_px.device)
+    raster, pullback = kernels.rasterise_vjp(drawn, background, camera.width, camera.height)
     return TrainingView(
-        raster.image, splats.source, splats.colours, splats.opacities, splats.volumes.mean(), drawing,
-        (means_px, conics),
+        raster.image, splats.source, splats.colours, splats.opacities, splats.volumes.mean(), pullback,
+        (drawn.means_px, drawn.conics),
     )  # fmt: skip
 
 
@@ -76,20 +68,19 @@ def move_anchors(
     gradients: SplatGradients,
     weights: DecoderWeights,
     camera: Camera,
-    optimiser: Optimiser,
-    rates: dict[str, float],
-    step: int,
+    states: Sequence[AdamState],
+    updates: Int32[Tensor, " n"],
     mobility: Callable[[Tensor], Tensor] | None = None,
 ) -> bool:
     """Move the anchors of the given rows in place, and leave the decoder's gradients in its `.grad`.
 
-    `weights` are the decoder's as the view saw them, `step` counts from 1; `mobility` as in `training.Stage`.
-    False: a gradient is not finite, and some anchors may have moved while others have not.
+    `weights` are the decoder's as the view saw them, `states` those of `TRAINED`; `updates` counts how often each
+    anchor has moved; `mobility` is the learning-rate mask of `training.Stage`. False: a gradient is not finite, and
+    some anchors may have moved while others have not.
     """
     slow = None if mobility is None else _SlowAnchors.of(anchors, rows, mobility)
-    states = optimiser.anchor_states(anchors, rates)
-    finite, of_weights = kernels.decode_backward_adam(
-        anchors.positions, states, weights, camera, rows, gradients, step=step
+    finite, of_weights = choose(anchors.positions.device).decode_backward_adam(
+        anchors.positions, states, weights, camera, rows, gradients, updates
     )
     if slow is not None:
         slow.hold_back(anchors)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
-from vdgs.verbs.shared import open_console, use_device
+from vdgs.settings.capture import CaptureOptions
+from vdgs.verbs.shared import open_console
 
 
 @dataclass(frozen=True)
@@ -27,22 +28,21 @@ class BenchArguments:
     seeds: int | None = None
     """How many seeds (0, 1, ...); by default as many as the table has."""
     scenes: tuple[str, ...] = ()
-    """Other scenes than the table's, by name: tiny, lab-uneven, town-even, copr, residence, sci-art, ..."""
+    """Other scenes than the table's, by name: tiny, lab-uneven, town-even, copr, residence, sci-art, ... Or captures of
+    your own, as folders: ./my-place. What says how a capture is read (--images, --downscale and on) is about these."""
     methods: tuple[str, ...] = ()
     """Other methods than the table's, by name: full, baseline, no-blocking, vastgaussian, lambda-vis-0, ..."""
     renders: tuple[str, ...] = ()
     """What other programs rendered of the test views, a row for each NAME=FOLDER (several after one --renders):
     FOLDER/SCENE/VIEW.png or FOLDER/SCENE/SEED/VIEW.png. Measured as all others (docs/bench.md)."""
     data: Path | None = None
-    """Folder that holds the captures which are not generated: residence-pixsfm, copr, ..."""
+    """Folder that holds the scenes with names which are not generated: residence-pixsfm, copr, ..."""
     scale_iterations: float = 1.0
     """Factor on the iterations of every scene."""
     iterations_total: int | None = None
     """Iterations that every method may spend on a scene, shared out as the scene's own; overrides the factor."""
     max_anchors: int = 0
     """No growth beyond this many anchors, of the scene or of all blocks together; 0 for no limit."""
-    validation: bool = False
-    """Measure on training photographs that are held out instead of on the test views: for choosing settings."""
     jobs: int = 1
     """Runs at once; cores are shared among them."""
     redo: bool = False
@@ -51,8 +51,8 @@ class BenchArguments:
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     bins: int = 4
     """Number of groups by visibility."""
-    device: str = "auto"
-    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
+    options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
+    """How folders among --scenes are read; scenes with names have their own. --validation holds for all."""
 
 
 def bench(arguments: list[str]) -> None:
@@ -60,10 +60,9 @@ def bench(arguments: list[str]) -> None:
     from vdgs.bench.bench import BenchSettings, run_bench
     from vdgs.bench.plan import Choices
 
-    use_device(asked.device)
     choices = Choices(
         asked.seeds, asked.scenes, asked.methods, asked.scale_iterations, asked.iterations_total, asked.max_anchors,
-        asked.validation, asked.renders,
+        asked.options.validation, asked.renders, replace(asked.options, validation=False),
     )  # fmt: skip
     run_bench(
         BenchSettings(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -23,8 +23,8 @@ class EvalArguments:
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
     views: Literal["test", "training"] = "test"
-    """Which views. `training` goes into evaluation_training: what is much better there than on test views was learnt by
-    heart. Blocks and seams are measured on test views only."""
+    """Which views. `training` goes into evaluation_training: a model that is much better there than on test views
+    overfits. Blocks and seams are measured on test views only."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     bins: int = 4
@@ -39,9 +39,9 @@ def eval(arguments: list[str]) -> None:
     asked = tyro.cli(EvalArguments, args=arguments, prog="vdgs eval")
     from vdgs.stages.evaluate import evaluate_stage
 
-    use_device(asked.device)
+    device = use_device(asked.device)
     use_threads(asked.threads)
-    evaluate_stage(asked.run, asked.model, asked.lpips_weights, asked.bins, open_console(), asked.views)
+    evaluate_stage(asked.run, asked.model, asked.lpips_weights, asked.bins, open_console(), asked.views, device)
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,6 @@ def render(arguments: list[str]) -> None:
     asked = tyro.cli(RenderArguments, args=arguments, prog="vdgs render")
     from vdgs.films.film import render_run
 
-    use_device(asked.device)
+    device = use_device(asked.device)
     use_threads(asked.threads)
-    render_run(asked, open_console())
+    render_run(replace(asked, device=device), open_console())

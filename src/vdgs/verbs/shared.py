@@ -51,27 +51,21 @@ def change_settings(run: RunFolder, method: MethodConfig, redo: bool) -> None:
     wanted = run.settings() | to_dict(method)
     if wanted != run.settings():
         with run.locked():
-            for line in run.change(wanted, redo):
+            for line in run.change_settings(wanted, redo):
                 open_console().print(f"[yellow]changed[/] {line}", highlight=False)
 
 
 def use_threads(count: int) -> None:
-    import torch
+    from vdgs.kernels import set_threads, threads
 
-    from vdgs.kernels.native.module import set_threads, threads
-
-    if count > 0:
-        set_threads(count)
-    torch.set_num_threads(max(1, threads()))
+    set_threads(count if count > 0 else threads())
 
 
 def use_device(asked: str) -> str:
-    """Decide which device computes, say so in a line, and return it. Raises VdgsError for one that cannot."""
+    """Which device computes, decided before any work begins. Raises VdgsError for one that cannot."""
     from vdgs.kernels.devices import choose
 
-    choice = choose(asked)
-    open_console().print(str(choice), highlight=False)
-    return choice.device
+    return choose(asked).device
 
 
 def open_console() -> Console:

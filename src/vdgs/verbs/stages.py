@@ -91,7 +91,7 @@ def train(arguments: list[str]) -> None:
 
         stop_when_parent_dies()
         use_threads(asked.threads)
-        train_block(asked.run, asked.block, asked.watching, open_console())
+        train_block(asked.run, asked.block, asked.watching, open_console(), device)
     else:
         from vdgs.stages.train import train_blocks
 

@@ -43,11 +43,11 @@ def coarse(arguments: list[str]) -> None:
     from vdgs.runs.beginning import begin_run
     from vdgs.stages.coarse import train_coarse
 
-    use_device(asked.device)
+    device = use_device(asked.device)
     use_threads(asked.threads)
     method = replace(PRESETS[preset], training=asked.training)
     run, capture = begin_run(asked.capture, asked.output, asked.options, method)
-    train_coarse(run, capture, asked.watching, open_console())
+    train_coarse(run, capture, asked.watching, open_console(), device)
 
 
 @dataclass(frozen=True)

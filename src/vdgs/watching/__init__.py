@@ -1,1 +1,1 @@
-"""Training under the eyes of a person: shown, logged, saved, stopped and continued."""
+"""Training that is watched: shown, logged, checkpointed, stopped and continued."""

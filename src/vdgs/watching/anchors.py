@@ -1,4 +1,4 @@
-"""Anchors in training under the eyes of a person: what the coarse stage and a block show, log and advise."""
+"""Training of anchors, watched: what the coarse stage and a block show, log and advise."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from rich.console import Console
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.runs.folder import StageFolder
+from vdgs.runs.status import Status
 from vdgs.settings.method import TrainConfig
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.checkpoints import save_state
 from vdgs.storage.tensors import identity
 from vdgs.training import Stage, StepReport, TrainingState, from_saved, to_saved, train
-from vdgs.watching.memory_notes import after_failure, announce, kind_of, need_of
+from vdgs.watching.memory_notes import after_failure, announce, need_of
 from vdgs.watching.progress import TrainingProgress
 from vdgs.watching.watch import Keeper, Watched, restore_or_start, watch
 
@@ -32,7 +33,7 @@ AFTER_DIVERGENCE = {
 def continue_or_start(
     folder: StageFolder, stage: Stage, start: Callable[[], TrainingState], console: Console
 ) -> TrainingState:
-    """The newest whole state in the folder, or a new one; the log ends where the state does.
+    """The state of the newest whole checkpoint, or a new one; the log ends where the state does.
 
     Raises RunError for a state that this version cannot read or that is beyond the last iteration.
     """
@@ -48,12 +49,12 @@ def train_watched(
 
     Says first how much memory it will take. Raises what `watch` raises.
     """
-    kind, need = kind_of(stage), need_of(state, stage)
+    kind, need = stage.kind, need_of(state, stage)
     announce(need, kind, console)
     training = Watched(
         folder, state,
         to_saved=lambda: to_saved(state),
-        facts=lambda: {"iteration": state.iteration, "iterations": stage.config.iterations},
+        status=lambda: Status("running", iteration=state.iteration, iterations=stage.config.iterations),
         size=lambda: f"{len(state.anchors):,} anchors",
         after_divergence=AFTER_DIVERGENCE[kind],
         save_memory=lambda: after_failure(need, state, stage),
@@ -67,7 +68,7 @@ def train_watched(
             def after_step(state: TrainingState, report: StepReport) -> None:
                 keeper.tick()
                 progress.step(state, report)
-                keeper.keep(lambda: progress.facts(state), progress.flush)
+                keeper.keep(lambda: progress.status(state), progress.flush)
 
             return train(state, stage, stop=stop, after_step=after_step)
 
@@ -79,13 +80,14 @@ def finish(folder: StageFolder, state: TrainingState, model: AnchorModel, consol
     step drew."""
     save_state(folder.checkpoints, to_saved(state))
     model.save(folder.model)
-    folder.set_status(
+    status = Status(
         "done", iteration=state.iteration, iterations=state.iteration, photographs=round(area * state.iteration, 1),
         anchors=len(state.anchors),
         model=identity(folder.model),
         seconds=state.seconds, psnr_training=None if math.isnan(state.psnr) else state.psnr,
         peak_memory_bytes=state.peak_memory_bytes,
     )  # fmt: skip
+    folder.set_status(status)
     minutes, seconds = divmod(round(state.seconds), 60)
     console.print(
         f"trained {state.iteration} iterations in {minutes} min {seconds} s: {len(state.anchors):,} anchors, "

@@ -8,19 +8,15 @@ import numpy as np
 import psutil
 from rich.console import Console
 
-from vdgs.kernels import native as kernels
 from vdgs.memory.estimate import Advice, Kind, Need, advice, describe, estimate, in_gb
 from vdgs.memory.process import available_bytes
+from vdgs.model.render import visible_rows
 from vdgs.training import Stage, TrainingState
 
 #: Views in which the anchors are counted, evenly chosen.
 VIEWS_COUNTED = 16
 #: After a failure: what a remedy should save, of all that the process takes.
 SAVE_SHARE = 0.3
-
-
-def kind_of(stage: Stage) -> Kind:
-    return "coarse" if stage.surroundings is None else "block"
 
 
 def need_of(state: TrainingState, stage: Stage) -> Need:
@@ -30,7 +26,7 @@ def need_of(state: TrainingState, stage: Stage) -> Need:
     pixels = [camera.width * camera.height for camera in cameras]
     chosen = np.unique(np.linspace(0, count - 1, min(count, VIEWS_COUNTED)).astype(int))
     anchors = state.anchors
-    seen = [len(kernels.cull(anchors.positions, anchors.log_scales, cameras[view])) for view in chosen]
+    seen = [len(visible_rows(anchors, cameras[view])) for view in chosen]
     # Every size that the resolution schedule asks for, each a quarter of the one before.
     photographs = 3 * sum(pixels) * 4 // 3
     growing = config.growth.levels > 0 and state.iteration <= config.growth.until * config.iterations
@@ -62,7 +58,7 @@ def announce(need: Need, kind: Kind, console: Console) -> None:
 
 def after_failure(need: Need, state: TrainingState, stage: Stage) -> str:
     """What to change after training ran out of memory, with what each change saves by estimate."""
-    kind, kept = kind_of(stage), getattr(stage.images, "nbytes", need.images_bytes)
+    kind, kept = stage.kind, getattr(stage.images, "nbytes", need.images_bytes)
     now = replace(
         need, anchors=len(state.anchors), max_anchors=len(state.anchors), images_bytes=kept,
         averaged=state.average is not None,

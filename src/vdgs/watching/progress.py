@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vdgs.runs.folder import StageFolder
+from vdgs.runs.status import Status
 from vdgs.settings.method import TrainConfig
 from vdgs.training import StepReport, TrainingState, downscale_at
 
@@ -66,13 +67,13 @@ class TrainingProgress:
         (then, first), (now, last) = self._recent[0], self._recent[-1]
         return (last - first) / (now - then) if now > then else 0.0
 
-    def facts(self, state: TrainingState) -> dict[str, Any]:
-        """Where training stands, for status.json."""
-        return {
-            "iteration": state.iteration, "iterations": self._config.iterations, "anchors": len(state.anchors),
-            "psnr_training": None if math.isnan(state.psnr) else state.psnr, "seconds": round(state.seconds, 1),
-            "seconds_left": round(self._seconds_left(state)), "peak_memory_bytes": state.peak_memory_bytes,
-        }  # fmt: skip
+    def status(self, state: TrainingState) -> Status:
+        """Where training stands."""
+        return Status(
+            "running", iteration=state.iteration, iterations=self._config.iterations, anchors=len(state.anchors),
+            psnr_training=None if math.isnan(state.psnr) else state.psnr, seconds=round(state.seconds, 1),
+            seconds_left=round(self._seconds_left(state)), peak_memory_bytes=state.peak_memory_bytes,
+        )  # fmt: skip
 
     def flush(self) -> None:
         self._log.flush()

@@ -1,34 +1,28 @@
-"""Training under the eyes of a person: logged, saved, stopped and continued. The same for every kind of state."""
+"""Training that is watched: logged, checkpointed, stopped and continued. The same for every kind of state."""
 
 from __future__ import annotations
 
 import re
-import signal
 import time
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
 import cv2
 from rich.console import Console
 
-from vdgs.errors import RunError, TrainingDiverged, VdgsError
+from vdgs.errors import RunError, Stopped, TrainingDiverged, VdgsError
 from vdgs.memory.process import is_out_of_memory, peak_memory_bytes, return_unused
 from vdgs.runs.folder import StageFolder
+from vdgs.runs.status import Status
 from vdgs.storage.checkpoints import SavedState, discard_after, load_newest, save_state
+from vdgs.watching.interrupts import stop_requests
 
 #: As what missing memory arrives, among others (`is_out_of_memory`): from Python and C++, torch, the system, OpenCV.
 MEMORY_ERRORS = (MemoryError, RuntimeError, OSError, cv2.error)
 #: Seconds between two notes of the progress in status.json.
 STATUS_SECONDS = 2.0
-
-
-class Stopped(VdgsError):
-    """Training was asked to stop; its state is saved."""
-
-    stopped = True
 
 
 class WatchedState(Protocol):
@@ -50,8 +44,8 @@ class Watched:
     state: WatchedState
     #: The whole state as it is saved.
     to_saved: Callable[[], SavedState]
-    #: Where training stands, for status.json.
-    facts: Callable[[], dict[str, Any]]
+    #: Where training stands.
+    status: Callable[[], Status]
     #: How large the model is, in words ("12,000 anchors").
     size: Callable[[], str]
     #: What a person may do about a loss that diverges, and about missing memory.
@@ -72,7 +66,7 @@ def restore_or_start(
     advice: str,
     console: Console,
 ) -> State:
-    """The newest whole state in the folder, or a new one; the log ends where the state does.
+    """The state of the newest whole checkpoint, or a new one; the log ends where the state does.
 
     Raises RunError, with `advice`, for a state that this version cannot read, and for one beyond the last iteration.
     """
@@ -82,7 +76,7 @@ def restore_or_start(
         console.print(f"[yellow]note[/] {complaint}")
     if saved is None:
         if complaints:
-            console.print("[yellow]note[/] no saved state is whole: starting again from the first iteration")
+            console.print("[yellow]note[/] no checkpoint is whole: starting again from the first iteration")
         state = start()
     else:
         try:
@@ -93,7 +87,7 @@ def restore_or_start(
             raise RunError(f"{folder.checkpoints}: is at iteration {state.iteration}, beyond {iterations}.")
         discard_after(folder.checkpoints, state.iteration)
         console.print(f"continuing at iteration {state.iteration}")
-    folder.cut_log(state.iteration)
+    folder.truncate_log(state.iteration)
     return state
 
 
@@ -105,33 +99,33 @@ def watch(training: Watched, loop: Callable[[Callable[[], bool]], bool]) -> None
     """
     folder, state = training.folder, training.state
     try:
-        with stop_requests() as stop:
-            folder.set_status("running", **training.facts())
-            complete = loop(stop)
+        with stop_requests(second_interrupts=True) as asked:
+            folder.set_status(training.status())
+            complete = loop(lambda: bool(asked))
     except TrainingDiverged as error:
-        folder.set_status("failed", iteration=state.iteration, why=str(error))
+        folder.set_status(Status("failed", iteration=state.iteration, why=str(error)))
         raise TrainingDiverged(f"{error} {_kept(folder)} {training.after_divergence}".rstrip()) from error
     except MEMORY_ERRORS as error:
         if not is_out_of_memory(error):
             raise
         traceback.clear_frames(error.__traceback__)  # they hold the pictures and splats of the step that failed
         kept = _rescue(training)
-        folder.set_status("failed", iteration=state.iteration, why="out of memory")
+        folder.set_status(Status("failed", iteration=state.iteration, why="out of memory"))
         raise VdgsError(
             f"{folder.path}: out of memory with {training.size()}{_wanted(error)}. {kept} {training.save_memory()}"
         ) from error
     except VdgsError as error:  # a photograph that is gone, a full disk: every step so far is whole
-        folder.set_status("failed", iteration=state.iteration, why=str(error))
+        folder.set_status(Status("failed", iteration=state.iteration, why=str(error)))
         training.save()
         raise
     if not complete:
         training.save()
-        folder.set_status("stopped", **training.facts())
+        folder.set_status(replace(training.status(), state="stopped"))
         raise Stopped(f"Stopped at iteration {state.iteration}; saved. The same command continues.")
 
 
 class Keeper:
-    """After every step: the state's account of time and memory (across interruptions), saved states, status.json."""
+    """After every step: the state's account of time and memory (across interruptions), checkpoints, status.json."""
 
     def __init__(self, training: Watched, save_every: int):
         self._training, self._save_every = training, save_every
@@ -144,10 +138,10 @@ class Keeper:
         state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
         self._last = now
 
-    def keep(self, facts: Callable[[], dict[str, Any]], flush_log: Callable[[], None] | None = None) -> None:
-        """Save the state and note `facts` in status.json, each where it is time.
+    def keep(self, status: Callable[[], Status], flush_log: Callable[[], None] | None = None) -> None:
+        """Save the state and write the `status`, each where it is time.
 
-        The log is flushed before the state is saved: a run that continues there must not miss lines of it.
+        The log is flushed before the checkpoint is written: a run that continues there must not miss lines of it.
         """
         training = self._training
         if training.state.iteration % self._save_every == 0:
@@ -157,14 +151,14 @@ class Keeper:
             training.save()
         if time.monotonic() - self._noted > STATUS_SECONDS:
             self._noted = time.monotonic()
-            training.folder.set_status("running", **facts())
+            training.folder.set_status(status())
 
 
 def _kept(folder: StageFolder) -> str:
     kept, _ = load_newest(folder.checkpoints)
     if kept is None:
-        return "No state was saved yet."
-    return f"The state of iteration {kept.iteration} is kept in {folder.checkpoints}."
+        return "There is no checkpoint yet."
+    return f"The checkpoint of iteration {kept.iteration} is kept in {folder.checkpoints}."
 
 
 def _rescue(training: Watched) -> str:
@@ -177,32 +171,14 @@ def _rescue(training: Watched) -> str:
         except (VdgsError, *MEMORY_ERRORS):
             pass  # what was saved before is still there
         else:
-            return f"The state of iteration {training.state.iteration} is saved in {folder.checkpoints}."
+            return f"The checkpoint of iteration {training.state.iteration} is saved in {folder.checkpoints}."
     try:
         return _kept(folder)
     except MEMORY_ERRORS:
-        return f"States that were saved before are kept in {folder.checkpoints}."
+        return f"Earlier checkpoints are kept in {folder.checkpoints}."
 
 
 def _wanted(error: BaseException) -> str:
     """How much was asked for in vain, where the error says so."""
     asked = re.search(r"allocate ([\d.]+) (bytes|[KMG]iB)", str(error))
     return f" ({asked.group(1)} {asked.group(2)} more could not be had)" if asked else ""
-
-
-@contextmanager
-def stop_requests() -> Iterator[Callable[[], bool]]:
-    """Ctrl-C and SIGTERM ask to stop after the current step; a second Ctrl-C interrupts at once."""
-    asked: list[int] = []
-
-    def ask(signum: int, _frame: object) -> None:
-        if asked and signum == signal.SIGINT:
-            raise KeyboardInterrupt
-        asked.append(signum)
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(asked)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

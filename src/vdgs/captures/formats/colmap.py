@@ -150,7 +150,6 @@ def _no_points() -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class _ImageRecord:
-    identifier: int
     quaternion: tuple[float, ...]  # wxyz
     translation: tuple[float, ...]
     camera: int
@@ -228,10 +227,10 @@ def _add_camera(cameras: dict[int, Intrinsics], identifier: int, intrinsics: Int
 def _images_binary(file: Path) -> Iterator[_ImageRecord]:
     cursor = _Cursor(file)
     for _ in range(cursor.count(4 + 7 * 8 + 4 + 1 + 8, "images")):
-        identifier, *pose, camera = cursor.take("I7dI")
+        _, *pose, camera = cursor.take("I7dI")
         name = cursor.name()
         cursor.skip(24 * cursor.count(24, "image points"))
-        yield _ImageRecord(identifier, tuple(pose[:4]), tuple(pose[4:]), camera, name)
+        yield _ImageRecord(tuple(pose[:4]), tuple(pose[4:]), camera, name)
     cursor.finish()
 
 
@@ -307,12 +306,12 @@ def _images_text(file: Path) -> Iterator[_ImageRecord]:
             continue
         words = line.split(maxsplit=9)
         try:
-            identifier, camera = int(words[0]), int(words[8])
+            _, camera = int(words[0]), int(words[8])
             pose = [float(word) for word in words[1:8]]
             name = words[9].strip()
         except (ValueError, IndexError):
             raise _bad_line(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
-        yield _ImageRecord(identifier, tuple(pose[:4]), tuple(pose[4:]), camera, name)
+        yield _ImageRecord(tuple(pose[:4]), tuple(pose[4:]), camera, name)
         next(lines, None)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vdgs.comparators.gaussians.model import Gaussians
-from vdgs.kernels.reference.project import rotation_matrices
+from vdgs.kernels.rotations import rotation_matrices
 
 #: A Gaussian is split into so many (3DGS section 5.2).
 PARTS = 2

@@ -23,9 +23,9 @@ from torch import Tensor
 from vdgs.cameras import Camera
 from vdgs.comparators.gaussians.spherical_harmonics import MAX_DEGREE, dc_of_colours, function_count, view_colours
 from vdgs.errors import VdgsError
-from vdgs.kernels import native as kernels
+from vdgs.kernels import choose
 from vdgs.kernels.constants import ALPHA_MIN
-from vdgs.kernels.types import Raster
+from vdgs.kernels.types import Raster, Splats
 from vdgs.storage.files import write_atomically
 from vdgs.storage.tensors import checksum, read_tensors, write_tensors
 
@@ -96,6 +96,7 @@ def initial_gaussians(
 @torch.no_grad()
 def visible_rows(gaussians: Gaussians, camera: Camera) -> Int64[Tensor, " v"]:
     """Rows of the Gaussians in front of the camera whose extent touches the image, ascending."""
+    kernels = choose(gaussians.means.device)
     seen = kernels.project(gaussians.means, gaussians.log_scales.exp(), gaussians.quaternions, camera)
     a, b, c = seen.conics.unbind(-1)
     # The inverse of the conic [[a, b], [b, c]] is the covariance, its diagonal the variances along x and y.
@@ -114,17 +115,19 @@ def draw_gaussians(
 
     Differentiable in all tensors of `gaussians`.
     """
+    kernels = choose(gaussians.means.device)
     projected = kernels.project(gaussians.means, gaussians.log_scales.exp(), gaussians.quaternions, camera)
     if camera.model == "pinhole":
-        centre = torch.from_numpy(camera.position.astype(np.float32))
+        centre = torch.from_numpy(camera.position.astype(np.float32)).to(gaussians.means)
         directions = torch.nn.functional.normalize(gaussians.means - centre, dim=-1)
     else:
-        directions = torch.from_numpy(camera.forward.astype(np.float32)).expand(len(gaussians), 3)
-    raster = kernels.rasterise(
-        projected.means_px, projected.conics, view_colours(gaussians.dc, gaussians.rest, directions, degree),
-        torch.where(projected.valid, gaussians.logits.sigmoid(), 0.0), projected.depths,
-        background, camera.width, camera.height, depth=depth,
+        directions = torch.from_numpy(camera.forward.astype(np.float32)).to(gaussians.means).expand(len(gaussians), 3)
+    splats = Splats(
+        projected.means_px, projected.conics, projected.depths,
+        view_colours(gaussians.dc, gaussians.rest, directions, degree),
+        torch.where(projected.valid, gaussians.logits.sigmoid(), 0.0),
     )  # fmt: skip
+    raster = kernels.rasterise(splats, background, camera.width, camera.height, depth=depth)
     return raster, projected.means_px
 
 
@@ -168,7 +171,7 @@ class GaussiansModel:
         except (KeyError, ValueError, TypeError) as error:
             raise VdgsError(
                 f"{path}: is damaged or incomplete ({error}). Delete it and train again: it is rebuilt from the last "
-                "saved state."
+                "checkpoint."
             ) from error
 
 

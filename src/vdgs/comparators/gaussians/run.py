@@ -6,7 +6,7 @@ or different:
 
 - pruning by footprint in the image (section 5.2); the prune by size in the world is there;
 - training stops at the iteration given: rates decay over that length; intervals (degree, decisions, resets) are
-  those of the settings, which `gaussian_schedule.scheduled` gives for another length than the published one;
+  those of the settings, which `schedule.scheduled` gives for another length than the published one;
 - views come in a new random order every epoch that is drawn from the seed, not from a running generator;
 - image formation is that of this project (docs/conventions.md): alpha at most 0.999, near plane at 0.01, extent by
   opacity, exact gradients;
@@ -36,7 +36,6 @@ from vdgs.comparators.gaussians.spherical_harmonics import MAX_DEGREE
 from vdgs.comparators.gaussians.training import GaussiansConfig, GaussiansStage, scene_extent
 from vdgs.comparators.gaussians.watching import continue_or_start, finish, train_watched
 from vdgs.errors import RunError, VdgsError
-from vdgs.evaluation import saving
 from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.of_run import cached_photographs
@@ -139,7 +138,7 @@ def evaluate_gaussians(
             photographs, measured, output, lpips=lpips, lpips_note=note, settings=settings, console=console
         )
     result = {**result, "n_gaussians": len(model.gaussians)}
-    saving.write_json(output / "metrics.json", result)
+    write_json(output / "metrics.json", result)
     return result
 
 
@@ -149,7 +148,7 @@ def _facts(trained: StageFolder | None) -> ModelFacts:
     status = trained.status()
     return ModelFacts(
         model=NAME, model_bytes=trained.model.stat().st_size,
-        train_seconds=status.get("seconds"), peak_memory_bytes=status.get("peak_memory_bytes"),
+        train_seconds=status.seconds, peak_memory_bytes=status.peak_memory_bytes,
     )  # fmt: skip
 
 

@@ -18,10 +18,12 @@ from vdgs.cameras import Camera
 from vdgs.comparators.gaussians.density import DensityConfig, control_density, reset_logits
 from vdgs.comparators.gaussians.model import Gaussians, draw_gaussians, visible_rows
 from vdgs.errors import TrainingDiverged
-from vdgs.kernels import native as kernels
+from vdgs.kernels import choose
+from vdgs.kernels.types import AdamState
 from vdgs.storage.checkpoints import SavedState
 from vdgs.training import PSNR_INTERVAL, TrainingImages, view_at
-from vdgs.training.optimiser import Moments, rebuild
+from vdgs.training.optimiser import Moments
+from vdgs.training.per_anchor import Group, remap
 from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
 
 
@@ -102,6 +104,17 @@ class GaussiansState:
     #: Zeros between steps, in the shape of each tensor of the Gaussians: where gradients are put. Not saved.
     room: dict[str, Tensor] = field(default_factory=dict)
 
+    def take_groups(self) -> dict[str, Group]:
+        """What is kept per Gaussian and outlives a decision, no longer held here: see `per_anchor.remap`."""
+        groups = {"gaussians": self.gaussians.tensors(), "first": self.moments.first, "second": self.moments.second}
+        self.put_groups({name: {key: t[:0] for key, t in group.items()} for name, group in groups.items()})
+        return groups
+
+    def put_groups(self, groups: dict[str, Group]) -> None:
+        """The inverse of `take_groups`."""
+        self.gaussians = Gaussians(**groups["gaussians"])
+        self.moments = Moments(groups["first"], groups["second"])
+
 
 @dataclass(frozen=True)
 class GaussiansReport:
@@ -158,7 +171,9 @@ def train_step(state: GaussiansState, stage: GaussiansStage) -> GaussiansReport:
 
     rows = visible_rows(state.gaussians, camera)
     seen = {name: t.index_select(0, rows).requires_grad_() for name, t in state.gaussians.tensors().items()}
-    raster, means_px = draw_gaussians(Gaussians(**seen), camera, torch.tensor(stage.background), degree)
+    behind = state.gaussians.means.new_tensor(stage.background)
+    raster, means_px = draw_gaussians(Gaussians(**seen), camera, behind, degree)
+    kernels = choose(raster.image.device)
     found = kernels.photometric_loss(raster.image, target, mask, ssim_weight=config.ssim_weight)
     value = float(found.loss.detach())
     if not math.isfinite(value):
@@ -195,10 +210,8 @@ def _move(
         if name == "rest" and not degree:
             continue  # gradients and moments are zero: nothing moves
         everywhere = state.room[name].index_copy_(0, rows, gradients[name])
-        finite &= kernels.adam_rows(
-            tensor, None, everywhere, state.moments.first[name], state.moments.second[name],
-            learning_rate=rates[name], step=state.iteration + 1,
-        )  # fmt: skip
+        moved = AdamState(tensor, state.moments.first[name], state.moments.second[name], rates[name])
+        finite &= choose(tensor.device).adam_rows(moved, None, everywhere, state.iteration + 1)
         everywhere.index_fill_(0, rows, 0.0)
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {state.iteration + 1}.")
@@ -232,10 +245,7 @@ def _control(state: GaussiansState, stage: GaussiansStage) -> dict[str, Any]:
 def _apply(state: GaussiansState, added: Gaussians, kept: Tensor) -> None:
     """Append Gaussians without moments, then keep some of all; the statistics begin again."""
     state.room = {}
-    tensors, state.gaussians = state.gaussians.tensors(), added
-    rebuild(tensors, added.tensors(), kept)
-    state.gaussians = Gaussians(**tensors)
-    state.moments.rebuild(len(added), kept)
+    remap(state, {"gaussians": added.tensors()}, len(added), kept)
     state.gradient, state.views = torch.zeros(len(state.gaussians)), torch.zeros(len(state.gaussians))
 
 

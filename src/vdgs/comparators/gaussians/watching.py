@@ -1,4 +1,4 @@
-"""3DGS in training under the eyes of a person: shown, logged, saved, stopped and continued.
+"""Training of 3DGS, watched: shown, logged, checkpointed, stopped and continued.
 
 The twin of `vdgs.watching.anchors`, for another kind of state.
 """
@@ -9,7 +9,6 @@ import json
 import math
 import time
 from collections.abc import Callable
-from typing import Any
 
 from rich.console import Console
 
@@ -28,6 +27,7 @@ from vdgs.comparators.gaussians.training import (
     train,
 )
 from vdgs.runs.folder import StageFolder
+from vdgs.runs.status import Status
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.checkpoints import save_state
 from vdgs.watching.progress import LOG_INTERVAL, PLAIN_SECONDS
@@ -37,7 +37,7 @@ from vdgs.watching.watch import Keeper, Watched, restore_or_start, watch
 def continue_or_start(
     folder: StageFolder, capture: Capture, config: GaussiansConfig, console: Console
 ) -> GaussiansState:
-    """The newest whole state in the folder, or a new one; the log ends where the state does.
+    """The state of the newest whole checkpoint, or a new one; the log ends where the state does.
 
     Raises RunError for a state that this version cannot read.
     """
@@ -57,7 +57,7 @@ def train_watched(
     training = Watched(
         folder, state,
         to_saved=lambda: to_saved(state),
-        facts=lambda: journal.facts(state),
+        status=lambda: journal.status(state),
         size=lambda: f"{len(state.gaussians):,} Gaussians",
         after_divergence="",
         save_memory=lambda: "Set density.max_gaussians or use smaller photographs, in another output folder.",
@@ -70,7 +70,7 @@ def train_watched(
         def after_step(state: GaussiansState, report: GaussiansReport) -> None:
             keeper.tick()
             journal.step(state, report)
-            keeper.keep(training.facts)
+            keeper.keep(training.status)
 
         return train(state, stage, stop=stop, after_step=after_step)
 
@@ -96,13 +96,13 @@ class _Journal:
                 highlight=False,
             )
 
-    def facts(self, state: GaussiansState) -> dict[str, Any]:
-        """Where training stands, for status.json."""
-        return {
-            "iteration": state.iteration, "iterations": self._config.iterations, "gaussians": len(state.gaussians),
-            "psnr_training": _number(state.psnr), "seconds": round(state.seconds, 1),
-            "peak_memory_bytes": state.peak_memory_bytes,
-        }  # fmt: skip
+    def status(self, state: GaussiansState) -> Status:
+        """Where training stands."""
+        return Status(
+            "running", iteration=state.iteration, iterations=self._config.iterations, gaussians=len(state.gaussians),
+            psnr_training=_number(state.psnr), seconds=round(state.seconds, 1),
+            peak_memory_bytes=state.peak_memory_bytes,
+        )  # fmt: skip
 
     def _log(self, state: GaussiansState, report: GaussiansReport) -> None:
         done = state.iteration - 1
@@ -121,10 +121,11 @@ def finish(folder: StageFolder, state: GaussiansState, model: GaussiansModel, co
     """Save the model of a run that is complete, mark it done and say so."""
     save_state(folder.checkpoints, to_saved(state))
     model.save(folder.model)
-    folder.set_status(
+    status = Status(
         "done", iteration=state.iteration, iterations=state.iteration, gaussians=len(state.gaussians),
         seconds=state.seconds, psnr_training=_number(state.psnr), peak_memory_bytes=state.peak_memory_bytes,
     )  # fmt: skip
+    folder.set_status(status)
     console.print(
         f"trained {state.iteration} iterations in {state.seconds:.0f} s: {len(state.gaussians):,} Gaussians, PSNR of "
         f"training views {state.psnr:.2f} dB, peak memory {state.peak_memory_bytes / 1e9:.1f} GB\n"

@@ -10,7 +10,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vdgs.kernels.cuda.launching import Program
-from vdgs.kernels.reference.loss import Photometric, check_images
+from vdgs.kernels.reference.loss import check_images
+from vdgs.kernels.types import Photometric
 
 #: Side of the tile that one block of threads does: kTile of the source.
 TILE_PX = 16

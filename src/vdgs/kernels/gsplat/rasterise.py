@@ -16,7 +16,7 @@ from torch import Tensor
 
 from vdgs.errors import VdgsError
 from vdgs.kernels.constants import ALPHA_MIN
-from vdgs.kernels.types import Raster
+from vdgs.kernels.types import Raster, Splats
 
 #: Side of gsplat's tiles, in pixels (its default).
 TILE_PX = 16
@@ -27,11 +27,7 @@ class GsplatUnavailable(VdgsError):
 
 
 def rasterise(
-    means_px: Float[Tensor, "m 2"],
-    conics: Float[Tensor, "m 3"],
-    colours: Float[Tensor, "m 3"],
-    opacities: Float[Tensor, "m"],
-    depths: Float[Tensor, "m"],
+    splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
     height: int,
@@ -45,9 +41,12 @@ def rasterise(
     minutes and a CUDA toolkit). Raises GsplatUnavailable without gsplat.
     """
     engine = engine or load()
+    means_px, conics, colours, opacities, depths = (
+        splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths,
+    )  # fmt: skip
     if not len(means_px):
         return _empty(background, width, height, depth)
-    reach = reach_px(means_px, conics, colours, opacities, depths)
+    reach = reach_px(splats)
     columns, rows = -(-width // TILE_PX), -(-height // TILE_PX)
     # gsplat draws several pictures at once: this is one.
     means, radii, near = means_px[None], reach[None], depths[None]
@@ -64,20 +63,17 @@ def rasterise(
 
 
 @torch.no_grad()
-def reach_px(
-    means_px: Float[Tensor, "m 2"],
-    conics: Float[Tensor, "m 3"],
-    colours: Float[Tensor, "m 3"],
-    opacities: Float[Tensor, "m"],
-    depths: Float[Tensor, "m"],
-) -> Int32[Tensor, "m 2"]:
+def reach_px(splats: Splats) -> Int32[Tensor, "m 2"]:
     """How far from its centre, in x and y, a splat's alpha is at least 1/255; 0 for one that is not to be drawn.
 
     Those are the splats of which a number is not finite, or whose conic is not positive definite. On the ellipse
     a dx² + 2 b dx dy + c dy² = q, dx² reaches q c / (a c - b²).
     """
-    rows = torch.cat([means_px, conics, colours, opacities[:, None], depths[:, None]], dim=1)
-    a, b, c = conics.unbind(dim=1)
+    opacities = splats.opacities
+    rows = torch.cat(
+        [splats.means_px, splats.conics, splats.colours, opacities[:, None], splats.depths[:, None]], dim=1
+    )
+    a, b, c = splats.conics.unbind(dim=1)
     determinant = a * c - b * b
     drawn = rows.isfinite().all(dim=1) & (a > 0) & (c > 0) & (determinant > 0) & (opacities >= ALPHA_MIN)
     level = 2 * torch.log(opacities.clamp(min=ALPHA_MIN) / ALPHA_MIN)

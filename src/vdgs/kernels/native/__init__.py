@@ -7,7 +7,7 @@ from vdgs.kernels.native.decode import decode
 from vdgs.kernels.native.decode_adam import decode_backward_adam
 from vdgs.kernels.native.loss import photometric_loss
 from vdgs.kernels.native.project import project
-from vdgs.kernels.native.rasterise import rasterise
+from vdgs.kernels.native.rasterise import rasterise, rasterise_vjp
 from vdgs.kernels.native.statistics import add_view_statistics
 from vdgs.kernels.native.visibility import count_visibility, mark_visible
 
@@ -28,4 +28,5 @@ __all__ = [
     "photometric_loss",
     "project",
     "rasterise",
+    "rasterise_vjp",
 ]

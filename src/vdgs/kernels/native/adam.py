@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.kernels.native import module
-from vdgs.kernels.reference.adam import check_rows, check_step
+from vdgs.kernels.reference.adam import StepFactors, check_rows, check_step
+from vdgs.kernels.types import AdamState
 
 
 def adam_rows(
-    parameter: Float[Tensor, "n *rest"],
+    state: AdamState,
     rows: Int64[Tensor, "v"] | None,
     gradient: Float[Tensor, "v *rest"],
-    first_moment: Float[Tensor, "n *rest"],
-    second_moment: Float[Tensor, "n *rest"],
+    step: int | Int32[Tensor, " v"],
     *,
-    learning_rate: float,
-    step: int,
     beta1: float = 0.9,
     beta2: float = 0.999,
     epsilon: float = 1e-15,
@@ -27,20 +26,26 @@ def adam_rows(
 
     Raises ValueError also where one of those is not contiguous. Same bits for any number of threads.
     """
-    factors = check_step(learning_rate, step, beta1, beta2, epsilon)
-    check_rows(parameter, rows, gradient, first_moment, second_moment)
-    if parameter.dtype != torch.float32:
-        raise TypeError(f"parameter must be float32, not {parameter.dtype}")
-    state = (parameter, first_moment, second_moment)
-    if not all(tensor.is_contiguous() for tensor in state):
-        raise ValueError("parameter, first_moment and second_moment must be contiguous")
+    check_rows(state, rows, gradient)
+    factors = check_step(state.learning_rate, step, len(gradient), beta1, beta2, epsilon)
+    tensors = state[:3]
+    if state.parameter.dtype != torch.float32:
+        raise TypeError(f"parameter must be float32, not {state.parameter.dtype}")
+    if not all(tensor.is_contiguous() for tensor in tensors):
+        raise ValueError("parameter, first moment and second moment must be contiguous")
     if gradient.numel() == 0:
         return True
-    flat, first, second = (tensor.detach().view(tensor.shape[0], -1) for tensor in state)
+    flat, first, second = (tensor.detach().view(tensor.shape[0], -1) for tensor in tensors)
     packed = gradient.detach().contiguous().view(gradient.shape[0], -1)
     chosen = None if rows is None else rows.contiguous()
-    finite: bool = module.native().adam_rows(flat, chosen, packed, first, second, *factors)
+    updates = None if isinstance(step, int) else step.contiguous()
+    finite: bool = module.native().adam_rows(flat, chosen, packed, first, second, updates, *rounded(factors))
     if finite:
         # What autograd has saved of these no longer holds their values.
-        torch.autograd.graph.increment_version(state)
+        torch.autograd.graph.increment_version(tensors)
     return finite
+
+
+def rounded(factors: StepFactors) -> StepFactors:
+    """The same with the tables in float32."""
+    return factors._replace(rates=factors.rates.astype(np.float32), roots=factors.roots.astype(np.float32))

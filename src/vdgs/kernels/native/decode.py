@@ -12,7 +12,7 @@ from vdgs.cameras import Camera
 from vdgs.kernels.native import module
 from vdgs.kernels.native.arguments import contiguous, packed_camera, require_rows
 from vdgs.kernels.reference.adam import check_indices
-from vdgs.kernels.types import FEATURE_SIZE, DecoderWeights, Splats
+from vdgs.kernels.types import FEATURE_SIZE, AnchorSplats, DecoderWeights
 
 
 def decode(
@@ -23,7 +23,7 @@ def decode(
     weights: DecoderWeights,
     camera: Camera,
     rows: Int64[Tensor, "v"] | None = None,
-) -> Splats:
+) -> AnchorSplats:
     """Decode and project visible anchors: see `vdgs.kernels.reference.decode.decode`, of which this is
     the float32 twin.
 
@@ -40,7 +40,8 @@ def decode(
         if torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors, *weights.tensors())):
             tensors, rows = tuple(t[rows] for t in tensors), None
     anchors = (contiguous(t) for t in tensors)
-    return Splats(*_Decode.apply(packed_camera(camera), rows, *anchors, *(contiguous(t) for t in weights.tensors())))
+    heads = (contiguous(t) for t in weights.tensors())
+    return AnchorSplats(*_Decode.apply(packed_camera(camera), rows, *anchors, *heads))
 
 
 def check_anchors(positions: Tensor, features: Tensor, offsets: Tensor, log_scales: Tensor) -> None:

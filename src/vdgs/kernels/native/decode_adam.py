@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels.native import module
+from vdgs.kernels.native.adam import rounded
 from vdgs.kernels.native.arguments import contiguous, packed_camera, require_rows
 from vdgs.kernels.native.decode import check_anchors
-from vdgs.kernels.reference.adam import check_indices, check_step
+from vdgs.kernels.reference.adam import check_indices, check_updates, step_factors
 from vdgs.kernels.reference.statistics import check_sources
 from vdgs.kernels.types import AdamState, DecoderWeights, SplatGradients
 
@@ -24,8 +26,7 @@ def decode_backward_adam(
     camera: Camera,
     rows: Int64[Tensor, "v"],
     gradients: SplatGradients,
-    *,
-    step: int,
+    updates: Int32[Tensor, "n"],
 ) -> tuple[bool, tuple[Tensor, ...] | None]:
     """As `reference.decode_adam.decode_backward_adam`, for contiguous float32 parameters and moments.
 
@@ -36,11 +37,14 @@ def decode_backward_adam(
     features, offsets, log_scales = (state.parameter for state in moved)
     check_anchors(positions, features, offsets, log_scales)
     check_indices(rows, len(positions))
+    check_updates(updates, len(positions))
+    if not updates.is_contiguous():
+        raise ValueError("updates must be contiguous")
     for state in moved:
         _check_state(state)
     check_sources(gradients.source, rows, offsets.shape[1])
     _check_splats(gradients)
-    steps = [(*(t.detach() for t in state[:3]), check_step(state.learning_rate, step)) for state in moved]
+    steps = [_step(state) for state in moved]
     heads = [contiguous(t.detach()) for t in weights.tensors()]
     incoming = (gradients.means_px, gradients.conics, gradients.colours, gradients.opacities)
     wanted = any(t.requires_grad for t in weights.tensors())
@@ -48,11 +52,18 @@ def decode_backward_adam(
     finite: bool = module.native().decode_backward_adam(
         [contiguous(positions.detach()), *(state[0] for state in steps)], rows.contiguous(), heads,
         packed_camera(camera), gradients.source, contiguous(gradients.colour_values),
-        contiguous(gradients.opacity_values), [contiguous(t) for t in incoming], gradients.volume, steps, found,
+        contiguous(gradients.opacity_values), [contiguous(t) for t in incoming], gradients.volume, steps, updates,
+        found,
     )  # fmt: skip
     # What autograd has saved of these no longer holds their values.
-    torch.autograd.graph.increment_version([t for state in moved for t in state[:3]])
+    torch.autograd.graph.increment_version([updates, *(t for state in moved for t in state[:3])])
     return finite, tuple(found) if found is not None else None
+
+
+def _step(state: AdamState) -> tuple[Any, ...]:
+    """A parameter and its moments, the tables of its step, and the betas with epsilon."""
+    rates, roots, *rest = rounded(step_factors(state.learning_rate, None))
+    return (*(t.detach() for t in state[:3]), rates, roots, rest)
 
 
 def _check_state(state: AdamState) -> None:

@@ -9,7 +9,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vdgs.kernels.native import module
-from vdgs.kernels.reference.loss import Photometric, check_images
+from vdgs.kernels.reference.loss import check_images
+from vdgs.kernels.types import Photometric
 
 
 def photometric_loss(

@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
-from jaxtyping import Float, Int32, Int64
+import torch
+from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.kernels.native import module
-from vdgs.kernels.reference.statistics import check_sources
+from vdgs.kernels.reference.statistics import check_inside, check_sources
+from vdgs.kernels.types import Statistics
 
 
 def add_view_statistics(
+    statistics: Statistics,
     visible: Int64[Tensor, "v"],
+    inside: Bool[Tensor, "v"],
     source: Int32[Tensor, "m"],
     opacities: Float[Tensor, "m"],
     gradient_px: Float[Tensor, "m 2"],
     width: int,
     height: int,
-    gradient: Float[Tensor, "n k"],
-    drawn: Float[Tensor, "n k"],
-    opacity: Float[Tensor, "n"],
-    seen: Float[Tensor, "n"],
 ) -> None:
     """As `reference.statistics.add_view_statistics`, for contiguous float32. Same bits for any number of threads."""
+    gradient = statistics.gradient
     check_sources(source, visible, gradient.shape[1])
+    check_inside(inside, visible)
     if len(visible) and not (int(visible.min()) >= 0 and int(visible.max()) < len(gradient)):
         raise IndexError(f"a visible anchor lies outside the {len(gradient)} anchors")
     module.native().add_view_statistics(
-        visible, source, opacities.detach().contiguous(), gradient_px.contiguous(), width / 2, height / 2,
-        gradient, drawn, opacity, seen,
+        visible, inside.contiguous().view(torch.uint8), source, opacities.detach().contiguous(),
+        gradient_px.contiguous(), width / 2, height / 2, gradient, statistics.drawn, statistics.opacity,
+        statistics.seen,
     )  # fmt: skip

@@ -7,7 +7,7 @@ from vdgs.kernels.reference.decode import decode
 from vdgs.kernels.reference.decode_adam import decode_backward_adam
 from vdgs.kernels.reference.loss import photometric_loss
 from vdgs.kernels.reference.project import project
-from vdgs.kernels.reference.rasterise import rasterise
+from vdgs.kernels.reference.rasterise import rasterise, rasterise_vjp
 from vdgs.kernels.reference.statistics import add_view_statistics
 from vdgs.kernels.reference.visibility import count_visibility, mark_visible
 
@@ -28,4 +28,5 @@ __all__ = [
     "photometric_loss",
     "project",
     "rasterise",
+    "rasterise_vjp",
 ]

@@ -34,7 +34,7 @@ def cell_keys(positions: Float[Tensor, "n 3"], cell_size: float, origin: Float[T
 
 def cell_centres(keys: Int64[Tensor, "n"], cell_size: float, origin: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
     """Centre of each cell, in the type of `origin`."""
-    shifts = torch.tensor([2 * AXIS_BITS, AXIS_BITS, 0])
+    shifts = torch.tensor([2 * AXIS_BITS, AXIS_BITS, 0], device=keys.device)
     index = ((keys[:, None] >> shifts) & AXIS_MASK) - AXIS_OFFSET
     return ((index.to(torch.float64) + 0.5) * cell_size + origin.to(torch.float64)).to(origin.dtype)
 
@@ -73,7 +73,7 @@ def morton_order(positions: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
     """
     check_positions(positions)
     if positions.shape[0] == 0:
-        return torch.zeros(0, dtype=torch.int64)
+        return positions.new_zeros(0, dtype=torch.int64)
     exact = positions.detach().to(torch.float64)
     if not bool(torch.isfinite(exact).all()):
         raise ValueError("a position is not finite")

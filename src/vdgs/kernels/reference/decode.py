@@ -9,7 +9,7 @@ from torch import Tensor
 from vdgs.cameras import Camera
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.reference.project import project_with_variances
-from vdgs.kernels.types import FEATURE_SIZE, DecoderWeights, HeadWeights, Splats
+from vdgs.kernels.types import FEATURE_SIZE, AnchorSplats, DecoderWeights, HeadWeights
 
 
 def decode(
@@ -20,7 +20,7 @@ def decode(
     weights: DecoderWeights,
     camera: Camera,
     rows: Int64[Tensor, "v"] | None = None,
-) -> Splats:
+) -> AnchorSplats:
     """Decode visible anchors (`rows` of those given; None: all) for one camera and project what they spawn.
 
     With d = (x - c)/|x - c| (orthographic: the viewing direction), each head sees [f, d], or
@@ -55,7 +55,7 @@ def decode(
     scales = extent[:, 3:] * torch.sigmoid(covariance[:, :3])
     projected, variances = project_with_variances(means, scales, covariance[:, 3:], camera)
     kept = (projected.valid & _on_image(projected.means_px, variances, opacity, camera)).nonzero()[:, 0]
-    return Splats(
+    return AnchorSplats(
         means_px=projected.means_px[kept],
         conics=projected.conics[kept],
         depths=projected.depths[kept],

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels.reference.adam import adam_rows
+from vdgs.kernels.reference.adam import adam_rows, check_updates
 from vdgs.kernels.reference.decode import decode
 from vdgs.kernels.types import AdamState, DecoderWeights, SplatGradients
 
@@ -21,15 +21,16 @@ def decode_backward_adam(
     camera: Camera,
     rows: Int64[Tensor, "v"],
     gradients: SplatGradients,
-    *,
-    step: int,
+    updates: Int32[Tensor, "n"],
 ) -> tuple[bool, tuple[Tensor, ...] | None]:
     """Differentiate `decode(positions, *parameters, weights, camera, rows)`, and move these rows, in place.
 
-    `moved` are features, offsets and log-scales; `gradients` are those of the splats that decoding gave. `step`
-    counts from 1. Returns whether every gradient of an anchor was finite (if not, some may have moved while others
-    have not) and the gradients of the decoder's twelve tensors (None where none of them requires one).
+    `moved` are features, offsets and log-scales; `gradients` are those of the splats that decoding gave. `updates` says
+    how often each anchor has moved, for the bias correction, and is counted up in place. Returns whether every gradient
+    of an anchor was finite (if not, some may have moved while others have not) and the gradients of the decoder's
+    twelve tensors (None where none of them requires one).
     """
+    check_updates(updates, len(positions))
     leaves = [state.parameter[rows].detach().requires_grad_(True) for state in moved]
     decoder = weights.map(lambda t: t.detach().requires_grad_(True))
     with torch.enable_grad():
@@ -38,9 +39,9 @@ def decode_backward_adam(
     received = (gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
                 torch.full_like(again.volumes, gradients.volume))  # fmt: skip
     found = torch.autograd.grad(outputs, [*leaves, *decoder.tensors()], received)
+    counted = updates[rows] + 1
     finite = True
     for state, gradient in zip(moved, found, strict=False):
-        finite &= adam_rows(
-            state.parameter, rows, gradient, state.first, state.second, learning_rate=state.learning_rate, step=step
-        )
+        finite &= adam_rows(state, rows, gradient, counted)
+    updates[rows] = counted
     return finite, found[3:] if any(t.requires_grad for t in weights.tensors()) else None

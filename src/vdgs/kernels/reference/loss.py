@@ -8,26 +8,18 @@ Both terms are means over the pixels that count and the three channels.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn.functional import conv2d
+
+from vdgs.kernels.types import Photometric
 
 #: Side of the SSIM window and its standard deviation, in pixels.
 WINDOW_PX = 11
 SIGMA_PX = 1.5
 C1 = 0.01**2
 C2 = 0.03**2
-
-
-class Photometric(NamedTuple):
-    """Scalars of one image. Only `loss` carries a gradient."""
-
-    loss: Float[Tensor, ""]
-    l1: Float[Tensor, ""]
-    ssim: Float[Tensor, ""]
 
 
 def photometric_loss(

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from vdgs.cameras import NEAR, Camera
 from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
+from vdgs.kernels.rotations import rotation_matrices
 from vdgs.kernels.types import Projected
 
 
@@ -60,17 +61,6 @@ def project_with_variances(
         valid=valid,
     )
     return projected, torch.where(shown, variances, 1.0)
-
-
-def rotation_matrices(quaternions: Float[Tensor, "m 4"]) -> Float[Tensor, "m 3 3"]:
-    """Rotation matrices of wxyz quaternions of any length but zero."""
-    w, x, y, z = (quaternions / quaternions.norm(dim=-1, keepdim=True)).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, -1).reshape(-1, 3, 3)
 
 
 def _pixels(local: Tensor, camera: Camera) -> Tensor:

@@ -7,15 +7,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.kernels.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
-from vdgs.kernels.types import Raster
+from vdgs.kernels.types import Raster, RasterGradients, RasterPullback, Splats
 
 
 def rasterise(
-    means_px: Float[Tensor, "m 2"],
-    conics: Float[Tensor, "m 3"],
-    colours: Float[Tensor, "m 3"],
-    opacities: Float[Tensor, "m"],
-    depths: Float[Tensor, "m"],
+    splats: Splats,
     background: Float[Tensor, "3"],
     width: int,
     height: int,
@@ -26,13 +22,12 @@ def rasterise(
 
     Works in the precision of its input and takes O(m h w) memory.
     """
-    rows = torch.cat([means_px, conics, colours, opacities[:, None], depths[:, None]], dim=1)
-    a, b, c = conics.unbind(dim=1)
+    tensors = (splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths)
+    a, b, c = splats.conics.unbind(dim=1)
+    rows = torch.cat([*tensors[:3], splats.opacities[:, None], splats.depths[:, None]], dim=1)
     drawn = rows.isfinite().all(dim=1) & (a > 0) & (c > 0) & (a * c - b * b > 0)
-    order = torch.argsort(depths[drawn], stable=True)
-    means_px, conics, colours, opacities, depths = (
-        t[drawn][order] for t in (means_px, conics, colours, opacities, depths)
-    )
+    order = torch.argsort(splats.depths[drawn], stable=True)
+    means_px, conics, colours, opacities, depths = (tensor[drawn][order] for tensor in tensors)
     alpha = _alphas(means_px, conics, opacities, width, height)
     with torch.no_grad():
         # A pixel ends before the splat that would take its transmittance below the minimum.
@@ -47,6 +42,43 @@ def rasterise(
     return Raster(image, 1 - through, expected_depth)
 
 
+def rasterise_vjp(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    *,
+    depth: bool = False,
+) -> tuple[Raster, RasterPullback]:
+    """`rasterise` without autograd for the caller: the picture, and the way back from it (by autograd in here)."""
+    inputs = (splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths, background)
+    leaves = [tensor.detach().clone().requires_grad_(True) for tensor in inputs]
+    means_px, conics, colours, opacities, depths, behind = leaves
+    with torch.enable_grad():
+        drawn = rasterise(Splats(means_px, conics, depths, colours, opacities), behind, width, height, depth=depth)
+
+    def pullback(
+        image: Tensor | None,
+        alpha: Tensor | None = None,
+        depth: Tensor | None = None,
+        over: tuple[Tensor, Tensor] | None = None,
+    ) -> RasterGradients:
+        made = {"image": image, "alpha": alpha, "depth": depth}
+        received = {name: gradient for name, gradient in made.items() if gradient is not None}
+        found = torch.autograd.grad(
+            [getattr(drawn, name) for name in received], leaves, list(received.values()),
+            allow_unused=True, materialize_grads=True,
+        )  # fmt: skip
+        for place, gradient in zip(over or (), found, strict=False):
+            place.copy_(gradient)
+        means, conics = over or found[:2]
+        of_depths = None if drawn.depth is None else found[4]
+        return RasterGradients(means, conics, found[2], found[3], of_depths, found[5])
+
+    shown = Raster(drawn.image.detach(), drawn.alpha.detach(), None if drawn.depth is None else drawn.depth.detach())
+    return shown, pullback
+
+
 def _alphas(
     means_px: Float[Tensor, "m 2"],
     conics: Float[Tensor, "m 3"],
@@ -55,8 +87,8 @@ def _alphas(
     height: int,
 ) -> Float[Tensor, "m h w"]:
     """Opacity of every splat at every pixel centre, zero where it is too small to count."""
-    x = torch.arange(width, dtype=means_px.dtype) + 0.5
-    y = torch.arange(height, dtype=means_px.dtype) + 0.5
+    x = torch.arange(width, dtype=means_px.dtype, device=means_px.device) + 0.5
+    y = torch.arange(height, dtype=means_px.dtype, device=means_px.device) + 0.5
     dx = (x - means_px[:, 0, None])[:, None, :]
     dy = (y - means_px[:, 1, None])[:, :, None]
     a, b, c = (conics[:, i, None, None] for i in range(3))

@@ -1,4 +1,4 @@
-"""How many cameras see each point: V_i of the visibility map (VDGS section III-B, eq. 5).
+"""How many cameras see each point: V_i of the visibility map (VDGS section IV-B, eq. 5).
 
 A camera sees a point where its frustum holds it: z > near and the projected centre on the image. Nothing
 is hidden behind anything else.
@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
-from vdgs.cameras import Camera
+from vdgs.cameras import NEAR, Camera
 
 
 def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int32[Tensor, "n"]:
@@ -22,18 +22,23 @@ def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) ->
     finite is in no view. Raises TypeError or ValueError for other points.
     """
     check_points(points)
-    count = torch.zeros(points.shape[0], dtype=torch.int32)
+    count = points.new_zeros(points.shape[0], dtype=torch.int32)
     for camera in cameras:
         count += mark_visible(points, camera)
     return count
 
 
 def mark_visible(points: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, "n"]:
-    """Which points one camera sees."""
+    """Which points one camera sees: as `Camera.sees`, on the device of the points."""
     check_points(points)
     exact = points.detach().to(torch.float64)
     finite = torch.isfinite(exact).all(dim=1)
-    return torch.from_numpy(camera.sees(torch.where(finite[:, None], exact, 0.0).numpy())) & finite
+    rigid = torch.as_tensor(camera.camera_from_world).to(exact)
+    x, y, z = (torch.where(finite[:, None], exact, 0.0) @ rigid[:3, :3].T + rigid[:3, 3]).unbind(1)
+    divisor = z if camera.model == "pinhole" else torch.ones_like(z)
+    column, row = camera.fx * x / divisor + camera.cx, camera.fy * y / divisor + camera.cy
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return finite & (z > NEAR) & inside
 
 
 def check_points(points: Tensor) -> None:

@@ -1,4 +1,4 @@
-"""Which cameras train which block, decided from the score matrix (section III-C).
+"""Which cameras train which block, decided from the score matrix (section IV-B).
 
 The paper assigns a camera where its score is above a threshold. Alone, that leaves cameras without any block and
 blocks without any camera; so (choice) every camera also joins its best block, and every block is topped up with its

@@ -1,4 +1,4 @@
-"""How well each camera shows each block: the score matrix behind camera assignment (section III-C, eqs. 6-7).
+"""How well each camera shows each block: the score matrix behind camera assignment (section IV-B, eqs. 6-7).
 
 Names and dimensions: c cameras, b blocks, n anchors, m splats of one view.
 
@@ -22,11 +22,11 @@ from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels import native as kernels
-from vdgs.kernels.native.module import threads
+from vdgs.kernels import choose, threads
 from vdgs.kernels.types import Raster, Splats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import decode_view, draw
+from vdgs.model.visibility import visibility_of
 from vdgs.partition.blocks import Blocks, places_of
 from vdgs.settings.method import AssignmentConfig
 
@@ -90,14 +90,14 @@ def score_matrix(
 
 def difference(block: Raster, full: Raster) -> Float[np.ndarray, "h w"]:
     """Δ(u) of eq. 6: the mean over the channels of the absolute difference."""
-    apart = np.abs(block.image.numpy() - full.image.numpy())
+    apart = np.abs(block.image.cpu().numpy() - full.image.cpu().numpy())
     return (apart[..., 0] + apart[..., 1] + apart[..., 2]) / 3  # twice as fast as the mean over so short an axis
 
 
 def covered_share(block: Raster, full: Raster, tau: float) -> float:
     """Share of the pixels that the scene draws which the block alone draws, and draws alike; 0 where there are none."""
-    drawn = full.alpha.numpy() > DRAWN_ALPHA
-    both = drawn & (block.alpha.numpy() > DRAWN_ALPHA)
+    drawn = full.alpha.cpu().numpy() > DRAWN_ALPHA
+    both = drawn & (block.alpha.cpu().numpy() > DRAWN_ALPHA)
     if not both.any():
         return 0.0
     return float(np.count_nonzero(both & (difference(block, full) < tau)) / np.count_nonzero(drawn))
@@ -111,7 +111,7 @@ def alike_share(block: Raster, full: Raster, tau: float) -> float:
 def dissimilarity(image: Float[Tensor, "h w 3"], full: Float[Tensor, "h w 3"]) -> float:
     """1 - SSIM of two pictures rounded to 8 bits."""
     rounded, target = ((each.clamp(0, 1) * 255 + 0.5).to(torch.uint8) for each in (image, full))
-    return 1.0 - float(kernels.photometric_loss(rounded.float() / 255, target, None).ssim)
+    return 1.0 - float(choose(full.device).photometric_loss(rounded.float() / 255, target, None).ssim)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,10 +138,13 @@ class _Members:
                 for index, block in enumerate(blocks.items)
             ]
         )
-        near = kernels.morton_order(positions).numpy()
+        near = choose(positions.device).morton_order(positions).cpu().numpy()
         order = near[np.argsort(owner[near], kind="stable")]
         bounds = [0, *np.cumsum(np.bincount(owner, minlength=len(blocks))).tolist()]
-        return _Members(torch.from_numpy(owner), torch.from_numpy(reached), positions[order].contiguous(), bounds)
+        return _Members(
+            torch.from_numpy(owner).to(positions.device), torch.from_numpy(reached).to(positions.device),
+            positions[order].contiguous(), bounds,
+        )  # fmt: skip
 
     def counts(self) -> Int64[np.ndarray, " b"]:
         """How many anchors every block owns."""
@@ -149,7 +152,7 @@ class _Members:
 
     def held(self, camera: Camera) -> list[int]:
         """How many anchors of every block the frustum holds."""
-        seen = kernels.count_visibility(self.points, [camera])
+        seen = visibility_of(self.points, [camera])
         return [int(seen[a:b].sum()) for a, b in pairwise(self.bounds)]
 
 
@@ -171,7 +174,7 @@ def _rendered_scores(
     """The scores of one camera for every block in a mode that draws, and its covered shares."""
     rows, splats = decode_view(model, camera)
     anchor = rows[splats.source.long() // model.anchors.offsets.shape[1]]
-    full = draw(splats, camera, torch.zeros(3))
+    full = draw(splats, camera, splats.means_px.new_zeros(3))
     owner, reached = members.owner[anchor], members.reached[:, anchor]
     scores, covered = [], []
     for index in range(len(reached)):
@@ -194,7 +197,7 @@ def _draw_some(splats: Splats, chosen: Bool[Tensor, " m"], full: Raster, camera:
         return full
     if not len(rows):
         return Raster(torch.zeros_like(full.image), torch.zeros_like(full.alpha), None)
-    return draw(select_splats(splats, rows), camera, torch.zeros(3))
+    return draw(select_splats(splats, rows), camera, splats.means_px.new_zeros(3))
 
 
 def select_splats(splats: Splats, rows: Int64[Tensor, " some"]) -> Splats:

@@ -29,6 +29,8 @@ __all__ = ["draw_block_facts", "draw_blocks", "draw_scores", "draw_visibility_ma
 
 #: More anchors than these are thinned: on a map they only cover each other.
 MOST_DRAWN = 60_000
+#: What the cut that is compared with is called.
+BY_PLACE = "λ_vis = 0: cut by place alone (numbers of its own)"
 #: The narrower side of a map is at least this share of the wider one: corridors stay legible.
 NARROWEST = 0.3
 
@@ -56,29 +58,24 @@ def draw_blocks(
     file: Path,
     positions: Float[np.ndarray, "n 3"],
     visibility: Int[np.ndarray, " n"],
-    blocks: Blocks,
     cameras: Sequence[Camera],
     assigned: Bool[np.ndarray, "c b"],
+    cuts: Sequence[tuple[str, Blocks]],
     unit: str,
-    compare: Blocks | None,
-    how: str,
 ) -> None:
-    """Anchors from above coloured by block, with outlines and cameras; beside it the cut `compare` (λ_vis = 0).
+    """Anchors from above coloured by block, with outlines and cameras, for each of the `cuts` with its name.
 
-    `how` says how the scene was cut. The map shows 99 % of the anchors in x and in y. Writes a PNG; `unit` is that of
-    places.
+    The first cut is the scene's own, to which cameras are assigned; another is there to compare with. The map shows
+    99 % of the anchors in x and in y. Writes a PNG; `unit` is that of places.
     """
     low, high = _frame(_inner(positions[:, :2]))
     width, height = map_size(low, high)
-    count = 1 if compare is None else 2
+    (_, blocks), count = cuts[0], len(cuts)
     columns, rows = (count, 1) if width < 1.7 * height else (1, count)
     figure = Figure(figsize=(max(0.85 + columns * (width + 0.75), 7.5), 1.15 + rows * (height + 1.1)), dpi=DPI)
     canvas, place = FigureCanvasAgg(figure), placer(figure)
     shown = sample_points(positions[:, :2].astype(np.float64), MOST_DRAWN)
-    cuts = [(blocks, how)]
-    if compare is not None:
-        cuts.append((compare, "λ_vis = 0: cut by place alone (numbers of its own)"))
-    for index, (cut, name) in enumerate(cuts):
+    for index, (name, cut) in enumerate(cuts):
         row, column = index // columns, index % columns
         left, bottom = 0.85 + column * (width + 0.75), 0.55 + (rows - 1 - row) * (height + 1.1)
         axes = place(left, bottom, width, height)

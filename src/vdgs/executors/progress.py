@@ -1,51 +1,18 @@
-"""One block's command, what it says of itself while it runs, and how it ended."""
+"""How far blocks are: what their status files say, how fast they are and how long they will take."""
 
 from __future__ import annotations
 
 import json
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
-
-from vdgs.runs.folder import StageFolder
 
 State = Literal["queued", "running", "done", "failed", "stopped"]
 #: Readings of a status file between which the speed is measured.
 WINDOW = 20
 #: No figure is larger, in whatever unit: beyond it the file is damaged.
 LARGEST = 1e12
-
-
-@dataclass(frozen=True)
-class Job:
-    """A command that trains one block, continues it after an interruption, and does nothing once it is done."""
-
-    index: int
-    folder: StageFolder
-    """The command locks it and keeps its status file; its output is appended to `output.log` there."""
-    command: list[str]
-    environment: dict[str, str] = field(default_factory=dict)
-    """Variables on top of those of this process."""
-
-    @property
-    def name(self) -> str:
-        return f"block {self.index:02d}"
-
-    @property
-    def output(self) -> Path:
-        return self.folder.path / "output.log"
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a job ended."""
-
-    index: int
-    state: Literal["done", "failed", "stopped"]
-    attempts: int
-    why: str = ""
-    """Empty when done."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +28,10 @@ class Figures:
 
 
 def read_figures(status_file: Path) -> Figures | None:
-    """The figures in a status file; None if it is missing or damaged. Never raises: a table is not worth a run."""
+    """The figures in a status file; None if it is missing or damaged.
+
+    Never raises, unlike `StageFolder.status`: a table is not worth a run.
+    """
     try:
         status = json.loads(status_file.read_bytes())
     except (OSError, ValueError, RecursionError):
@@ -93,8 +63,8 @@ def _count(value: Any) -> int | None:
     return None if number is None else int(number)
 
 
-class JobProgress:
-    """What is known of a job while the others run."""
+class BlockProgress:
+    """What is known of a block while the others run."""
 
     def __init__(self, index: int):
         self.index = index
@@ -130,7 +100,7 @@ class JobProgress:
 
     @property
     def seconds_left(self) -> float | None:
-        """What the job says itself, else what follows from its speed; None where neither is known."""
+        """What the block says itself, else what follows from its speed; None where neither is known."""
         if self.figures.seconds_left is not None:
             return self.figures.seconds_left
         iteration, iterations, speed = self.figures.iteration, self.figures.iterations, self.speed
@@ -139,10 +109,10 @@ class JobProgress:
         return max(iterations - iteration, 0) / speed
 
 
-def seconds_left_overall(rows: list[JobProgress], at_once: int) -> float | None:
-    """Estimated time until all jobs are done; None before anything is known (complexity: one pass).
+def seconds_left_overall(rows: list[BlockProgress], at_once: int) -> float | None:
+    """Estimated time until all blocks are done; None before anything is known (complexity: one pass).
 
-    Jobs that wait are taken to be as fast, and where they say nothing as long, as those that ran.
+    Blocks that wait are taken to be as fast, and where they say nothing as long, as those that ran.
     """
     speeds = [row.speed for row in rows if row.speed]
     lengths = [row.figures.iterations for row in rows if row.figures.iterations]

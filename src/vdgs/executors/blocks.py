@@ -1,0 +1,132 @@
+"""Blocks as tasks of an executor: what their status files say while they run, shown live, and how they ended."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rich.console import Console
+
+from vdgs.errors import VdgsError
+from vdgs.executors.executor import Executor, Outcome, Task
+from vdgs.executors.lines import Lines
+from vdgs.executors.progress import BlockProgress, read_figures
+from vdgs.executors.table import STYLES, Board, duration
+from vdgs.runs.folder import StageFolder
+
+
+@dataclass(frozen=True)
+class BlockCommand:
+    """A command that trains one block, continues it after an interruption, and does nothing once it is done."""
+
+    index: int
+    folder: StageFolder
+    """The command locks it and keeps its status file; its output is appended to `output.log` there."""
+    command: list[str]
+
+    @property
+    def name(self) -> str:
+        return f"block {self.index:02d}"
+
+    @property
+    def output(self) -> Path:
+        return self.folder.path / "output.log"
+
+    def task(self) -> Task:
+        return Task(self.name, self.command, self.output, folder=self.folder.path)
+
+
+def default_jobs(blocks: int, cores: int, memory_available: int, memory_per_block: int) -> tuple[int, int]:
+    """How many blocks to train at once on the CPU, and with how many threads each (choice).
+
+    As many blocks as there are cores and memory (bytes) for, at least one: separate blocks use cores better than the
+    threads of one block. The cores left over are shared out.
+    """
+    fit = memory_available // memory_per_block if memory_per_block > 0 else blocks
+    jobs = max(1, min(blocks, cores, fit))
+    return jobs, max(1, cores // jobs)
+
+
+def run_blocks(blocks: Sequence[BlockCommand], executor: Executor, console: Console) -> list[Outcome]:
+    """Run the command of every block, with a live table; the outcomes in their order. One that fails stops no other."""
+    rows = [BlockProgress(block.index) for block in blocks]
+    for block, row in zip(blocks, rows, strict=True):
+        row.observe(read_figures(block.folder.status_file), time.monotonic())
+    with Board(console, rows, executor.at_once) as board:
+        outcomes = executor.run([block.task() for block in blocks], _Watcher(blocks, rows, board))
+    _summarise(blocks, outcomes, console)
+    return outcomes
+
+
+class _Watcher(Lines):
+    """Keeps the rows of the table as status files say."""
+
+    def __init__(self, blocks: Sequence[BlockCommand], rows: Sequence[BlockProgress], board: Board):
+        super().__init__(board.say)
+        self._board = board
+        self._pairs = {block.name: (block, row) for block, row in zip(blocks, rows, strict=True)}
+
+    def started(self, task: Task, attempt: int) -> None:
+        self._pairs[task.name][1].started()
+        self._board.note(f"{task.name}: started{_attempt(attempt)}")
+
+    def crashed(self, task: Task, how: str, attempts_left: int) -> None:
+        super().crashed(task, how, attempts_left)
+        self._observe(task.name)
+        self._pairs[task.name][1].state = "queued"
+
+    def ended(self, task: Task, outcome: Outcome) -> None:
+        block, row = self._pairs[task.name]
+        self._observe(task.name)
+        row.state, row.attempts = outcome.state, outcome.attempts
+        if outcome.state == "failed":
+            self.say(f"{task.name}: failed", STYLES[outcome.state])
+            self.say("\n".join(f"  {line}" for line in outcome.last_lines or outcome.why.splitlines()), "")
+        elif outcome.attempts:
+            took = f"{duration(outcome.seconds)}{_attempt(outcome.attempts)}"
+            self._board.note(f"{task.name}: {outcome.state} after {took}")
+        if outcome.attempts and outcome.state != "done":
+            _note_end(block.folder, outcome)
+
+    def tick(self) -> None:
+        for name in self._pairs:
+            self._observe(name)
+        self._board.show()
+
+    def _observe(self, name: str) -> None:
+        block, row = self._pairs[name]
+        if row.state == "running":
+            row.observe(read_figures(block.folder.status_file), time.monotonic())
+
+
+def _attempt(number: int) -> str:
+    return f" (attempt {number})" if number > 1 else ""
+
+
+def _note_end(folder: StageFolder, outcome: Outcome) -> None:
+    """Let no status file say "running" of a block that is not: a process that was killed could not write it itself."""
+    # Not if another process has taken over, nor if the file is damaged.
+    with suppress(VdgsError, OSError, ValueError), folder.locked():
+        status = folder.status()
+        if status.state not in (outcome.state, "done"):
+            folder.set_status(replace(status, state=outcome.state, why=outcome.why))
+
+
+def _summarise(blocks: Sequence[BlockCommand], outcomes: list[Outcome], console: Console) -> None:
+    def say(text: str, style: str = "") -> None:
+        console.print(text, style=style, highlight=False, markup=False)
+
+    unfinished = [(block, outcome) for block, outcome in zip(blocks, outcomes, strict=True) if outcome.state != "done"]
+    say(f"{len(blocks) - len(unfinished)} of {len(blocks)} blocks done")
+    for block, outcome in unfinished:
+        if outcome.attempts:
+            say(f"{block.name} {outcome.state}" + (f": {outcome.why}" if outcome.why else ""), STYLES[outcome.state])
+        if outcome.state == "failed" and block.output.is_file():
+            say(f"  all of its output: {block.output}")
+    if waited := [block.name for block, outcome in unfinished if not outcome.attempts]:
+        say(f"not started: {', '.join(waited)}", STYLES["stopped"])
+    if unfinished:
+        say("The same command continues these blocks and leaves those that are done.")

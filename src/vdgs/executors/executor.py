@@ -1,0 +1,86 @@
+"""What runs commands: the interface that every engine stands behind (processes of this machine: `local`).
+
+A task is a command that can be repeated: it continues after an interruption and does nothing once it is done. So an
+engine keeps no state of its own, and may die. A task that ends with 0 is done; with 1 or 2 (usage) it failed for a
+reason that it printed, which another attempt would not mend; with 130 it was asked to stop. Everything else is a crash:
+the task is started again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, Protocol
+
+#: How a task can end.
+EndState = Literal["done", "failed", "stopped"]
+
+
+@dataclass(frozen=True)
+class Task:
+    """A command that can be repeated."""
+
+    name: str
+    command: Sequence[str]
+    output: Path
+    """What it prints is appended here."""
+    environment: Mapping[str, str] = field(default_factory=dict)
+    """Variables on top of those of this process."""
+    folder: Path | None = None
+    """The stage folder that the command locks while it works; while another process holds it, the task waits."""
+    after: str | None = None
+    """The name of the task, among those run with it, that must be done before this one starts."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a task ended."""
+
+    name: str
+    state: EndState
+    attempts: int = 0
+    """0: it was not started."""
+    seconds: float = 0.0
+    """Of the last attempt."""
+    why: str = ""
+    """Empty when done."""
+    last_lines: tuple[str, ...] = ()
+    """The end of what a failed one printed."""
+
+
+class Listener:
+    """Is told what becomes of the tasks while they run; does nothing with it. Called in the thread that runs them."""
+
+    def started(self, task: Task, attempt: int) -> None:
+        """An attempt, counted from 1, begins."""
+
+    def waits(self, task: Task) -> None:
+        """There is room for it, but another process works on it."""
+
+    def crashed(self, task: Task, how: str, attempts_left: int) -> None:
+        """It will be started again."""
+
+    def stopping(self, tasks: Sequence[Task]) -> None:
+        """These run and were asked to save and end; no more are started."""
+
+    def ended(self, task: Task, outcome: Outcome) -> None:
+        """It will not be started again, or never was."""
+
+    def tick(self) -> None:
+        """Called regularly, after all other news."""
+
+
+class Executor(Protocol):
+    """An engine that runs tasks."""
+
+    @property
+    def at_once(self) -> int:
+        """How many tasks run side by side, at most."""
+
+    def run(self, tasks: Sequence[Task], listener: Listener) -> list[Outcome]:
+        """Run every task, in their order where there is a choice; the outcomes in the order of the tasks.
+
+        One that fails stops no other but those that come `after` it. When this process is asked to stop (Ctrl-C,
+        SIGTERM, SIGHUP), it asks the running tasks once to save and end, and starts no more.
+        """

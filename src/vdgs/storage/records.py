@@ -1,0 +1,60 @@
+"""Frozen dataclasses as JSON objects and back: what stages note of themselves, typed here and plain on disk."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+Record = TypeVar("Record")
+
+
+def plain(record: Any) -> dict[str, Any]:
+    """A record ready for JSON, every field of it."""
+    return dataclasses.asdict(record)
+
+
+def known(record: Any) -> dict[str, Any]:
+    """A record ready for JSON, without the fields that are None."""
+    return {name: value for name, value in plain(record).items() if value is not None}
+
+
+def record_of(kind: type[Record], values: Any) -> Record:
+    """The inverse of `plain` and `known`. Keys that the class does not have are those of a newer version: left out.
+
+    Raises ValueError, naming the field, for a value of another kind or one that is missing.
+    """
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{_shown(values)} is not an object")
+    hints = typing.get_type_hints(kind)
+    taken = {name: _read(hints[name], values[name], name) for name in hints if name in values}
+    try:
+        return kind(**taken)
+    except TypeError as error:  # it names what is missing
+        raise ValueError(str(error)) from error
+
+
+def _read(hint: Any, value: Any, name: str) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        if value is None and type(None) in arguments:
+            return None
+        (hint,) = (each for each in arguments if each is not type(None))
+        return _read(hint, value, name)
+    if origin is tuple:
+        if not isinstance(value, list):
+            raise ValueError(f"{name} is {_shown(value)}, not a list")
+        return tuple(_read(arguments[0], each, name) for each in value)
+    if dataclasses.is_dataclass(hint):
+        return record_of(typing.cast(type, hint), value)
+    accepted = (int, float) if hint is float else hint
+    if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
+        raise ValueError(f"{name} is {_shown(value)}")
+    return float(value) if hint is float else value
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else text[:40] + "…"

@@ -1,0 +1,57 @@
+"""All that is kept per anchor comes, goes and changes places by one rule.
+
+Parameters, moments, statistics, remembered gradients and the mean of models have one row for each anchor. They are
+held in groups of named tensors; a group's new rows are given (parameters) or zero: an anchor without history.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+#: Named tensors with one row for each anchor.
+Group = dict[str, Tensor]
+
+
+class PerAnchor(Protocol):
+    """What holds groups of tensors with one row for each anchor."""
+
+    def take_groups(self) -> dict[str, Group]:
+        """All groups by name, no longer held elsewhere: each tensor can be let go as it is replaced."""
+        ...
+
+    def put_groups(self, groups: dict[str, Group]) -> None:
+        """The inverse of `take_groups`."""
+        ...
+
+
+def remap(state: PerAnchor, added: Mapping[str, Group], count: int, kept: Tensor) -> None:
+    """Append `count` rows to everything that the state keeps per anchor, then keep the rows `kept` (mask or order).
+
+    `added` has the new rows of the groups that it names; those of the others are zero. Tensor by tensor: no more than
+    one is there twice.
+    """
+    groups = state.take_groups()
+    for name, group in groups.items():
+        remap_rows(group, added.get(name) or {key: t.new_zeros(count, *t.shape[1:]) for key, t in group.items()}, kept)
+    state.put_groups(groups)
+
+
+def remap_rows(group: Group, added: Mapping[str, Tensor], kept: Tensor) -> None:
+    """Append to each tensor the rows of its name in `added`, then keep the `kept` rows (mask or order); in place.
+
+    Each old tensor is let go before the next is made: if nothing else holds it, no more than one is there twice.
+    """
+    for name in list(group):
+        before, more = group.pop(name), added[name]
+        if kept.dtype != torch.bool:
+            group[name] = (torch.cat([before, more]) if len(more) else before).index_select(0, kept)
+            continue
+        old, new = kept[: len(before)], kept[len(before) :]
+        stays, comes = int(old.sum()), int(new.sum())
+        group[name] = before.new_empty(stays + comes, *before.shape[1:])
+        torch.index_select(before, 0, old.nonzero()[:, 0], out=group[name][:stays])
+        torch.index_select(more, 0, new.nonzero()[:, 0], out=group[name][stays:])

@@ -1,0 +1,61 @@
+"""Requests to stop are noted as they should be, and handlers are put back."""
+
+import signal
+import threading
+
+import pytest
+
+from vdgs.watching.interrupts import stop_requests
+
+NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@pytest.fixture(autouse=True)
+def handlers_as_before():
+    before = [signal.getsignal(number) for number in NUMBERS]
+    yield
+    assert [signal.getsignal(number) for number in NUMBERS] == before
+
+
+def test_requests_are_noted_in_their_order():
+    with stop_requests(hangup=True) as asked:
+        assert not asked
+        for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGINT):
+            signal.raise_signal(number)
+        assert list(asked) == [signal.SIGHUP, signal.SIGINT, signal.SIGTERM, signal.SIGINT]
+
+
+@pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
+def test_the_second_ctrl_c_interrupts_where_asked_for(first):
+    with stop_requests(second_interrupts=True) as asked:
+        signal.raise_signal(first)
+        signal.raise_signal(signal.SIGTERM)  # a scheduler that asks twice is no impatient person
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        assert list(asked) == [first, signal.SIGTERM]
+
+
+def test_hangup_stays_ignored_under_nohup_and_is_left_alone_where_not_asked_for():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stop_requests(hangup=True) as asked:
+            signal.raise_signal(signal.SIGHUP)
+            assert not asked
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    with stop_requests():
+        assert signal.getsignal(signal.SIGHUP) == before
+
+
+def test_outside_the_main_thread_nothing_is_noted():
+    seen = []
+
+    def work() -> None:
+        with stop_requests(hangup=True) as asked:
+            seen.append((list(asked), signal.getsignal(signal.SIGINT)))
+
+    before = signal.getsignal(signal.SIGINT)
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [([], before)]

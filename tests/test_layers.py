@@ -1,0 +1,274 @@
+"""Which room of the package may import which: downwards only, in no circle, and kernels through their door.
+
+A room is a folder or a module right below `src/vdgs`. All imports count, those inside functions and those for type
+checkers too: what a file names, it must be able to know.
+"""
+
+from __future__ import annotations
+
+import ast
+import graphlib
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "src" / "vdgs"
+
+#: Lowest first. A room imports lower layers only: neither higher ones nor the other rooms of its own.
+LAYERS: tuple[tuple[str, ...], ...] = (
+    ("errors", "cameras"),
+    ("settings", "storage"),
+    ("kernels",),
+    ("memory",),
+    ("captures", "model"),
+    ("figures", "training"),
+    ("partition", "inspection", "synth"),
+    ("runs",),
+    ("watching",),
+    ("executors", "evaluation"),
+    ("stages", "films", "report", "comparators"),
+    ("pipeline", "doctor", "bench"),
+    ("verbs",),
+    ("cli",),
+)
+#: What other rooms may import of a room, beside the room itself.
+DOORS: Mapping[str, tuple[str, ...]] = {"kernels": ("types", "constants", "operations", "devices", "rotations")}
+#: Rooms that may look behind the doors: `doctor` says what the machine can do.
+LOOKS_BEHIND = ("doctor",)
+#: Rooms whose files import nothing from each other: what two stages need lies below both.
+STRANGERS = ("stages",)
+
+
+@dataclass(frozen=True)
+class Import:
+    """One import of the package's own: modules by their full names."""
+
+    where: str
+    importer: str
+    imported: str
+
+
+def modules_of(package: Path) -> dict[str, Path]:
+    """Every file of a package by its module's name."""
+    found = {}
+    for file in sorted(package.rglob("*.py")):
+        parts = file.relative_to(package.parent).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = file
+    return found
+
+
+def imports_of(package: Path) -> list[Import]:
+    """All imports inside the package, wherever in a file they stand."""
+    modules, found = modules_of(package), list[Import]()
+    for name, file in modules.items():
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"), str(file))):
+            if isinstance(node, (ast.Import, ast.ImportFrom)):
+                where = f"{file.relative_to(package.parent).as_posix()}:{node.lineno}"
+                within = name if file.name == "__init__.py" else name.rpartition(".")[0]
+                found += [Import(where, name, each) for each in _imported(node, within, modules, package.name)]
+    return found
+
+
+def _imported(node: ast.Import | ast.ImportFrom, within: str, modules: Iterable[str], package: str) -> list[str]:
+    """The modules of the package that a statement in a file of the package `within` imports."""
+    if isinstance(node, ast.Import):
+        names = [alias.name for alias in node.names]
+    else:
+        base = node.module or ""
+        if node.level:
+            above = within.split(".")[: len(within.split(".")) - node.level + 1]
+            base = ".".join([*above, *([node.module] if node.module else [])])
+        names = [f"{base}.{alias.name}" if f"{base}.{alias.name}" in modules else base for alias in node.names]
+    return list(dict.fromkeys(name for name in names if name.split(".")[0] == package))
+
+
+def room_of(module: str) -> str:
+    """`partition` for vdgs.partition.cut; empty for the package itself, which only says its version."""
+    return module.partition(".")[2].partition(".")[0]
+
+
+def problems(package: Path, layers: tuple[tuple[str, ...], ...] = LAYERS) -> list[str]:
+    """Everything that is wrong with the imports of a package, a sentence each."""
+    imports = imports_of(package)
+    return [
+        *unlisted(package, layers), *upwards(imports, layers), *past_doors(imports), *between_strangers(imports),
+        *circles(imports),
+    ]  # fmt: skip
+
+
+def unlisted(package: Path, layers: tuple[tuple[str, ...], ...]) -> list[str]:
+    """Rooms without a layer, and layers' rooms that are not there."""
+    there = {room_of(module) for module in modules_of(package)} - {""}
+    listed = [room for layer in layers for room in layer]
+    return [
+        *(f"{package.name}/{room}: belongs to no layer; add it to LAYERS" for room in sorted(there - {*listed})),
+        *(f"LAYERS names {room}, which is not there" for room in sorted({*listed} - there)),
+        *(f"LAYERS names {room} more than once" for room in sorted({*listed}) if listed.count(room) > 1),
+    ]
+
+
+def upwards(imports: Iterable[Import], layers: tuple[tuple[str, ...], ...]) -> list[str]:
+    """Imports from a room into its own layer or a higher one."""
+    height = {room: number for number, layer in enumerate(layers) for room in layer}
+
+    def words(room: str) -> str:
+        return f"{room} (layer {height[room] + 1}: {', '.join(layers[height[room]])})"
+
+    found = []
+    for each in imports:
+        lower, upper = room_of(each.importer), room_of(each.imported)
+        if lower == upper or not {lower, upper} <= height.keys():
+            continue
+        if height[upper] >= height[lower]:
+            how = "of its own layer" if height[upper] == height[lower] else "above it"
+            found.append(f"{each.where}: imports {each.imported}: {words(lower)} may not import {words(upper)}, {how}")
+    return found
+
+
+def past_doors(imports: Iterable[Import]) -> list[str]:
+    """Imports of what a room keeps to itself."""
+    found = []
+    for each in imports:
+        room, asking = room_of(each.imported), room_of(each.importer)
+        inside = each.imported.split(".")[2:]
+        if room in DOORS and asking != room and asking not in LOOKS_BEHIND and inside and inside[0] not in DOORS[room]:
+            allowed = ", ".join([room, *(f"{room}.{name}" for name in DOORS[room])])
+            found.append(f"{each.where}: imports {each.imported}: {asking} may import only {allowed}")
+    return found
+
+
+def between_strangers(imports: Iterable[Import]) -> list[str]:
+    """Imports between files of a room whose files know nothing of each other."""
+    return [
+        f"{each.where}: imports {each.imported}: files of {room_of(each.importer)} do not import each other"
+        for each in imports
+        if room_of(each.importer) == room_of(each.imported) in STRANGERS and each.importer != each.imported
+    ]
+
+
+def circles(imports: Iterable[Import]) -> list[str]:
+    """A circle of files, and for every folder one of what lies in it: files and folders."""
+    graphs: dict[str, dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
+    for each in imports:
+        graphs[""][each.importer].add(each.imported)
+        source, target = each.importer.split("."), each.imported.split(".")
+        shared = next(
+            (i for i, (a, b) in enumerate(zip(source, target, strict=False)) if a != b), min(len(source), len(target))
+        )
+        if shared < min(len(source), len(target)):  # neither is the folder itself, that is its __init__
+            folder = ".".join(source[:shared])
+            graphs[folder][".".join(source[: shared + 1])].add(".".join(target[: shared + 1]))
+    found = []
+    for folder, graph in graphs.items():
+        try:
+            graphlib.TopologicalSorter(graph).prepare()
+        except graphlib.CycleError as error:
+            what = f"a circle in {folder}" if folder else "a circle of files"
+            found.append(f"{what}: {' imports '.join(reversed(error.args[1]))}")
+    return found
+
+
+def test_every_room_has_its_layer():
+    assert unlisted(PACKAGE, LAYERS) == []
+
+
+def test_rooms_import_downwards_in_no_circle_and_stages_nothing_of_each_other():
+    imports = imports_of(PACKAGE)
+    assert len(imports) > 500
+    found = [*upwards(imports, LAYERS), *between_strangers(imports), *circles(imports)]
+    assert not found, "\n" + "\n".join(found)
+
+
+def test_kernels_are_asked_at_their_door():
+    found = past_doors(imports_of(PACKAGE))
+    assert not found, "\n" + "\n".join(found)
+
+
+@pytest.fixture
+def tree(tmp_path):
+    """Writes a package of made-up files: module name -> source."""
+
+    def write(files: Mapping[str, str]) -> Path:
+        package = tmp_path / "vdgs"
+        for name, source in files.items():
+            file = package / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(source, encoding="utf-8")
+        return package
+
+    return write
+
+
+SMALL = (("low", "side"), ("kernels",), ("stages",), ("high", "doctor"))
+CLEAN = {
+    "__init__.py": "", "low.py": "from vdgs import __version__", "side.py": "import json",
+    "kernels/__init__.py": "from vdgs.kernels import native", "kernels/native.py": "from vdgs.kernels.types import T",
+    "kernels/types.py": "import vdgs.low", "stages/one.py": "from vdgs.kernels import work",
+    "stages/two.py": "from vdgs.kernels.types import T", "high.py": "from vdgs.stages import one",
+    "doctor/cards.py": "from vdgs.kernels import native",
+}  # fmt: skip
+
+
+def test_the_checker_is_content_with_a_clean_tree(tree):
+    assert problems(tree(CLEAN), SMALL) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "said"),
+    [
+        pytest.param(
+            "side.py", "def f():\n    from vdgs.high import g",
+            ["vdgs/side.py:2: imports vdgs.high: side (layer 1: low, side) may not import high (layer 4: high, "
+             "doctor), above it"], id="upwards, inside a function",
+        ),
+        pytest.param(
+            "low.py", "if TYPE_CHECKING:\n    import vdgs.side as other",
+            ["vdgs/low.py:2: imports vdgs.side: low (layer 1: low, side) may not import side (layer 1: low, side), of "
+             "its own layer"], id="sideways, for type checkers",
+        ),
+        pytest.param(
+            "stages/one.py", "from .two import go",
+            ["vdgs/stages/one.py:1: imports vdgs.stages.two: files of stages do not import each other"],
+            id="between stages, relative",
+        ),
+        pytest.param(
+            "high.py", "from vdgs.kernels import native as kernels",
+            ["vdgs/high.py:1: imports vdgs.kernels.native: high may import only kernels, kernels.types, "
+             "kernels.constants, kernels.operations, kernels.devices, kernels.rotations"], id="past the door",
+        ),
+        pytest.param(
+            "stages/two.py", "from vdgs.kernels.native.module import threads",
+            ["vdgs/stages/two.py:1: imports vdgs.kernels.native.module: stages may import only kernels, kernels.types, "
+             "kernels.constants, kernels.operations, kernels.devices, kernels.rotations"], id="far past the door",
+        ),
+        pytest.param("attic/box.py", "", ["vdgs/attic: belongs to no layer; add it to LAYERS"], id="a new room"),
+    ],
+)  # fmt: skip
+def test_the_checker_names_what_is_wrong(tree, name, source, said):
+    assert problems(tree(CLEAN | {name: source}), SMALL) == said
+
+
+def test_the_checker_misses_rooms_that_are_gone(tree):
+    without = {name: source for name, source in CLEAN.items() if name != "side.py"}
+    assert problems(tree(without), SMALL) == ["LAYERS names side, which is not there"]
+
+
+def test_the_checker_sees_circles_of_files_and_of_folders(tree):
+    files = {"high/a.py": "from vdgs.high.b import x", "high/b.py": "def f():\n    from vdgs.high import a"}
+    package = tree({name: source for name, source in CLEAN.items() if name != "high.py"} | files)
+    said = problems(package, SMALL)
+    assert len(said) == 2
+    assert {line.partition(":")[0] for line in said} == {"a circle of files", "a circle in vdgs.high"}
+    assert all("vdgs.high.a imports vdgs.high.b" in line for line in said)
+    tree(
+        {
+            "high/b.py": "", "high/a.py": "", "high/first/x.py": "from vdgs.high.second.x import f",
+            "high/first/y.py": "", "high/second/x.py": "", "high/second/y.py": "import vdgs.high.first.y",
+        }
+    )  # fmt: skip
+    (circle,) = problems(package, SMALL)
+    assert circle.startswith("a circle in vdgs.high: ")
+    assert "vdgs.high.first imports vdgs.high.second" in circle
