@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
 
 from captures_support import tiny_scene, write_colmap
+from cli_support import threads_as_before
 from vdgs.bench.bench import BenchSettings, run_bench
 from vdgs.bench.plan import Choices
 from vdgs.bench.results import Result
@@ -24,8 +25,9 @@ class InThisProcess:
     at_once: int
 
     def run(self, tasks: Sequence[Task], _listener: Listener) -> list[Outcome]:
-        for task in tasks:
-            work(Job.read(Path(task.command[-1])))
+        with threads_as_before():
+            for task in tasks:
+                work(replace(Job.read(Path(task.command[-1])), threads=1))
         return [Outcome(task.name, "done") for task in tasks]
 
 

@@ -6,11 +6,13 @@
         command.send_signal(signal.SIGKILL)
 
 One server for each worker of the tests imports the package once; every command is forked from it. What a command starts
-itself (the processes of blocks) is started as always. `entry_point` is a whole `python -m vdgs.cli`.
+itself (the processes of blocks) is started as always, unless it is asked to do that itself (`CommandsHere`).
+`entry_point` is a whole `python -m vdgs.cli`.
 """
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
 import signal
@@ -19,10 +21,15 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pausing import Pause, pause_where_asked
+
+if TYPE_CHECKING:
+    from vdgs.executors.executor import Listener, Outcome, Task
 
 #: What nothing takes that still goes on, however busy the machine is. The limit of a whole test is larger still.
 PATIENCE_SECONDS = 900.0
@@ -40,15 +47,63 @@ if sys.platform == "linux":
     _PROCESSES.set_forkserver_preload(IMPORTED)
 
 
+@dataclass(frozen=True)
+class CommandsHere:
+    """An executor that runs modules of vdgs in this process, one after the other: processes without their start."""
+
+    at_once: int
+
+    def run(self, tasks: Sequence[Task], _listener: Listener) -> list[Outcome]:
+        from vdgs.executors.executor import Outcome
+
+        for task in tasks:
+            python, option, module, *arguments = task.command
+            assert (python, option) == (sys.executable, "-m")
+            task.output.parent.mkdir(parents=True, exist_ok=True)
+            with task.output.open("a") as output, redirect_stdout(output), redirect_stderr(output), threads_as_before():
+                code = _exit_code(importlib.import_module(module).main, arguments)
+            assert not code, f"{task.name}: exit code {code}, see {task.output}"
+        return [Outcome(task.name, "done", 1) for task in tasks]
+
+
+def _exit_code(main: Callable[[list[str]], int | None], arguments: list[str]) -> object:
+    try:
+        return main(arguments)
+    except SystemExit as ended:
+        return ended.code
+
+
+@contextmanager
+def threads_as_before() -> Iterator[None]:
+    """Undo what a command that runs in this process sets: how many threads compute."""
+    import torch
+
+    from vdgs.kernels.native import module
+
+    kernels, of_torch = module.threads(), torch.get_num_threads()
+    try:
+        yield
+    finally:
+        module.set_threads(kernels)
+        torch.set_num_threads(of_torch)
+
+
+@dataclass(frozen=True)
+class _Circumstances:
+    """In which a command runs: see `begun`."""
+
+    environment: dict[str, str]
+    file_blocks: int | None = None
+    tasks_here: bool = False
+
+
 class Command:
     """A command that runs, its output going to files in a folder."""
 
-    def __init__(self, arguments: Sequence[str], folder: Path, pause: Pause, file_blocks: int | None):
+    def __init__(self, arguments: Sequence[str], folder: Path, pause: Pause, circumstances: _Circumstances):
         self.args, self._pause = list(arguments), pause
         self._files = (folder / "stdout", folder / "stderr")
-        environment = pause.environment() if pause.count else {}
-        target = (self.args, *map(str, self._files), environment, file_blocks)
-        self._process = _PROCESSES.Process(target=_run, args=target)
+        self._process = _PROCESSES.Process(target=_run, args=(self.args, *map(str, self._files), circumstances))
         self._process.start()
 
     @property
@@ -94,27 +149,36 @@ class Command:
 
 
 @contextmanager
-def begun(*arguments: object, pause_at: tuple[str, int] = ("", 0), file_blocks: int | None = None) -> Iterator[Command]:
+def begun(
+    *arguments: object,
+    pause_at: tuple[str, int] | None = None,
+    file_blocks: int | None = None,
+    tasks_here: bool = False,
+) -> Iterator[Command]:
     """A `vdgs` that runs meanwhile; killed at the end if it still does.
 
     `pause_at`: it waits, and so do processes that it starts, before the n-th time that it opens, renames to or removes
     a file whose whole path is like this pattern. `file_blocks`: no file that it writes may be larger, in units of 1024
-    bytes.
+    bytes. `tasks_here`: what it would start processes for, it
+    does itself.
     """
     with tempfile.TemporaryDirectory() as folder:
         waiting = Path(folder) / "waiting"
         waiting.mkdir()
-        pause = Pause(*pause_at, str(waiting))
-        command = Command([str(each) for each in arguments], Path(folder), pause, file_blocks)
+        pause = Pause(*(pause_at or ("", 0)), str(waiting))
+        circumstances = _Circumstances(pause.environment() if pause_at else {}, file_blocks, tasks_here)
+        command = Command([str(each) for each in arguments], Path(folder), pause, circumstances)
         try:
             yield command
         finally:
             command.close()
 
 
-def vdgs(*arguments: object, file_blocks: int | None = None) -> subprocess.CompletedProcess[str]:
+def vdgs(
+    *arguments: object, file_blocks: int | None = None, tasks_here: bool = False
+) -> subprocess.CompletedProcess[str]:
     """Run a command to its end. See `begun`."""
-    with begun(*arguments, file_blocks=file_blocks) as command:
+    with begun(*arguments, file_blocks=file_blocks, tasks_here=tasks_here) as command:
         return command.finished()
 
 
@@ -132,16 +196,33 @@ def wait_until(condition: Callable[[], object]) -> None:
         time.sleep(GLANCE_SECONDS)
 
 
-def _run(arguments: list[str], stdout: str, stderr: str, environment: dict[str, str], file_blocks: int | None) -> None:
+def is_free(run: Path) -> bool:
+    """Whether no process works on a run."""
+    from vdgs.errors import RunError
+    from vdgs.runs.folder import RunFolder
+
+    try:
+        with RunFolder(run).locked():
+            return True
+    except RunError:
+        return False
+
+
+def _run(arguments: list[str], stdout: str, stderr: str, circumstances: _Circumstances) -> None:
     """In the process of the command."""
     for descriptor, file in ((1, stdout), (2, stderr)):
         os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), descriptor)
-    if file_blocks is not None:
+    if circumstances.file_blocks is not None:
         import resource
 
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * file_blocks,) * 2)
-    os.environ.update(environment)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * circumstances.file_blocks,) * 2)
+    os.environ.update(circumstances.environment)
     pause_where_asked()
+    if circumstances.tasks_here:
+        from vdgs.bench import bench
+        from vdgs.stages import train
+
+        bench.LocalExecutor = train.LocalExecutor = CommandsHere  # type: ignore[assignment,misc]
     from vdgs.cli import main
 
     main(arguments)

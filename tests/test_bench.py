@@ -3,12 +3,8 @@
 import fcntl
 import io
 import json
-import os
 import shutil
 import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from cli_support import begun, is_free, wait_until
 from vdgs.bench import bench
 from vdgs.bench.bench import BenchSettings, run_bench
 from vdgs.bench.plan import Choices
@@ -38,16 +35,12 @@ def settings(output: Path, scale: float = 0.1) -> BenchSettings:
 def benched(tmp_path_factory) -> Path:
     pytest.importorskip("embreex")
     output = tmp_path_factory.mktemp("bench") / "out"
-    started = subprocess.Popen(
-        [sys.executable, "-m", "vdgs.cli", "bench", "toy", "--output", str(output), *SMALL],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    until = time.monotonic() + 100  # killed without a word once the first run is there; then continued
-    while not list(output.glob("runs/tiny/*/0/config.yaml")) and started.poll() is None and time.monotonic() < until:
-        time.sleep(0.05)
-    os.kill(started.pid, signal.SIGKILL)
-    started.communicate()
-    time.sleep(1.5)  # its processes notice, save and end
+    command = ("bench", "toy", "--output", output, *SMALL)
+    with begun(*command, pause_at=("*/runs/*/coarse/log.jsonl", 1)) as process:
+        process.wait_until_paused()  # the first run begins to train
+        process.send_signal(signal.SIGKILL)  # without a word
+        process.finished()
+    wait_until(lambda: all(is_free(run) for run in output.glob("runs/*/*/*")))  # its processes notice, save and end
     run_bench(settings(output), Console(file=io.StringIO()))
     return output
 

@@ -7,14 +7,12 @@ from pathlib import Path
 import cv2
 import pytest
 
-from bench_support import InThisProcess
 from captures_support import TinyScene, write_colmap
+from cli_support import vdgs
 from layouts_support import halves, write_matrixcity, write_mega_nerf
-from vdgs.bench import bench
 from vdgs.bench.scenes import SCENES
 from vdgs.captures.capture import Capture
 from vdgs.captures.loading import load_capture
-from vdgs.cli import main
 from vdgs.runs.folder import RunFolder
 from vdgs.synth import SynthOptions, generate
 
@@ -53,13 +51,11 @@ def data(tmp_path_factory) -> Path:
     return folder
 
 
-def test_the_published_data_sets_are_benched(data, tmp_path, monkeypatch):
+def test_the_published_data_sets_are_benched(data, tmp_path):
     """Their folders are found and read, methods run with the paper's settings, and pixels are grouped by V."""
-    monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
     asked = ("--scenes", "residence", "block-all", "--methods", "3dgs", "blocks-2", "--iterations-total", "80")
-    with pytest.raises(SystemExit) as ended:
-        main(["bench", "table1", "--output", str(tmp_path), "--data", str(data), *asked, "--seeds", "1"])
-    assert ended.value.code == 0
+    done = vdgs("bench", "table1", "--output", tmp_path, "--data", data, *asked, "--seeds", "1", tasks_here=True)
+    assert done.returncode == 0, done.stderr
     results = json.loads((tmp_path / "table1" / "results.json").read_text())["results"]
     assert [(each["scene"], each["method"], each["state"]) for each in results] == [
         (scene, method, "done") for scene in ("residence", "block-all") for method in ("3dgs", "blocks-2")
