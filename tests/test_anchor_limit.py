@@ -79,7 +79,7 @@ def merged(capture: Path, output: Path, max_anchors: int) -> tuple[RunFolder, in
     train_coarse(run, opened, WatchOptions(), console)
     measure_visibility(run, console)
     partition_run(run, console)
-    for index in range(len(run.partition_facts()["blocks"])):
+    for index in range(len(run.partition_record().blocks)):
         train_block(output, index, WatchOptions(), console)
     merge_run(output, False, console)
     return run, run.coarse.status().anchors, run.merged.status().anchors
@@ -88,7 +88,7 @@ def merged(capture: Path, output: Path, max_anchors: int) -> tuple[RunFolder, in
 def test_a_merged_scene_keeps_to_the_limit_of_all_its_blocks(place, tmp_path):
     limit = 140  # a little more than the coarse model has
     run, coarse, grown = merged(place, tmp_path / "run", limit)
-    owned = [each["anchors_core"] for each in run.partition_facts()["blocks"]]
+    owned = [each.anchors_core for each in run.partition_record().blocks]
     trained = [run.block(index).status().anchors for index in range(len(owned))]
     shares = [limit * each // coarse for each in owned]
     assert max(owned) > -(-limit // len(owned))  # equal shares would leave the largest above its own

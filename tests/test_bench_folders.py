@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from bench_support import run_here
+from bench_support import InThisProcess
 from captures_support import tiny_scene, write_colmap
 from vdgs.bench import bench
 from vdgs.bench.bench import BenchSettings, run_bench
@@ -121,7 +121,7 @@ def benched(folder: Path, output: Path) -> list[Result]:
 
 
 def test_a_folder_becomes_a_table_and_keeps_its_results_where_it_goes(captures, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench, "run_tasks", run_here)
+    monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
     output = tmp_path / "out"
     (result,) = benched(captures / "My place (2024)", output)
     assert (result.scene, result.state, result.figures["iterations"]) == ("My-place-2024", "done", 24)
