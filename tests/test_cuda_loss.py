@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+
 import numpy as np
 import pytest
 import torch
@@ -17,6 +19,8 @@ from vdgs.kernels.reference import loss as reference
 
 pytestmark = [needs_nvrtc, pytest.mark.xdist_group("cuda_loss")]
 needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
+#: How many the kernels have.
+BARRIERS = 7
 SIZES = [(1, 1), (3, 2), (16, 16), (17, 33), (37, 50), (64, 31)]
 
 
@@ -25,9 +29,29 @@ def library(tmp_path_factory):
     return build_on_host("loss.cu", tmp_path_factory.mktemp("host"))
 
 
+@pytest.fixture(scope="module")
+def numbered(tmp_path_factory):
+    """The kernels, of whose barriers one can be left out: that of the number `left_out`."""
+    before, *after = read_source("loss.cu").split("__syncthreads();")
+    assert len(after) == BARRIERS
+    parts = [f"if (left_out != {number}) __syncthreads();{part}" for number, part in enumerate(after)]
+    text = 'extern "C" int left_out;\nint left_out = -1;\n' + before + "".join(parts)
+    return build_on_host("loss.cu", tmp_path_factory.mktemp("numbered"), text)
+
+
+@pytest.fixture(scope="module")
+def code(tmp_path_factory):
+    """Where compiled code is kept, so that NVRTC runs once (that it is never wrong: test_cuda_compiling.py)."""
+    return tmp_path_factory.mktemp("code")
+
+
+@pytest.fixture(autouse=True)
+def _compiled_once(code, monkeypatch):
+    monkeypatch.setenv(cache.VARIABLE, str(code))
+
+
 @pytest.fixture
-def program(library, tmp_path, monkeypatch):
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "code"))
+def program(library):
     return Program("loss.cu", driver=HostDriver(library))
 
 
@@ -70,21 +94,19 @@ def test_no_barrier_is_missing(program, library):
 
 
 @needs_a_compiler
-@pytest.mark.parametrize("barrier", range(7))
-def test_a_missing_barrier_would_be_noticed(barrier, tmp_path, monkeypatch):
+@pytest.mark.parametrize("barrier", range(BARRIERS))
+def test_a_missing_barrier_would_be_noticed(barrier, numbered):
     """And every barrier is needed: without any one of them the order of turns changes the result."""
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "code"))
-    before, *after = read_source("loss.cu").split("__syncthreads();")
-    assert len(after) == 7
-    parts = [before, *(f"__syncthreads();{part}" if i != barrier else part for i, part in enumerate(after))]
-    library = build_on_host("loss.cu", tmp_path, "".join(parts))
     image, target, _ = scene(18, 17)
-    forwards, backwards = (
-        on_host(Program("loss.cu", driver=HostDriver(library, turned)), image, target) for turned in (False, True)
-    )
-    assert float(forwards[0].loss.detach()) != float(backwards[0].loss.detach()) or not torch.equal(
-        forwards[1], backwards[1]
-    )
+    left_out = ctypes.c_int.in_dll(numbered, "left_out")
+
+    def loss_and_gradient(left: int, turned: bool) -> tuple[float, bytes]:
+        left_out.value = left
+        result, gradient = on_host(Program("loss.cu", driver=HostDriver(numbered, turned)), image, target)
+        return float(result.loss.detach()), gradient.numpy().tobytes()
+
+    assert loss_and_gradient(barrier, False) != loss_and_gradient(barrier, True)
+    assert loss_and_gradient(-1, False) == loss_and_gradient(-1, True)
 
 
 @needs_a_compiler

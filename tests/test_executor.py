@@ -7,41 +7,43 @@ import signal
 import subprocess
 import sys
 import textwrap
-import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+from cli_support import PATIENCE_SECONDS, wait_until
 from vdgs.executors import local
 from vdgs.executors.blocks import BlockCommand, run_blocks
 from vdgs.executors.executor import Listener, Outcome, Task
+from vdgs.executors.lines import Lines
 from vdgs.executors.local import LocalExecutor
 from vdgs.executors.parent import PARENT, stop_when_parent_dies
 from vdgs.runs.folder import StageFolder
 
 #: What every fake block begins with: it knows its folder, can say how far it is, and lists the SIGTERMs it gets.
-PRELUDE = """
+PRELUDE = f"""
 import json, os, pathlib, signal, sys, time
 folder = pathlib.Path(sys.argv[1])
 def tell(state, **facts):
-    (folder / "status.json").write_text(json.dumps({"state": state, **facts}))
+    (folder / "status.json").write_text(json.dumps({{"state": state, **facts}}))
 def stop(*_):
     with (folder / "terms").open("a") as terms:
         terms.write("TERM ")
 signal.signal(signal.SIGTERM, stop)
-def wait_for_stop(seconds=20):
-    end = time.monotonic() + seconds
-    while not (folder / "terms").exists() and time.monotonic() < end:
+def wait_for(condition):
+    end = time.monotonic() + {PATIENCE_SECONDS}
+    while not condition() and time.monotonic() < end:
         time.sleep(0.02)
 """
 FINE = 'tell("done", iteration=10, iterations=10, psnr_training=25.5, anchors=1234)'
-#: Runs until asked to stop, then saves for a moment, in which a second SIGTERM would be noticed.
+#: Runs until asked to stop, then saves until it may end; a second SIGTERM would be noticed.
 LONG = """
 tell("running", iteration=3, iterations=10)
 (folder / "ready").touch()
-wait_for_stop()
-time.sleep(0.2)
+wait_for((folder / "terms").exists)
+wait_for((folder.parent / "may_end").exists)
 tell("stopped", iteration=4)
 sys.exit(130)
 """
@@ -62,6 +64,19 @@ def run(jobs, *, at_once=2, retries=2, terminal=False):
     return outcomes, console.file.getvalue()
 
 
+class Told(Listener):
+    """What it was told, in order."""
+
+    def __init__(self):
+        self.news: list[tuple[str, str | int]] = []
+
+    def started(self, task: Task, attempt: int) -> None:
+        self.news.append((task.name, attempt))
+
+    def ended(self, task: Task, outcome: Outcome) -> None:
+        self.news.append((task.name, outcome.state))
+
+
 @pytest.mark.parametrize("terminal", [False, True])
 def test_all_are_done_and_shown(tmp_path, terminal):
     outcomes, text = run([job(tmp_path, i, FINE) for i in (0, 3, 5)], terminal=terminal)
@@ -77,18 +92,18 @@ def test_no_jobs_are_no_trouble():
     assert run([])[0] == []
 
 
-def test_never_more_than_asked_for_at_once(tmp_path):
+def test_never_more_than_asked_for_at_once_and_not_fewer(tmp_path):
     script = """
-        with (folder.parent / "log").open("a") as log: log.write("+")
-        time.sleep(0.15)
-        with (folder.parent / "log").open("a") as log: log.write("-")
+        log = os.open(folder.parent / "log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        os.write(log, b"+")
+        own, begun = os.lseek(log, 0, os.SEEK_CUR), lambda: os.fstat(log).st_size
+        wait_for(lambda: begun() > own or begun() == 6)  # each but the last ends only after another has begun
     """
-    outcomes, _ = run([job(tmp_path, i, script) for i in range(6)], at_once=2)
-    steps = (tmp_path / "log").read_text()
-    running = [steps[:end].count("+") - steps[:end].count("-") for end in range(len(steps) + 1)]
-    assert len(outcomes) == 6
-    assert len(steps) == 12
-    assert max(running) == 2  # not more, and not one after the other either
+    told = Told()
+    outcomes = LocalExecutor(2, poll_seconds=0.02).run([job(tmp_path, i, script).task() for i in range(6)], told)
+    assert [outcome.state for outcome in outcomes] == ["done"] * 6
+    steps = [1 if isinstance(news, int) else -1 for _, news in told.news]
+    assert max(sum(steps[:end]) for end in range(len(steps) + 1)) == 2
 
 
 def test_a_crash_is_continued_and_said(tmp_path):
@@ -152,7 +167,7 @@ def test_memory_that_ran_out_lowers_the_number_at_once(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("content", [b"", b'{"sta', b"\xff\xfe\x00", b"[1, 2]", b"[" * 100_000, b'{"state": 3}'])
 def test_a_damaged_status_file_is_no_reason_to_fall(tmp_path, content):
-    script = f'(folder / "status.json").write_bytes({content[:50]!r}); time.sleep(0.1); os._exit(9)'
+    script = f'(folder / "status.json").write_bytes({content[:50]!r}); os._exit(9)'
     made = job(tmp_path, 0, script)
     made.folder.path.mkdir()
     made.folder.status_file.write_bytes(content)
@@ -188,30 +203,20 @@ def test_a_command_that_is_not_there_is_named(tmp_path):
 
 
 def test_a_folder_that_another_process_holds_is_waited_for(tmp_path):
-    made = job(tmp_path, 0, FINE)
-    made.folder.path.mkdir()
-    holder = (
-        "import fcntl, sys, time; f = open(sys.argv[1], 'w'); fcntl.flock(f, 2); print(1, flush=True); time.sleep(0.6)"
-    )
-    command = [sys.executable, "-c", holder, str(made.folder.path / ".lock")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as other:
-        assert other.stdout.readline() == b"1\n"
-        (outcome,), text = run([made])
+    made, said = job(tmp_path, 0, FINE), []
+
+    class Holding(Lines):
+        """Lets go of the folder once it hears that it is waited for."""
+
+        def waits(self, task: Task) -> None:
+            super().waits(task)
+            lock.close()
+
+    with ExitStack() as lock:
+        lock.enter_context(made.folder.locked())
+        (outcome,) = LocalExecutor(1, poll_seconds=0.02).run([made.task()], Holding(lambda text, _: said.append(text)))
     assert outcome.state == "done"
-    assert "waiting for another process" in text
-
-
-class Told(Listener):
-    """What it was told, in order."""
-
-    def __init__(self):
-        self.news: list[tuple[str, str | int]] = []
-
-    def started(self, task: Task, attempt: int) -> None:
-        self.news.append((task.name, attempt))
-
-    def ended(self, task: Task, outcome: Outcome) -> None:
-        self.news.append((task.name, outcome.state))
+    assert "waiting for another process" in said[0]
 
 
 def task(root: Path, name: str, script: str, after: str | None = None) -> Task:
@@ -252,6 +257,7 @@ def test_a_task_waits_for_the_one_that_it_comes_after(tmp_path):
     ]  # fmt: skip
 
 
+#: Runs jobs; every look at them leaves a dot in a file.
 DRIVER = """
 import json, sys
 from pathlib import Path
@@ -259,59 +265,72 @@ from rich.console import Console
 from vdgs.executors.blocks import BlockCommand, run_blocks
 from vdgs.executors.local import LocalExecutor
 from vdgs.runs.folder import StageFolder
+
+class Counted(LocalExecutor):
+    def run(self, tasks, listener):
+        tick = listener.tick
+        def counted():
+            tick()
+            with open(sys.argv[2], "a") as looks: looks.write(".")
+        listener.tick = counted
+        return super().run(tasks, listener)
+
 jobs = [
     BlockCommand(index, StageFolder(Path(folder)), command) for index, folder, command in json.loads(sys.argv[1])
 ]
-outcomes = run_blocks(jobs, LocalExecutor(2, poll_seconds=0.02), Console())
+outcomes = run_blocks(jobs, Counted(2, poll_seconds=0.02), Console())
 print("OUTCOMES", json.dumps([[o.state, o.attempts, o.why] for o in outcomes]))
 """
 
 
-def driver(jobs: list[BlockCommand]) -> subprocess.Popen:
-    """A process that runs the jobs; returns once the first two say that they are ready."""
-    argument = json.dumps([[made.index, str(made.folder.path), made.command] for made in jobs])
-    process = subprocess.Popen([sys.executable, "-c", DRIVER, argument], stdout=subprocess.PIPE, text=True)
-    for made in jobs[:2]:
-        wait_until((made.folder.path / "ready").exists)
-    return process
+class Driver:
+    """A process that runs jobs; begins once the first two say that they are ready."""
 
+    def __init__(self, jobs: list[BlockCommand], root: Path):
+        self._looks, self._root = root / "looks", root
+        argument = json.dumps([[made.index, str(made.folder.path), made.command] for made in jobs])
+        command = [sys.executable, "-c", DRIVER, argument, str(self._looks)]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        for made in jobs[:2]:
+            wait_until(lambda made=made: (made.folder.path / "ready").exists() or self.process.poll() is not None)
+        assert self.process.poll() is None
 
-def wait_until(condition, seconds=15.0):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
+    def send_signal(self, number: signal.Signals) -> None:
+        """Returns when the driver has looked at its jobs since."""
+        self.process.send_signal(number)
+        before = self._looks.stat().st_size
+        wait_until(lambda: self._looks.stat().st_size >= before + 2 or self.process.poll() is not None)
 
+    def let_jobs_end(self) -> None:
+        (self._root / "may_end").touch()
 
-def outcomes_of(process: subprocess.Popen) -> list:
-    text, _ = process.communicate(timeout=15)
-    assert process.returncode == 0
-    return json.loads(next(line for line in text.splitlines() if line.startswith("OUTCOMES")).removeprefix("OUTCOMES"))
+    def outcomes(self) -> list:
+        text, _ = self.process.communicate(timeout=PATIENCE_SECONDS)
+        assert self.process.returncode == 0
+        line = next(line for line in text.splitlines() if line.startswith("OUTCOMES"))
+        return json.loads(line.removeprefix("OUTCOMES"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_request_to_stop_reaches_each_job_once(tmp_path, number):
     jobs = [job(tmp_path, i, LONG) for i in range(3)]
-    process = driver(jobs)
-    process.send_signal(number)
-    time.sleep(0.1)
+    driver = Driver(jobs, tmp_path)
+    driver.send_signal(number)
     if number == signal.SIGTERM:
-        process.send_signal(number)  # a scheduler that asks twice: still once, and no kill
-    outcomes = outcomes_of(process)
-    assert [o[:2] for o in outcomes] == [["stopped", 1], ["stopped", 1], ["stopped", 0]]
+        driver.send_signal(number)  # a scheduler that asks twice: still once, and no kill
+    driver.let_jobs_end()
+    assert [o[:2] for o in driver.outcomes()] == [["stopped", 1], ["stopped", 1], ["stopped", 0]]
     assert [made.folder.status().state for made in jobs[:2]] == ["stopped"] * 2
     assert [(made.folder.path / "terms").read_text() for made in jobs[:2]] == ["TERM "] * 2
     assert not jobs[2].folder.path.exists() or not jobs[2].output.exists()
 
 
 def test_a_second_interrupt_kills(tmp_path):
-    deaf = LONG.replace("wait_for_stop()", "time.sleep(20)")  # a sleep goes on after a signal that is handled
-    jobs = [job(tmp_path, i, deaf) for i in range(2)]
-    process = driver(jobs)
-    process.send_signal(signal.SIGINT)
-    wait_until((jobs[1].folder.path / "terms").exists)
-    process.send_signal(signal.SIGINT)
-    outcomes = outcomes_of(process)
+    jobs = [job(tmp_path, i, LONG) for i in range(2)]  # they may not end
+    driver = Driver(jobs, tmp_path)
+    for _ in range(2):
+        driver.send_signal(signal.SIGINT)
+    outcomes = driver.outcomes()
     assert [o[0] for o in outcomes] == ["stopped", "stopped"]
     assert all("SIGKILL" in o[2] for o in outcomes)
     assert jobs[0].folder.status().state == "stopped"  # it could not write that itself
@@ -326,9 +345,10 @@ def test_a_job_ends_with_a_driver_that_was_killed(tmp_path):
     jobs = [job(tmp_path, i, watched) for i in range(2)]
     for made in jobs:
         made.command.append(source)
-    process = driver(jobs)
-    process.kill()
-    process.communicate()
+    driver = Driver(jobs, tmp_path)
+    driver.process.kill()
+    driver.process.communicate()
+    driver.let_jobs_end()
     for made in jobs:
         wait_until(lambda made=made: made.folder.status().state == "stopped")
         assert (made.folder.path / "terms").read_text() == "TERM "
