@@ -6,7 +6,7 @@
         command.send_signal(signal.SIGKILL)
 
 One server for each worker of the tests imports the package once; every command is forked from it. What a command starts
-itself (the processes of blocks) is started as always, unless it is asked to do that itself (`CommandsHere`).
+itself (the processes of blocks) is started as always, unless it is asked to do that itself (`do_tasks_here`).
 `entry_point` is a whole `python -m vdgs.cli`.
 """
 
@@ -88,22 +88,17 @@ def threads_as_before() -> Iterator[None]:
         torch.set_num_threads(of_torch)
 
 
-@dataclass(frozen=True)
-class _Circumstances:
-    """In which a command runs: see `begun`."""
-
-    environment: dict[str, str]
-    file_blocks: int | None = None
-    tasks_here: bool = False
-
-
 class Command:
     """A command that runs, its output going to files in a folder."""
 
-    def __init__(self, arguments: Sequence[str], folder: Path, pause: Pause, circumstances: _Circumstances):
+    def __init__(
+        self, arguments: Sequence[str], folder: Path, pause: Pause, environment: dict[str, str],
+        prepare: Callable[[], None] | None,
+    ):  # fmt: skip
         self.args, self._pause = list(arguments), pause
         self._files = (folder / "stdout", folder / "stderr")
-        self._process = _PROCESSES.Process(target=_run, args=(self.args, *map(str, self._files), circumstances))
+        target = (self.args, *map(str, self._files), environment, prepare)
+        self._process = _PROCESSES.Process(target=_run, args=target)
         self._process.start()
 
     @property
@@ -150,36 +145,44 @@ class Command:
 
 @contextmanager
 def begun(
-    *arguments: object,
-    pause_at: tuple[str, int] | None = None,
-    file_blocks: int | None = None,
-    tasks_here: bool = False,
+    *arguments: object, pause_at: tuple[str, int] | None = None, prepare: Callable[[], None] | None = None
 ) -> Iterator[Command]:
     """A `vdgs` that runs meanwhile; killed at the end if it still does.
 
     `pause_at`: it waits, and so do processes that it starts, before the n-th time that it opens, renames to or removes
-    a file whose whole path is like this pattern. `file_blocks`: no file that it writes may be larger, in units of 1024
-    bytes. `tasks_here`: what it would start processes for, it
-    does itself.
+    a file whose whole path is like this pattern. `prepare` is called in its process before it begins.
     """
     with tempfile.TemporaryDirectory() as folder:
         waiting = Path(folder) / "waiting"
         waiting.mkdir()
         pause = Pause(*(pause_at or ("", 0)), str(waiting))
-        circumstances = _Circumstances(pause.environment() if pause_at else {}, file_blocks, tasks_here)
-        command = Command([str(each) for each in arguments], Path(folder), pause, circumstances)
+        environment = pause.environment() if pause_at else {}
+        command = Command([str(each) for each in arguments], Path(folder), pause, environment, prepare)
         try:
             yield command
         finally:
             command.close()
 
 
-def vdgs(
-    *arguments: object, file_blocks: int | None = None, tasks_here: bool = False
-) -> subprocess.CompletedProcess[str]:
+def vdgs(*arguments: object, prepare: Callable[[], None] | None = None) -> subprocess.CompletedProcess[str]:
     """Run a command to its end. See `begun`."""
-    with begun(*arguments, file_blocks=file_blocks, tasks_here=tasks_here) as command:
+    with begun(*arguments, prepare=prepare) as command:
         return command.finished()
+
+
+def do_tasks_here() -> None:
+    """Let this process do itself what it would start processes for."""
+    from vdgs.bench import bench
+    from vdgs.stages import train
+
+    bench.LocalExecutor = train.LocalExecutor = CommandsHere  # type: ignore[assignment,misc]
+
+
+def limit_files(most_bytes: int) -> None:
+    """Let no file that this process writes be larger."""
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
 
 
 def entry_point(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -208,21 +211,16 @@ def is_free(run: Path) -> bool:
         return False
 
 
-def _run(arguments: list[str], stdout: str, stderr: str, circumstances: _Circumstances) -> None:
+def _run(
+    arguments: list[str], stdout: str, stderr: str, environment: dict[str, str], prepare: Callable[[], None] | None
+) -> None:
     """In the process of the command."""
     for descriptor, file in ((1, stdout), (2, stderr)):
         os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), descriptor)
-    if circumstances.file_blocks is not None:
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * circumstances.file_blocks,) * 2)
-    os.environ.update(circumstances.environment)
+    os.environ.update(environment)
     pause_where_asked()
-    if circumstances.tasks_here:
-        from vdgs.bench import bench
-        from vdgs.stages import train
-
-        bench.LocalExecutor = train.LocalExecutor = CommandsHere  # type: ignore[assignment,misc]
+    if prepare is not None:
+        prepare()
     from vdgs.cli import main
 
     main(arguments)
