@@ -7,7 +7,7 @@
 
 One server for each worker of the tests imports the package once; every command is forked from it. What a command starts
 itself (the processes of blocks) is started as always, unless it is asked to do that itself (`do_tasks_here`).
-`entry_point` is a whole `python -m vdgs.cli`.
+`entry_point` is a whole `python -m vdgs.cli`, `python` any code in such a process.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -89,16 +90,12 @@ def threads_as_before() -> Iterator[None]:
 
 
 class Command:
-    """A command that runs, its output going to files in a folder."""
+    """A function of the command line's that runs in a process of its own, its output going to files in a folder."""
 
-    def __init__(
-        self, arguments: Sequence[str], folder: Path, pause: Pause, environment: dict[str, str],
-        prepare: Callable[[], None] | None,
-    ):  # fmt: skip
-        self.args, self._pause = list(arguments), pause
+    def __init__(self, main: Callable[[], None], folder: Path, pause: Pause, environment: dict[str, str]):
+        self._main, self._pause = main, pause
         self._files = (folder / "stdout", folder / "stderr")
-        target = (self.args, *map(str, self._files), environment, prepare)
-        self._process = _PROCESSES.Process(target=_run, args=target)
+        self._process = _PROCESSES.Process(target=_run, args=(main, *map(str, self._files), environment))
         self._process.start()
 
     @property
@@ -131,11 +128,11 @@ class Command:
     def finished(self) -> subprocess.CompletedProcess[str]:
         """How the command ended and what it printed; waits for its end."""
         self._process.join(PATIENCE_SECONDS)
-        assert not self.runs(), f"vdgs {' '.join(self.args)} does not end"
+        assert not self.runs(), f"{self._main} does not end"
         code = self._process.exitcode
         assert code is not None
         printed = [file.read_text(encoding="utf-8") if file.exists() else "" for file in self._files]
-        return subprocess.CompletedProcess(self.args, code, *printed)
+        return subprocess.CompletedProcess(self._main, code, *printed)
 
     def close(self) -> None:
         """Kill the process if it still runs."""
@@ -152,21 +149,27 @@ def begun(
     `pause_at`: it waits, and so do processes that it starts, before the n-th time that it opens, renames to or removes
     a file whose whole path is like this pattern. `prepare` is called in its process before it begins.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        waiting = Path(folder) / "waiting"
-        waiting.mkdir()
-        pause = Pause(*(pause_at or ("", 0)), str(waiting))
-        environment = pause.environment() if pause_at else {}
-        command = Command([str(each) for each in arguments], Path(folder), pause, environment, prepare)
-        try:
-            yield command
-        finally:
-            command.close()
+    main = partial(_vdgs, [str(each) for each in arguments], prepare)
+    with _started(main, pause_at, {}) as command:
+        yield command
 
 
 def vdgs(*arguments: object, prepare: Callable[[], None] | None = None) -> subprocess.CompletedProcess[str]:
     """Run a command to its end. See `begun`."""
     with begun(*arguments, prepare=prepare) as command:
+        return command.finished()
+
+
+@contextmanager
+def python_begun(code: str, **environment: str) -> Iterator[Command]:
+    """Code that runs in a process which has imported the package and called nothing of it."""
+    with _started(partial(_execute, code), None, environment) as command:
+        yield command
+
+
+def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run code to its end. See `python_begun`."""
+    with python_begun(code, **environment) as command:
         return command.finished()
 
 
@@ -211,16 +214,37 @@ def is_free(run: Path) -> bool:
         return False
 
 
-def _run(
-    arguments: list[str], stdout: str, stderr: str, environment: dict[str, str], prepare: Callable[[], None] | None
-) -> None:
-    """In the process of the command."""
+@contextmanager
+def _started(
+    main: Callable[[], None], pause_at: tuple[str, int] | None, environment: dict[str, str]
+) -> Iterator[Command]:
+    with tempfile.TemporaryDirectory() as folder:
+        waiting = Path(folder) / "waiting"
+        waiting.mkdir()
+        pause = Pause(*(pause_at or ("", 0)), str(waiting))
+        command = Command(main, Path(folder), pause, environment | (pause.environment() if pause_at else {}))
+        try:
+            yield command
+        finally:
+            command.close()
+
+
+def _run(main: Callable[[], None], stdout: str, stderr: str, environment: dict[str, str]) -> None:
+    """In the process of a command."""
     for descriptor, file in ((1, stdout), (2, stderr)):
         os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), descriptor)
     os.environ.update(environment)
     pause_where_asked()
+    main()
+
+
+def _vdgs(arguments: list[str], prepare: Callable[[], None] | None) -> None:
     if prepare is not None:
         prepare()
     from vdgs.cli import main
 
     main(arguments)
+
+
+def _execute(code: str) -> None:
+    exec(code, {"__name__": "__main__"})
