@@ -6,8 +6,8 @@
         command.send_signal(signal.SIGKILL)
 
 One server for each worker of the tests imports the package once; every command is forked from it. What a command starts
-itself (the processes of blocks) is started as always, unless it is asked to do that itself (`CommandsHere`).
-`entry_point` is a whole `python -m vdgs.cli`.
+itself (the processes of blocks) is started as always, unless it is asked to do that itself (`do_tasks_here`).
+`entry_point` is a whole `python -m vdgs.cli`, `python` any code in such a process.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -88,22 +89,13 @@ def threads_as_before() -> Iterator[None]:
         torch.set_num_threads(of_torch)
 
 
-@dataclass(frozen=True)
-class _Circumstances:
-    """In which a command runs: see `begun`."""
-
-    environment: dict[str, str]
-    file_blocks: int | None = None
-    tasks_here: bool = False
-
-
 class Command:
-    """A command that runs, its output going to files in a folder."""
+    """A function of the command line's that runs in a process of its own, its output going to files in a folder."""
 
-    def __init__(self, arguments: Sequence[str], folder: Path, pause: Pause, circumstances: _Circumstances):
-        self.args, self._pause = list(arguments), pause
+    def __init__(self, main: Callable[[], None], folder: Path, pause: Pause, environment: dict[str, str]):
+        self._main, self._pause = main, pause
         self._files = (folder / "stdout", folder / "stderr")
-        self._process = _PROCESSES.Process(target=_run, args=(self.args, *map(str, self._files), circumstances))
+        self._process = _PROCESSES.Process(target=_run, args=(main, *map(str, self._files), environment))
         self._process.start()
 
     @property
@@ -136,11 +128,11 @@ class Command:
     def finished(self) -> subprocess.CompletedProcess[str]:
         """How the command ended and what it printed; waits for its end."""
         self._process.join(PATIENCE_SECONDS)
-        assert not self.runs(), f"vdgs {' '.join(self.args)} does not end"
+        assert not self.runs(), f"{self._main} does not end"
         code = self._process.exitcode
         assert code is not None
         printed = [file.read_text(encoding="utf-8") if file.exists() else "" for file in self._files]
-        return subprocess.CompletedProcess(self.args, code, *printed)
+        return subprocess.CompletedProcess(self._main, code, *printed)
 
     def close(self) -> None:
         """Kill the process if it still runs."""
@@ -150,36 +142,50 @@ class Command:
 
 @contextmanager
 def begun(
-    *arguments: object,
-    pause_at: tuple[str, int] | None = None,
-    file_blocks: int | None = None,
-    tasks_here: bool = False,
+    *arguments: object, pause_at: tuple[str, int] | None = None, prepare: Callable[[], None] | None = None
 ) -> Iterator[Command]:
     """A `vdgs` that runs meanwhile; killed at the end if it still does.
 
     `pause_at`: it waits, and so do processes that it starts, before the n-th time that it opens, renames to or removes
-    a file whose whole path is like this pattern. `file_blocks`: no file that it writes may be larger, in units of 1024
-    bytes. `tasks_here`: what it would start processes for, it
-    does itself.
+    a file whose whole path is like this pattern. `prepare` is called in its process before it begins.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        waiting = Path(folder) / "waiting"
-        waiting.mkdir()
-        pause = Pause(*(pause_at or ("", 0)), str(waiting))
-        circumstances = _Circumstances(pause.environment() if pause_at else {}, file_blocks, tasks_here)
-        command = Command([str(each) for each in arguments], Path(folder), pause, circumstances)
-        try:
-            yield command
-        finally:
-            command.close()
+    main = partial(_vdgs, [str(each) for each in arguments], prepare)
+    with _started(main, pause_at, {}) as command:
+        yield command
 
 
-def vdgs(
-    *arguments: object, file_blocks: int | None = None, tasks_here: bool = False
-) -> subprocess.CompletedProcess[str]:
+def vdgs(*arguments: object, prepare: Callable[[], None] | None = None) -> subprocess.CompletedProcess[str]:
     """Run a command to its end. See `begun`."""
-    with begun(*arguments, file_blocks=file_blocks, tasks_here=tasks_here) as command:
+    with begun(*arguments, prepare=prepare) as command:
         return command.finished()
+
+
+@contextmanager
+def python_begun(code: str, **environment: str) -> Iterator[Command]:
+    """Code that runs in a process which has imported the package and called nothing of it."""
+    with _started(partial(_execute, code), None, environment) as command:
+        yield command
+
+
+def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run code to its end. See `python_begun`."""
+    with python_begun(code, **environment) as command:
+        return command.finished()
+
+
+def do_tasks_here() -> None:
+    """Let this process do itself what it would start processes for."""
+    from vdgs.bench import bench
+    from vdgs.stages import train
+
+    bench.LocalExecutor = train.LocalExecutor = CommandsHere  # type: ignore[assignment,misc]
+
+
+def limit_files(most_bytes: int) -> None:
+    """Let no file that this process writes be larger."""
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))
 
 
 def entry_point(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -208,21 +214,37 @@ def is_free(run: Path) -> bool:
         return False
 
 
-def _run(arguments: list[str], stdout: str, stderr: str, circumstances: _Circumstances) -> None:
-    """In the process of the command."""
+@contextmanager
+def _started(
+    main: Callable[[], None], pause_at: tuple[str, int] | None, environment: dict[str, str]
+) -> Iterator[Command]:
+    with tempfile.TemporaryDirectory() as folder:
+        waiting = Path(folder) / "waiting"
+        waiting.mkdir()
+        pause = Pause(*(pause_at or ("", 0)), str(waiting))
+        command = Command(main, Path(folder), pause, environment | (pause.environment() if pause_at else {}))
+        try:
+            yield command
+        finally:
+            command.close()
+
+
+def _run(main: Callable[[], None], stdout: str, stderr: str, environment: dict[str, str]) -> None:
+    """In the process of a command."""
     for descriptor, file in ((1, stdout), (2, stderr)):
         os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), descriptor)
-    if circumstances.file_blocks is not None:
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * circumstances.file_blocks,) * 2)
-    os.environ.update(circumstances.environment)
+    os.environ.update(environment)
     pause_where_asked()
-    if circumstances.tasks_here:
-        from vdgs.bench import bench
-        from vdgs.stages import train
+    main()
 
-        bench.LocalExecutor = train.LocalExecutor = CommandsHere  # type: ignore[assignment,misc]
+
+def _vdgs(arguments: list[str], prepare: Callable[[], None] | None) -> None:
+    if prepare is not None:
+        prepare()
     from vdgs.cli import main
 
     main(arguments)
+
+
+def _execute(code: str) -> None:
+    exec(code, {"__name__": "__main__"})

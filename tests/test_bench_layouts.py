@@ -8,7 +8,7 @@ import cv2
 import pytest
 
 from captures_support import TinyScene, write_colmap
-from cli_support import vdgs
+from cli_support import do_tasks_here, vdgs
 from layouts_support import halves, write_matrixcity, write_mega_nerf
 from vdgs.bench.scenes import SCENES
 from vdgs.captures.capture import Capture
@@ -54,7 +54,7 @@ def data(tmp_path_factory) -> Path:
 def test_the_published_data_sets_are_benched(data, tmp_path):
     """Their folders are found and read, methods run with the paper's settings, and pixels are grouped by V."""
     asked = ("--scenes", "residence", "block-all", "--methods", "3dgs", "blocks-2", "--iterations-total", "80")
-    done = vdgs("bench", "table1", "--output", tmp_path, "--data", data, *asked, "--seeds", "1", tasks_here=True)
+    done = vdgs("bench", "table1", "--output", tmp_path, "--data", data, *asked, "--seeds", "1", prepare=do_tasks_here)
     assert done.returncode == 0, done.stderr
     results = json.loads((tmp_path / "table1" / "results.json").read_text())["results"]
     assert [(each["scene"], each["method"], each["state"]) for each in results] == [

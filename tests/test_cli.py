@@ -5,13 +5,10 @@ import sys
 
 import pytest
 
+from cli_support import PATIENCE_SECONDS, entry_point, vdgs
 from vdgs.cli import HELP, VERBS, main
 
 HEAVY = ("torch", "numpy", "matplotlib", "pycolmap", "cv2", "scipy")
-
-
-def vdgs(*arguments: str, **kwargs) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, "-m", "vdgs.cli", *arguments], capture_output=True, text=True, timeout=120)
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["coarse", "--help"], ["eval", "--help"]])
@@ -21,7 +18,7 @@ def test_help_imports_nothing_heavy(arguments):
         f"try:\n    main({arguments!r})\nexcept SystemExit as exit:\n    assert not exit.code, exit.code\n"
         f"heavy = [name for name in {HEAVY!r} if name in sys.modules]\nassert not heavy, heavy\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_SECONDS)
     assert done.returncode == 0, done.stderr
     assert "usage" in done.stdout.lower()
 
@@ -60,7 +57,7 @@ def test_an_unknown_verb_is_a_usage_error(capsys):
 
 
 def test_a_missing_capture_is_one_line_and_no_traceback(tmp_path):
-    done = vdgs("coarse", str(tmp_path / "nowhere"), "--output", str(tmp_path / "run"))
+    done = entry_point("coarse", tmp_path / "nowhere", "--output", tmp_path / "run")
     assert done.returncode == 1
     assert "nowhere" in done.stderr
     assert "Traceback" not in done.stderr

@@ -5,6 +5,7 @@ import os
 import random
 import shutil
 import signal
+from functools import partial
 from pathlib import Path
 from subprocess import CompletedProcess
 
@@ -13,7 +14,7 @@ import pytest
 import torch
 
 from captures_support import tiny_scene, write_colmap
-from cli_support import begun, entry_point, vdgs
+from cli_support import begun, entry_point, limit_files, vdgs
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.runs.opening import open_run
@@ -205,7 +206,7 @@ def test_a_capture_that_changed_is_refused(capture, unbroken, tmp_path, change):
 def test_a_disk_that_is_full_is_said_and_the_same_command_continues(capture, unbroken, tmp_path):
     """A limit on the size of files stands in for the disk: the states of this run do not fit."""
     run = tmp_path / "run"
-    done = vdgs(*command(capture, run), file_blocks=60)
+    done = vdgs(*command(capture, run), prepare=partial(limit_files, 60_000))
     assert done.returncode == 1
     assert "cannot be written" in done.stderr
     assert "Traceback" not in done.stderr

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import ctypes
-import multiprocessing
 from pathlib import Path
 
 import pytest
 import torch
 
+from cli_support import python_begun
 from vdgs.errors import VdgsError
 from vdgs.kernels.cuda import cache, launching, nvrtc
 from vdgs.kernels.cuda.nvrtc import CompileError, CudaUnavailable, Found, Nvrtc, Target
@@ -181,8 +181,11 @@ class TestCache:
         assert cache.cached("k", PARTS, lambda: b"code") == b"code"
 
     def test_processes_at_once(self):
-        with multiprocessing.get_context("spawn").Pool(2) as pool:
-            assert pool.map(_make, range(6)) == [b"x" * 100_000] * 6
+        code = "from vdgs.kernels.cuda.cache import cached\n"
+        code += "for _ in range(3): assert cached('k', {'source': 'same'}, lambda: b'x' * 100_000) == b'x' * 100_000"
+        environment = {cache.VARIABLE: str(cache.cache_folder())}
+        with python_begun(code, **environment) as one, python_begun(code, **environment) as other:
+            assert [each.finished().returncode for each in (one, other)] == [0, 0]
         (entry,) = cache.cache_folder().iterdir()  # and no temporary file beside it
         assert entry.stat().st_size > 100_000
 
@@ -201,7 +204,3 @@ class TestCache:
         first = launching.compile_source("s.cu", Target("compute_80"), headers={"h.h": "#define N 1"})
         second = launching.compile_source("s.cu", Target("compute_80"), headers={"h.h": "#define N 2"})
         assert first != second or len(list(cache.cache_folder().iterdir())) == 2
-
-
-def _make(_: int) -> bytes:
-    return cache.cached("k", {"source": "same"}, lambda: b"x" * 100_000)

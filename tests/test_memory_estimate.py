@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import json
-import os
+import platform
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import psutil
@@ -19,8 +19,10 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from captures_support import tiny_scene, write_colmap
+from cli_support import entry_point, vdgs
 from vdgs.memory.estimate import Need, advice, bytes_per_anchor, describe, estimate
 from vdgs.memory.process import available_bytes, is_out_of_memory
+from vdgs.watching import anchors as watching
 from vdgs.watching import memory_notes
 from vdgs.watching.memory_notes import announce
 
@@ -154,56 +156,51 @@ def test_a_limit_of_the_process_counts():
 
 # ------------------------------------------------------------------------------------------ for real
 
-#: `vdgs` whose process may take no more than some further megabytes once it has trained for five steps. Photographs at
-#: full size come later (preset laptop), and with them the need for more.
-LIMITED = """
-import resource, sys
-import psutil
-import vdgs.watching.anchors as watching
-
-train = watching.train
-
-def limited(state, stage, *, after_step, **others):
-    def step(state, report):
-        after_step(state, report)
-        if state.iteration == 5:
-            most = psutil.Process().memory_info().vms + int(sys.argv[1]) * 10**6
-            resource.setrlimit(resource.RLIMIT_AS, (most, most))
-    return train(state, stage, after_step=step, **others)
-
-watching.train = limited
-from vdgs.cli import main
-main(sys.argv[2:])
-"""
 SETTINGS = ("--preset", "laptop", "--iterations", "40", "--up", "z", "--anchors.offsets", "3", "--threads", "1")
+#: The last iteration with photographs at half their size (preset laptop).
+LAST_HALF = 16
 
 
-def coarse(capture: Path, run: Path, limit_mb: int | None = None) -> subprocess.CompletedProcess:
-    asked = ["coarse", str(capture), "--output", str(run), *SETTINGS]
-    program = ["-m", "vdgs.cli"] if limit_mb is None else ["-c", LIMITED, str(limit_mb)]
-    # One heap: those of further threads reserve room of their own, which the limit would count or not as they come.
-    alone = os.environ | {"MALLOC_ARENA_MAX": "1"}
-    return subprocess.run([sys.executable, *program, *asked], capture_output=True, text=True, timeout=200, env=alone)
+def limit_memory_before_full_size() -> None:
+    """Once this process begins with photographs at full size, it may take 16 MB more; a step takes three times that.
+
+    From then on every large piece is asked of the system, so that nothing depends on what malloc has kept.
+    """
+    import resource
+
+    train, mmap_threshold = watching.train, -3
+
+    def limited(state, stage, *, after_step, **others):
+        def step(state, report):
+            after_step(state, report)
+            if state.iteration == LAST_HALF:
+                assert ctypes.CDLL(None).mallopt(mmap_threshold, 128 * 1024)
+                most = psutil.Process().memory_info().vms + 16 * 10**6
+                resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+        return train(state, stage, after_step=step, **others)
+
+    watching.train = limited  # type: ignore[assignment]
 
 
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="limits of address space, and a malloc that can be told")
 def test_training_that_runs_out_of_memory_saves_says_what_helps_and_continues(tmp_path):
-    if sys.platform != "linux":
-        pytest.skip("limits of address space")
     capture = tmp_path / "capture"
     write_colmap(capture, tiny_scene(columns=3, rows=2, width=1000, height=750))
-    broken = coarse(capture, tmp_path / "run", limit_mb=60)
+    command = ("coarse", capture, "--output", tmp_path / "run", *SETTINGS)
+    broken = vdgs(*command, prepare=limit_memory_before_full_size)
     assert broken.returncode == 1, broken.stdout + broken.stderr
     assert "Traceback" not in broken.stderr
     assert "out of memory with" in broken.stderr
     assert "photographs of half the size (--downscale or --images images_N) saves about 0." in broken.stderr
     folder = tmp_path / "run" / "coarse"
-    (saved,) = (int(path.stem) for path in (folder / "checkpoints").glob("*.json"))
-    assert 5 < saved < 40
-    assert f"The checkpoint of iteration {saved} is saved in {folder / 'checkpoints'}." in broken.stderr
+    assert [path.stem for path in (folder / "checkpoints").glob("*.json")] == [f"{LAST_HALF:08d}"]
+    assert f"The checkpoint of iteration {LAST_HALF} is saved in {folder / 'checkpoints'}." in broken.stderr
     assert json.loads((folder / "status.json").read_text())["why"] == "out of memory"
 
-    continued, unbroken = coarse(capture, tmp_path / "run"), coarse(capture, tmp_path / "unbroken")
-    assert f"continuing at iteration {saved}" in continued.stdout
+    continued = vdgs(*command)
+    assert f"continuing at iteration {LAST_HALF}" in continued.stdout
+    unbroken = entry_point("coarse", capture, "--output", tmp_path / "unbroken", *SETTINGS)
     assert continued.returncode == unbroken.returncode == 0
     models = [(tmp_path / run / "coarse" / "model.safetensors").read_bytes() for run in ("run", "unbroken")]
     assert models[0] == models[1]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
+from cli_support import python
 from vdgs.kernels.native import module as native_module
 from vdgs.kernels.native.module import NativeUnavailable, load, native, supported
 
@@ -19,16 +18,6 @@ def elementwise(isa: str, name: str, x: np.ndarray) -> np.ndarray:
     out = np.empty_like(x)
     load(isa).check.elementwise(name, x, out)
     return out
-
-
-def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
 
 
 def test_best_supported_module_is_chosen() -> None:
@@ -49,7 +38,7 @@ def test_unknown_instruction_set_is_refused_by_name() -> None:
 
 def test_environment_chooses_instruction_set_and_threads() -> None:
     code = "from vdgs.kernels.native import module as m; print(m.isa(), m.threads())"
-    done = run_python(code, VDGS_ISA="portable", VDGS_THREADS="3")
+    done = python(code, VDGS_ISA="portable", VDGS_THREADS="3")
     assert done.stdout.split() == ["portable", "3"]
 
 
@@ -61,7 +50,7 @@ def test_environment_chooses_instruction_set_and_threads() -> None:
     ],
 )
 def test_environment_errors_say_what_is_wrong(variable: str, value: str, message: str) -> None:
-    done = run_python("from vdgs.kernels.native import module as m; m.native()", **{variable: value})
+    done = python("from vdgs.kernels.native import module as m; m.native()", **{variable: value})
     assert done.returncode != 0
     assert message in done.stderr
 
@@ -177,5 +166,5 @@ assert all(m.check.sum_of_tasks(1000, -1) == 499500 for m in modules)
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 def test_threads_work_after_fork_in_parent_and_child() -> None:
-    done = run_python(FORK)
+    done = python(FORK)
     assert done.returncode == 0, done.stderr

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from captures_support import tiny_scene, write_colmap
-from cli_support import begun, entry_point, is_free, vdgs, wait_until
+from cli_support import begun, do_tasks_here, entry_point, is_free, vdgs, wait_until
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
 from vdgs.model.visibility import visibility_of
@@ -194,7 +194,15 @@ def test_other_settings_are_refused_where_they_cost_training(capture, copied):
 def test_a_changed_setting_redoes_exactly_what_depends_on_it(capture, copied):
     before = moments(copied)
     redone = vdgs(
-        "run", capture, "--output", copied, *SETTINGS, "--block.compensation.beta-g", "0", "--redo", tasks_here=True
+        "run",
+        capture,
+        "--output",
+        copied,
+        *SETTINGS,
+        "--block.compensation.beta-g",
+        "0",
+        "--redo",
+        prepare=do_tasks_here,
     )
     assert redone.returncode == 0, redone.stderr
     changed = {name.split("/")[0] for name in changed_files(copied, before)}
@@ -262,7 +270,7 @@ def test_a_missing_block_stops_the_merge_unless_the_coarse_model_may_stand_in(co
 
 def test_one_block_is_the_whole_scene_and_merging_it_the_identity(copied):
     for command in (("partition", copied, "--no-blocking", "--redo"), ("train", copied), ("merge", copied)):
-        done = vdgs(*command, tasks_here=True)
+        done = vdgs(*command, prepare=do_tasks_here)
         assert done.returncode == 0, done.stderr
     assert [path.name for path in (copied / "blocks").iterdir()] == ["00"]
     merged, block = (AnchorModel.load(copied / name) for name in (MERGED, "blocks/00/model.safetensors"))
