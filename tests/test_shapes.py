@@ -1,4 +1,4 @@
-"""Shapes are checked wherever they are annotated: no file is left out, and a wrong shape is an error."""
+"""Shapes are checked while the tests run: no file that names them is left out, and a wrong one is an error."""
 
 from __future__ import annotations
 
@@ -11,43 +11,63 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from conftest import PACKAGE, module_name
+from conftest import PACKAGE, files_with_shapes, module_name
+from vdgs.captures.heights import reach
+from vdgs.comparators.gaussians.spherical_harmonics import basis
 from vdgs.evaluation.metrics import squared_error
-from vdgs.kernels.reference.cull import cull
-from vdgs.model.visibility import normalised
-from vdgs.partition.cluster import features_of
-from vdgs.training.smoothing import psnr_of
+from vdgs.kernels import native, reference, rotations
+from vdgs.model.gaps import gap_points
+from vdgs.model.visibility import visibility_of
+from vdgs.partition.plane import principal_plane
+from vdgs.settings.method import CompensationConfig
+from vdgs.training.compensation import low_visibility
 
 
 def imports_jaxtyping(file: Path) -> bool:
-    """Read from the syntax, not as the hook finds its files."""
+    """In any form, anywhere in the file."""
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "jaxtyping":
-            return True
-        if isinstance(node, ast.Import) and any(alias.name.split(".")[0] == "jaxtyping" for alias in node.names):
+        names = [each.name for each in node.names] if isinstance(node, ast.Import) else []
+        names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        if any(name.partition(".")[0] == "jaxtyping" for name in names):
             return True
     return False
 
 
-def test_no_file_with_shapes_is_left_out():
-    files = [file for file in PACKAGE.rglob("*.py") if imports_jaxtyping(file)]
-    assert len(files) > 60
-    loaders = {file: importlib.import_module(module_name(file)).__loader__ for file in files}
-    unchecked = [str(file) for file, loader in loaders.items() if type(loader).__name__ != "_JaxtypingLoader"]
-    assert not unchecked
+def test_every_file_that_names_shapes_is_among_the_checked():
+    assert files_with_shapes() == sorted(file for file in PACKAGE.rglob("*.py") if imports_jaxtyping(file))
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: cull(torch.zeros(3, 2), torch.zeros(3, 6), None),
-        lambda: normalised(np.zeros((3, 2), np.int64)),
-        lambda: features_of(np.zeros((3, 3)), np.zeros(3, np.int64), 1.0),
-        lambda: psnr_of(torch.zeros(4, 5), torch.zeros(4, 5, dtype=torch.uint8), None),
-        lambda: squared_error(np.zeros((4, 5), np.uint8), np.zeros((4, 5), np.uint8)),
-    ],
-    ids=["kernels", "model", "partition", "training", "evaluation"],
-)
-def test_a_wrong_shape_is_an_error(call):
+@pytest.mark.parametrize("name", [module_name(file) for file in files_with_shapes()])
+def test_it_was_loaded_with_its_checks(name):
+    """By jaxtyping's loader, and not by an import that came before it was asked to."""
+    loader = importlib.import_module(name).__spec__.loader
+    assert type(loader).__module__.partition(".")[0] == "jaxtyping"
+
+
+def test_other_files_are_loaded_as_always():
+    """So the test above can fail."""
+    loader = importlib.import_module("vdgs.errors").__spec__.loader
+    assert type(loader).__module__.partition(".")[0] != "jaxtyping"
+
+
+FLAT = np.zeros((5, 2))
+WRONG = {
+    "kernels.native": lambda: native.count_visibility(torch.zeros(5, 2), []),
+    "kernels.native, two that disagree": lambda: native.group_max(torch.zeros(5, 2), torch.zeros(4).long(), 1),
+    "kernels.reference": lambda: reference.morton_order(torch.zeros(5, 2)),
+    "kernels": lambda: rotations.rotation_matrices(torch.zeros(5, 3)),
+    "model, torch": lambda: visibility_of(torch.zeros(5, 2), []),
+    "model, numpy": lambda: gap_points(FLAT, [], 1.0),
+    "training": lambda: low_visibility(torch.zeros(5, 1), CompensationConfig()),
+    "partition": lambda: principal_plane(np.zeros((5, 3))),
+    "captures": lambda: reach(FLAT, np.zeros((5, 3)), np.zeros(3)),
+    "evaluation, two that disagree": lambda: squared_error(*(np.zeros((n, 4, 3), np.uint8) for n in (4, 5))),
+    "evaluation, another type": lambda: squared_error(*(np.zeros((4, 4, 3), np.float32) for _ in range(2))),
+    "comparators": lambda: basis(torch.zeros(5, 2), 1),
+}
+
+
+@pytest.mark.parametrize("where", WRONG)
+def test_a_wrong_shape_is_an_error(where):
     with pytest.raises(TypeCheckError):
-        call()
+        WRONG[where]()
