@@ -83,9 +83,9 @@ class Advice:
 
 
 def bytes_per_anchor(offsets: int, seen: float) -> float:
-    """Parameters, two moments, a count of updates and statistics of an anchor, and what steps make of the share that
-    is in view."""
-    kept = 3 * bytes_of_model(offsets) + 4 * (1 + 2 * offsets + 2)
+    """Parameters, two moments, a count of updates, a bound on size and statistics of an anchor, and what steps make of
+    the share that is in view."""
+    kept = 3 * bytes_of_model(offsets) + 4 * (2 + 2 * offsets + 2)
     return kept + seen * STEP_BYTES_PER_OFFSET * offsets
 
 

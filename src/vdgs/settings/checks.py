@@ -95,6 +95,8 @@ def _validate_training(config: TrainConfig) -> list[str]:
         problems.append(f"anchors.offsets is {config.anchors.offsets}; 1 to 32 are possible")
     if not 0.0 <= config.loss.ssim_weight <= 1.0:
         problems.append(f"loss.ssim_weight is {config.loss.ssim_weight}; it lies between 0 and 1")
+    if config.loss.alpha_weight < 0:
+        problems.append(f"loss.alpha_weight is {config.loss.alpha_weight}; it must not be negative, and 0 is without")
     for rate in dataclasses.fields(config.rates):
         if min(getattr(config.rates, rate.name)) <= 0:
             problems.append(f"rates.{rate.name} must be positive")

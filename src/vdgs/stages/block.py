@@ -21,11 +21,14 @@ from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.ground import ground_cells
+from vdgs.model.sizes import largest_log_scales
 from vdgs.model.visibility import effective_count
 from vdgs.partition.blocks import Blocks
 from vdgs.partition.regions import drawn_by, holds, ramp, split_anchors
 from vdgs.runs.cut import blocks_of, views_of_block
 from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.ground import ground_of
 from vdgs.runs.opening import open_run
 from vdgs.runs.status import Status
 from vdgs.settings.method import block_limit, block_training
@@ -89,6 +92,10 @@ def _train(
     prepared = time.monotonic() - began
     note_without_growth(config, console, "--block.")
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
+    ground, flown = (
+        ground_of(capture, method.training.anchors).to(device),
+        [view.camera for view in capture.train_views],
+    )
     with ImageCache(views, image_budget(options), downscales=factors) as images:
         stage = Stage(
             config, images, len(views), coarse.voxel, camera_height(capture), kind="block",
@@ -96,6 +103,8 @@ def _train(
             surroundings=Surroundings(surroundings, coarse.decoder),
             may_hold=holds(blocks, index, method.block), mobility=ramp(blocks, index, method.block),
             appearance_of=chosen, shares=shares, crops=crops,
+            ground=[ground_cells(ground, view.camera) for view in views],
+            largest=lambda positions: largest_log_scales(positions, flown),
         )  # fmt: skip
         state = continue_or_start(folder, stage, lambda: start_state(anchors, coarse.decoder.copy(), stage), console)
         state.seconds += prepared

@@ -14,6 +14,8 @@ from vdgs.captures.images import ImageCache
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
+from vdgs.model.ground import ground_cells, known_ground
+from vdgs.model.sizes import largest_log_scales
 from vdgs.model.start import initial_anchors
 from vdgs.runs.folder import RunFolder
 from vdgs.settings.method import TrainConfig
@@ -54,9 +56,9 @@ def _train(
 ) -> None:
     folder, views = run.coarse, capture.train_views
     # The voxel follows from the capture: recomputed when a run continues.
-    anchors, voxel = initial_anchors(
-        capture.points, capture.point_colours, [view.camera for view in views], config.anchors
-    )
+    cameras = [view.camera for view in views]
+    anchors, voxel = initial_anchors(capture.points, capture.point_colours, cameras, config.anchors)
+    ground = known_ground(anchors.positions.to(device), cameras)
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
     with ImageCache(views, image_budget(options), downscales=factors) as images:
         background = (0.0, 0.0, 0.0)
@@ -64,7 +66,9 @@ def _train(
             background = mean_colour(images, len(views), factors[-1])
         stage = Stage(
             config, images, len(views), voxel, camera_height(capture), background=background,
-            shares=shares_for(config, anchors, [view.camera for view in views]), device=device,
+            shares=shares_for(config, anchors, cameras), device=device,
+            ground=[ground_cells(ground, camera) for camera in cameras],
+            largest=lambda positions: largest_log_scales(positions, cameras),
         )  # fmt: skip
         state = continue_or_start(folder, stage, lambda: _start(anchors, stage), console)
         _announce(capture, state, config, console)

@@ -32,7 +32,8 @@ def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:
     before, added = len(state.anchors), len(decision.added)
     kept = torch.cat([decision.kept, decision.kept.new_ones(added)])
     return_unused()
-    remap(state, {"anchors": decision.added.tensors()}, added, kept)
+    new = {"anchors": decision.added.tensors(), "largest": {"log_scale": stage.largest_at(decision.added.positions)}}
+    remap(state, new, added, kept)
     return_unused()
     if state.compensation is not None:
         begin_cycle(state.compensation, state.statistics)

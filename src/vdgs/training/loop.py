@@ -20,18 +20,20 @@ from vdgs.kernels.types import DecoderWeights, SplatGradients, Splats
 from vdgs.model.render import decode_rows, visible_rows
 from vdgs.training.averaging import Average, counts_in_mean
 from vdgs.training.background import background_at
-from vdgs.training.crops import WHOLE, crop_at
 from vdgs.training.growing import grow, reorder
 from vdgs.training.optimiser import rates_at
 from vdgs.training.schedule import downscale_at, view_at
 from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
 from vdgs.training.state import Stage, StepReport, TrainingState
 from vdgs.training.step import draw_view, move_anchors
+from vdgs.training.target import target_at
 
 #: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
 REFERENCE_HEIGHT = 10.0
 #: Every so many iterations anchors are put into Morton order, so that neighbours in space are neighbours in memory.
 REORDER_INTERVAL = 1000
+#: Every so many iterations sizes are brought back below their bounds; they also are where a model leaves the loop.
+BOUND_INTERVAL = 10
 #: Every so many iterations the PSNR of the training view is taken, for people.
 PSNR_INTERVAL = 10
 
@@ -44,7 +46,8 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     config, iteration = stage.config, state.iteration
     downscale = downscale_at(iteration, config)
     view = view_at(iteration, stage.image_count, config.seed, stage.shares)
-    target, mask, camera, share = _photograph(stage, view, downscale, iteration)
+    target = target_at(stage, view, downscale, iteration)
+    camera = target.camera
 
     rows = visible_rows(state.anchors, camera)
     weights = state.decoder.for_image(appearance_at(stage, view))
@@ -55,19 +58,24 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
         )
     image = drawn.image.requires_grad_(True)
     kernels = choose(stage.device)
-    photometric = kernels.photometric_loss(image, target, mask, ssim_weight=config.loss.ssim_weight)
+    photometric = kernels.photometric_loss(image, target.image, target.mask, ssim_weight=config.loss.ssim_weight)
     volume_weight = _volume_weight(stage)
     loss = photometric.loss.detach()
+    alpha_gradient = None
+    if target.ground is not None:
+        clear, alpha_gradient = target.transparency(drawn.alpha, config.loss.alpha_weight)
+        loss = loss + clear
     if volume_weight and len(drawn.source):
         loss = loss + volume_weight * drawn.volume
     value = float(loss)
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
     (image_gradient,) = torch.autograd.grad(photometric.loss, image)
-    if share != 1.0:
-        image_gradient.mul_(share)
-    gradients = drawn.backward(image_gradient, volume_weight)
-    psnr = psnr_of(image.detach(), target, mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
+    if target.share != 1.0:
+        image_gradient.mul_(target.share)
+        alpha_gradient = None if alpha_gradient is None else alpha_gradient.mul_(target.share)
+    gradients = drawn.backward(image_gradient, alpha_gradient, volume_weight)
+    psnr = psnr_of(image.detach(), target.image, target.mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
     state.whole = False
     _move(state, stage, rows, gradients, weights, camera)
 
@@ -84,33 +92,14 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
         report = replace(report, **grow(state, stage))
     if state.iteration % REORDER_INTERVAL == 0:
         reorder(state)
-    if counts_in_mean(state.iteration, config):
+    last, averaged = state.iteration == config.iterations, counts_in_mean(state.iteration, config)
+    if state.iteration % BOUND_INTERVAL == 0 or averaged or last:
+        _bound_sizes(state)
+    if averaged:
         _average(state)
     _smooth(state, value, psnr)
     state.whole = True
     return report
-
-
-def _photograph(stage: Stage, view: int, downscale: int, iteration: int) -> tuple[Tensor, Tensor | None, Camera, float]:
-    """What a step is to draw: the photograph, its mask, its camera, or those of the part that the stage wants of it.
-
-    Last the share of the photograph's pixels that count in that part. Gradients are multiplied by it: those of a mean
-    over the part become those of a mean over the whole picture, in which thresholds of growth are given (but for SSIM
-    within its window of the part's border, where it sees nothing beyond).
-    """
-    target, mask = stage.images.get(view, downscale)
-    target, mask = target.to(stage.device), None if mask is None else mask.to(stage.device)
-    camera = stage.images.camera(view, downscale)
-    crop = crop_at(stage.crops, view, iteration)
-    if crop == WHOLE:
-        return target, mask, camera, 1.0
-    left, top, right, bottom = crop.pixels(camera.width, camera.height)
-    inside = (slice(top, bottom), slice(left, right))
-    part = camera.cropped(left, top, right, bottom)
-    if mask is None:
-        return target[inside], None, part, part.width * part.height / (camera.width * camera.height)
-    kept = mask[inside]
-    return target[inside], kept, part, int(kept.count_nonzero()) / max(int(mask.count_nonzero()), 1)
 
 
 @torch.no_grad()
@@ -144,6 +133,13 @@ def _move(
     finite &= state.optimiser.update_decoder(state.decoder, rates, step)
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")
+
+
+@torch.no_grad()
+def _bound_sizes(state: TrainingState) -> None:
+    """Let no Gaussian be larger than pictures can show: the decoder only makes an anchor's scales smaller."""
+    scales = state.anchors.log_scales[:, 3:]
+    torch.minimum(scales, state.largest[:, None], out=scales)
 
 
 def _average(state: TrainingState) -> None:

@@ -47,6 +47,8 @@ class TrainingState:
     decoder: Decoder
     statistics: Statistics
     optimiser: Optimiser
+    #: Largest log-scale that Gaussians of each anchor may have, [n] (`model.sizes`): anchors never move.
+    largest: Tensor
     #: Remembered gradients of compensated growth; None where growth is plain.
     compensation: Compensation | None = None
     #: Mean of the last models, once it has begun (`averaging.counts_in_mean`).
@@ -67,7 +69,7 @@ class TrainingState:
         groups = {
             "anchors": self.anchors.tensors(), "statistics": self.statistics.tensors(),
             "first.anchors": moments.first, "second.anchors": moments.second,
-            "updates": {"anchors": self.optimiser.updates},
+            "updates": {"anchors": self.optimiser.updates}, "largest": {"log_scale": self.largest},
         }  # fmt: skip
         if self.compensation is not None:
             groups["compensation"] = self.compensation.tensors()
@@ -86,6 +88,7 @@ class TrainingState:
         self.anchors, self.statistics = Anchors(**groups["anchors"]), Statistics(**groups["statistics"])
         self.optimiser.anchors = Moments(groups["first.anchors"], groups["second.anchors"])
         self.optimiser.updates = groups["updates"]["anchors"]
+        self.largest = groups["largest"]["log_scale"]
         if self.compensation is not None:
             self.compensation = Compensation(**groups["compensation"])
         if self.average is not None:
@@ -126,6 +129,10 @@ class Stage:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     #: A block may leave the decoder as it is.
     frozen_decoder: bool = False
+    #: The largest log-scale of Gaussians of anchors at places [p, 3]; None: any.
+    largest: Callable[[Tensor], Tensor] | None = None
+    #: Which cells of each view's picture show ground (`model.ground`), where the scene must be opaque; None: nowhere.
+    ground: Sequence[Tensor] | None = None
     #: What is drawn and never moves: ring and context of a block.
     surroundings: Surroundings | None = None
     #: Which places [p, 3] may get new anchors; None: all.
@@ -140,6 +147,10 @@ class Stage:
     crops: tuple[Crop, ...] | None = None
     #: Where the arithmetic is done. Photographs and places come to it.
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+
+    def largest_at(self, positions: Tensor) -> Tensor:
+        """The largest log-scale [p] of Gaussians of anchors at places [p, 3]."""
+        return torch.full_like(positions[:, 0], math.inf) if self.largest is None else self.largest(positions)
 
 
 @dataclass(frozen=True)
@@ -166,7 +177,8 @@ def start_state(anchors: Anchors, decoder: Decoder, stage: Stage) -> TrainingSta
         tensor.requires_grad_(not stage.frozen_decoder and not shared)
     compensation = Compensation.zeros(n, k, device) if stage.config.compensation.enabled else None
     optimiser = Optimiser.start(anchors, decoder)
-    return TrainingState(0, anchors, decoder, Statistics.zeros(n, k, device), optimiser, compensation)
+    largest = stage.largest_at(anchors.positions)
+    return TrainingState(0, anchors, decoder, Statistics.zeros(n, k, device), optimiser, largest, compensation)
 
 
 def to_saved(state: TrainingState) -> SavedState:

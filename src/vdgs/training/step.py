@@ -26,6 +26,8 @@ class TrainingView:
     """A picture for training, and what the backward pass needs of the m splats of the anchors that are trained."""
 
     image: Float[Tensor, "h w 3"]
+    #: 1 - the share of the background that shows through.
+    alpha: Float[Tensor, "h w"]
     source: Int32[Tensor, " m"]
     colours: Float[Tensor, "m 3"]
     opacities: Float[Tensor, " m"]
@@ -36,10 +38,13 @@ class TrainingView:
     room: tuple[Tensor, Tensor]
 
     @torch.no_grad()
-    def backward(self, image: Float[Tensor, "h w 3"], volume_weight: float) -> SplatGradients:
-        """Gradients of a loss: `image` by the picture, `volume_weight` by the mean volume. Call it once."""
+    def backward(
+        self, image: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"] | None, volume_weight: float
+    ) -> SplatGradients:
+        """Gradients of a loss: `image` by the picture, `alpha` by its alpha (None: zero), `volume_weight` by the mean
+        volume. Call it once."""
         m = len(self.source)
-        means_px, conics, colours, opacities, *_ = self.pullback(image, over=self.room)
+        means_px, conics, colours, opacities, *_ = self.pullback(image, alpha, over=self.room)
         # In float32, as autograd divides.
         volume = float(torch.tensor(volume_weight) / m) if m else 0.0
         return SplatGradients(
@@ -57,7 +62,7 @@ def draw_view(
     kernels = choose(drawn.means_px.device)
     raster, pullback = kernels.rasterise_vjp(drawn, background, camera.width, camera.height)
     return TrainingView(
-        raster.image, splats.source, splats.colours, splats.opacities, splats.volumes.mean(), pullback,
+        raster.image, raster.alpha, splats.source, splats.colours, splats.opacities, splats.volumes.mean(), pullback,
         (drawn.means_px, drawn.conics),
     )  # fmt: skip
 

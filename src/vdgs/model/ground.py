@@ -1,0 +1,58 @@
+"""Where a picture shows ground that cameras know: there the scene must be opaque, not in the sky.
+
+Ground is where anchors start (sparse points, and what fills the gaps between them). A picture is cut into cells; a cell
+shows ground where at least one such place that `LEAST_VIEWS` training cameras see falls into it. Nothing is hidden
+behind anything else: what hides ground from a camera is as solid as the ground.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_closing, binary_erosion, binary_fill_holes
+from torch import Tensor
+
+from vdgs.cameras import Camera
+from vdgs.model.frustum import project
+from vdgs.model.visibility import visibility_of
+
+#: Ground that fewer training cameras see has no certain place: nothing is asked of it.
+LEAST_VIEWS = 3
+#: Cells along the longer side of a picture (choice): wide enough to hold some of the sparse points each.
+CELLS = 32
+
+
+def known_ground(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, "g 3"]:
+    """Those of the places where anchors start that at least `LEAST_VIEWS` of the training cameras hold."""
+    return positions[visibility_of(positions, cameras) >= LEAST_VIEWS]
+
+
+def ground_cells(ground: Float[Tensor, "g 3"], camera: Camera) -> Bool[Tensor, "rows columns"]:
+    """Which cells of a camera's picture show ground, `CELLS` along its longer side.
+
+    Gaps of a cell, and what ground encloses, count as ground. The outermost cells of ground do not, unless the picture
+    ends there: part of them may be sky.
+    """
+    longer = max(camera.width, camera.height)
+    columns, rows = (max(1, round(CELLS * side / longer)) for side in (camera.width, camera.height))
+    seen = project(ground, camera)
+    column = (seen.column[seen.inside] * (columns / camera.width)).long().clamp(max=columns - 1)
+    row = (seen.row[seen.inside] * (rows / camera.height)).long().clamp(max=rows - 1)
+    held = (row * columns + column).bincount(minlength=rows * columns).reshape(rows, columns).cpu().numpy() > 0
+    around = np.ones((3, 3), bool)
+    # Beyond the picture is what its edge shows.
+    closed = binary_closing(np.pad(held, 2, mode="edge"), around)[2:-2, 2:-2]
+    cells = binary_erosion(binary_fill_holes(closed), around, border_value=1)
+    return torch.from_numpy(cells).to(ground.device)
+
+
+def at_size(cells: Bool[Tensor, "rows columns"], width: int, height: int) -> Bool[Tensor, "height width"]:
+    """The cell of every pixel of a picture."""
+    row, column = (
+        ((torch.arange(pixels, device=cells.device) + 0.5) * (count / pixels)).long()
+        for pixels, count in ((height, cells.shape[0]), (width, cells.shape[1]))
+    )
+    return cells[row[:, None], column]

@@ -1,0 +1,73 @@
+"""What a step is to draw: a photograph, or the part of it that the stage wants, and where it must be opaque."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from vdgs.cameras import Camera
+from vdgs.model.ground import at_size
+from vdgs.training.crops import WHOLE, crop_at
+from vdgs.training.state import Stage
+
+#: Share of light let through below which the root is bent to a line: its slope would have no end.
+NEARLY_OPAQUE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A photograph or a part of it."""
+
+    image: UInt8[Tensor, "h w 3"]
+    #: 1 where a pixel counts; None: everywhere.
+    mask: UInt8[Tensor, "h w"] | None
+    #: Where it shows ground, among the pixels that count; None: nothing is asked of alpha.
+    ground: Bool[Tensor, "h w"] | None
+    camera: Camera
+    #: The share of the photograph's pixels that count in this part. Gradients are multiplied by it: those of a mean
+    #: over the part become those of a mean over the whole picture, in which thresholds of growth are given (but for
+    #: SSIM within its window of the part's border, where it sees nothing beyond).
+    share: float = 1.0
+
+    def transparency(self, alpha: Float[Tensor, "h w"], weight: float) -> tuple[Tensor, Float[Tensor, "h w"]]:
+        """`weight` times the sum of √(1 - alpha) over the pixels that show ground, divided by how many pixels count at
+        all; and its gradient by alpha. Needs `ground`.
+
+        The background is a colour of the place, so a model can leave ground half transparent and borrow its colour:
+        photographs alone do not object. Before any other background such a scene is a ghost, and its depth is wrong.
+        The root pulls hardest where little is left to do, so that a small weight makes ground opaque and hardly bends
+        what is far from it (choice; docs/findings.md).
+        """
+        assert self.ground is not None
+        counted = alpha.numel() if self.mask is None else max(int(self.mask.count_nonzero()), 1)
+        root = (1.0 - alpha).clamp(min=0.0).add(NEARLY_OPAQUE).sqrt()
+        shown = self.ground.to(alpha.dtype) * (weight / counted)
+        return (shown * (root - NEARLY_OPAQUE**0.5)).sum(), shown / (-2.0 * root)
+
+
+def target_at(stage: Stage, view: int, downscale: int, iteration: int) -> Target:
+    """What iteration (from 0) is to draw of a view, on the stage's device."""
+    image, mask = stage.images.get(view, downscale)
+    image, mask = image.to(stage.device), None if mask is None else mask.to(stage.device)
+    camera = stage.images.camera(view, downscale)
+    ground = _ground(stage, view, mask, camera)
+    crop = crop_at(stage.crops, view, iteration)
+    if crop == WHOLE:
+        return Target(image, mask, ground, camera)
+    left, top, right, bottom = crop.pixels(camera.width, camera.height)
+    inside = (slice(top, bottom), slice(left, right))
+    part = camera.cropped(left, top, right, bottom)
+    ground = None if ground is None else ground[inside]
+    if mask is None:
+        return Target(image[inside], None, ground, part, part.width * part.height / (camera.width * camera.height))
+    kept = mask[inside]
+    return Target(image[inside], kept, ground, part, int(kept.count_nonzero()) / max(int(mask.count_nonzero()), 1))
+
+
+def _ground(stage: Stage, view: int, mask: Tensor | None, camera: Camera) -> Bool[Tensor, "h w"] | None:
+    if stage.ground is None or not stage.config.loss.alpha_weight:
+        return None
+    ground = at_size(stage.ground[view], camera.width, camera.height)
+    return ground if mask is None else ground & (mask > 0)

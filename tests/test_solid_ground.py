@@ -1,0 +1,210 @@
+"""Solid ground: where pictures show it, what training asks of alpha there, and how large Gaussians may be."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from block_support import block_stage
+from checkerboard import Photographs
+from vdgs.cameras import NEAR, Camera
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.frustum import project
+from vdgs.model.ground import CELLS, LEAST_VIEWS, at_size, ground_cells, known_ground
+from vdgs.model.render import decode_view, render
+from vdgs.model.sizes import REACH, SPAN, largest_log_scales
+from vdgs.settings.method import BlockConfig, GrowthConfig, LossConfig
+from vdgs.training import Stage, train
+from vdgs.training.target import Target
+
+FOCAL, WIDTH, HEIGHT = 100.0, 200, 160
+
+
+def camera_at(x: float = 0.0, height: float = 20.0, tilt: float = 0.0) -> Camera:
+    """Above (x, 0), looking straight down, or by `tilt` radians towards +y."""
+    down = np.diag([1.0, -1.0, -1.0])
+    turn = np.array([[1, 0, 0], [0, math.cos(tilt), math.sin(tilt)], [0, -math.sin(tilt), math.cos(tilt)]])
+    pose = np.eye(4)
+    pose[:3, :3] = turn @ down
+    pose[:3, 3] = -pose[:3, :3] @ np.array([x, 0.0, height])
+    return Camera(pose, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+
+
+def plain(step: float = 0.4, half: float = 60.0) -> torch.Tensor:
+    x, y = torch.meshgrid(torch.arange(-half, half, step), torch.arange(-half, half, step), indexing="ij")
+    return torch.stack([x.ravel(), y.ravel(), torch.zeros(x.numel())], dim=1)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 1000), tilt=st.floats(-1.5, 1.5))
+def test_points_fall_where_the_camera_says(seed, tilt):
+    points, camera = np.random.default_rng(seed).uniform(-30, 30, (200, 3)), camera_at(tilt=tilt)
+    seen = project(torch.from_numpy(points), camera)
+    assert np.array_equal(seen.inside.numpy(), camera.sees(points))
+    pixels, depth = camera.project(points)
+    inside = seen.inside.numpy()
+    assert np.allclose(np.stack([seen.column, seen.row], axis=1)[inside], pixels[inside])
+    assert np.allclose(seen.depth, depth)
+    assert np.allclose(seen.distance, np.linalg.norm(points - camera.position, axis=1))
+    assert depth[inside].min(initial=1.0) > NEAR
+
+
+def test_a_picture_full_of_ground_shows_it_everywhere():
+    assert ground_cells(plain(), camera_at()).all()
+
+
+def test_sky_is_left_alone_and_so_is_its_border():
+    camera = camera_at(tilt=1.5)
+    shown = at_size(ground_cells(plain(step=0.1), camera), WIDTH, HEIGHT).numpy()
+    horizon = camera.project(np.array([[0.0, 1e6, 0.0]]))[0][0, 1]
+    below, above = np.arange(HEIGHT) > horizon + 40, np.arange(HEIGHT) < horizon
+    assert shown[below].all()
+    assert not shown[above].any()
+
+
+def test_a_hole_that_ground_encloses_is_ground_and_one_that_it_does_not_is_none():
+    points = plain()
+    lake = points[:, :2].norm(dim=1) > 6
+    assert ground_cells(points[lake], camera_at()).all()
+    beach = points[points[:, 0] < 0]
+    shown = at_size(ground_cells(beach, camera_at()), WIDTH, HEIGHT)
+    edge = WIDTH / CELLS
+    assert shown[:, : int(WIDTH / 2 - 2 * edge)].all()
+    assert not shown[:, WIDTH // 2 :].any()
+
+
+def test_ground_that_too_few_cameras_see_is_not_known():
+    points = plain()
+    cameras = [camera_at(x) for x in (-20.0, 0.0, 20.0, 30.0)]
+    known = known_ground(points, cameras)
+    times = sum(torch.from_numpy(camera.sees(known.double().numpy())).int() for camera in cameras)
+    assert 0 < len(known) < len(points)
+    assert int(times.min()) == LEAST_VIEWS
+
+
+def test_no_ground_at_all_is_no_ground():
+    assert not ground_cells(torch.zeros(0, 3), camera_at()).any()
+
+
+# ------------------------------------------------------------------------------------------ the term of the loss
+
+
+def target(ground: torch.Tensor, mask: torch.Tensor | None = None) -> Target:
+    height, width = ground.shape
+    return Target(torch.zeros(height, width, 3, dtype=torch.uint8), mask, ground, camera_at())
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_gradient_of_transparency_is_that_of_finite_differences(masked):
+    generator = torch.Generator().manual_seed(0)
+    alpha = torch.rand(5, 7, generator=generator, dtype=torch.float64)
+    mask = (torch.rand(5, 7, generator=generator) > 0.3).to(torch.uint8) if masked else None
+    ground = torch.rand(5, 7, generator=generator) > 0.3
+    wanted = target(ground if mask is None else ground & (mask > 0), mask)
+    _, gradient = wanted.transparency(alpha, 0.3)
+    for pixel in np.ndindex(5, 7):
+        step = torch.zeros_like(alpha)
+        step[pixel] = 1e-6
+        above, below = (wanted.transparency(alpha + sign * step, 0.3)[0] for sign in (1, -1))
+        assert float(gradient[pixel]) == pytest.approx(float(above - below) / 2e-6, rel=1e-5, abs=1e-12)
+
+
+def test_opaque_ground_costs_nothing_and_what_is_no_ground_neither():
+    ground = torch.zeros(4, 6, dtype=torch.bool)
+    ground[:, :3] = True
+    opaque, clear = torch.ones(4, 6), torch.ones(4, 6)
+    clear[:, 3:] = 0.0
+    assert float(target(ground).transparency(opaque, 0.5)[0]) == pytest.approx(0.0, abs=1e-7)
+    cost, gradient = target(ground).transparency(clear, 0.5)
+    assert float(cost) == pytest.approx(0.0, abs=1e-7)
+    assert not gradient[:, 3:].any()
+    half = float(target(ground).transparency(torch.zeros(4, 6), 0.5)[0])
+    assert half == pytest.approx(0.5 * 0.5, rel=0.05)  # half of the pixels, weight a half
+
+
+def trained(loss: LossConfig, background: tuple[float, float, float] = (0.5, 0.5, 0.5)) -> AnchorModel:
+    stage, state = block_stage(BlockConfig())
+    config = replace(stage.config, iterations=300, loss=loss, growth=GrowthConfig(levels=0, start=10_000))
+    cells = ground_cells(plain(0.1, 6.0), Photographs().camera(0))
+    ground = [torch.ones_like(cells)] * 8
+    stage = replace(stage, config=config, background=background, surroundings=None, ground=ground)
+    train(state, stage, stop=lambda: False, after_step=lambda *_: None)
+    return AnchorModel(*state.result(), stage.voxel, background, {})
+
+
+def test_ground_becomes_opaque_although_the_background_has_its_colour():
+    """The board's mean colour stands behind it: without the term light shines through, with it nearly none does."""
+    through = {
+        weight: 1.0 - render(trained(LossConfig(alpha_weight=weight, background_noise=0.0)), seen).alpha.clamp(0, 1)
+        for weight in (0.0, 0.05)
+        for seen in [Photographs().camera(0)]
+    }
+    board = through[0.05].quantile(0.5)
+    assert float(board) < 0.02
+    assert float(through[0.0].quantile(0.5)) > 3 * float(board)
+
+
+# ------------------------------------------------------------------------------------------------ the law of sizes
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 1000))
+def test_no_camera_that_holds_a_place_is_veiled_from_there(seed):
+    """A Gaussian as large as allowed, drawn at full opacity, spans no more than its share of any picture."""
+    rng = np.random.default_rng(seed)
+    points = torch.from_numpy(rng.uniform(-15, 15, (300, 3)) * [1, 1, 0.3])
+    cameras = [camera_at(x, height, tilt) for x, height, tilt in rng.uniform([-10, 8, -0.5], [10, 30, 0.5], (5, 3))]
+    diameter = 2 * REACH * largest_log_scales(points, cameras).exp().numpy()
+    held = np.zeros(len(points), bool)
+    longest = np.zeros(len(points))
+    for camera in cameras:
+        inside = camera.sees(points.numpy())
+        depth = camera.project(points.numpy())[1]
+        longest[inside] = np.maximum(longest, diameter * FOCAL / depth)[inside]
+        held |= inside
+    assert held.sum() > 10
+    assert longest[held].max() <= SPAN * WIDTH * (1 + 1e-6)
+    assert longest[held].min() > SPAN * WIDTH * 0.999  # no smaller than it must be
+
+
+def test_what_no_camera_holds_is_bounded_by_the_nearest_and_nothing_without_cameras():
+    beside = torch.tensor([[500.0, 0.0, 20.0]])
+    bound = largest_log_scales(beside, [camera_at(), camera_at(100.0)]).exp()
+    assert float(bound) == pytest.approx(400.0 * WIDTH / FOCAL * SPAN / (2 * REACH), rel=1e-5)
+    assert largest_log_scales(beside, []).tolist() == [math.inf]
+
+
+def test_training_leaves_no_gaussian_larger_than_its_bound():
+    """Scales are driven up by a loss that wants them large; anchors that grow are bounded too."""
+    stage, state = block_stage(BlockConfig())
+    growth = GrowthConfig(interval=10, statistics_from=0, start=10, until=0.8, threshold=1e-6, gate=0.05)
+    config = replace(stage.config, iterations=47, average=0.1, growth=growth)
+    cameras = Photographs().cameras
+    stage = replace(stage, config=config, largest=lambda places: largest_log_scales(places, cameras) - 3.0)
+    state.largest = stage.largest_at(state.anchors.positions)
+    state.anchors.log_scales[:, 3:] += 2.0
+    before = len(state.anchors)
+    train(state, stage, stop=lambda: False, after_step=lambda *_: None)
+    anchors, decoder = state.result()
+    assert len(anchors) != before
+    bound = largest_log_scales(anchors.positions, cameras) - 3.0
+    assert (anchors.log_scales[:, 3:] <= bound[:, None] + 1e-5).all()
+    assert (anchors.log_scales[:, 3:] > bound[:, None] - 0.5).any()
+    model = AnchorModel(anchors, decoder, stage.voxel, (0.0, 0.0, 0.0), {})
+    for camera in cameras:
+        rows, splats = decode_view(model, camera)
+        of = rows[splats.source.long() // anchors.offsets.shape[1]]
+        largest = (3 * bound[of]).exp()
+        assert (splats.volumes <= largest * 1.001).all()
+
+
+def test_an_unbounded_stage_changes_no_scale():
+    stage, state = block_stage(BlockConfig())
+    assert isinstance(stage, Stage)
+    assert torch.equal(state.largest, torch.full((len(state.anchors),), math.inf))
