@@ -39,8 +39,9 @@ from vdgs.storage.checkpoints import save_state
 from vdgs.training import Stage, start_state, to_saved
 from vdgs.training.optimiser import rates_at
 from vdgs.training.step import draw_view, move_anchors
+from vdgs.training.target import Target
 
-PHASES = ("cull", "decode", "rasterise", "loss", "backward", "move", "statistics")
+PHASES = ("cull", "decode", "rasterise", "loss", "solid", "backward", "move", "statistics")
 
 
 def scene(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Anchors, Camera]:
@@ -91,7 +92,9 @@ def one_step(
         return torch.autograd.grad(photometric.loss, view.image)[0]
 
     image_gradient = timed(times, "loss", loss)
-    gradients = timed(times, "backward", lambda: view.backward(image_gradient, 0.01))
+    whole = Target(target, None, torch.ones(target.shape[:2], dtype=torch.bool), camera)
+    _, alpha_gradient = timed(times, "solid", lambda: whole.transparency(view.alpha, 0.02))
+    gradients = timed(times, "backward", lambda: view.backward(image_gradient, alpha_gradient, 0.01))
 
     def move() -> None:
         states = state.optimiser.anchor_states(state.anchors, rates)

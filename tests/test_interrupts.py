@@ -12,9 +12,13 @@ NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @pytest.fixture(autouse=True)
 def handlers_as_before():
+    """Those of a terminal, whatever the tests were started with: under nohup they inherit an ignored SIGHUP."""
+    inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     before = [signal.getsignal(number) for number in NUMBERS]
     yield
-    assert [signal.getsignal(number) for number in NUMBERS] == before
+    after = [signal.getsignal(number) for number in NUMBERS]
+    signal.signal(signal.SIGHUP, inherited)
+    assert after == before
 
 
 def test_requests_are_noted_in_their_order():
