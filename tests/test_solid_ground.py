@@ -55,28 +55,55 @@ def test_points_fall_where_the_camera_says(seed, tilt):
     assert depth[inside].min(initial=1.0) > NEAR
 
 
-def test_a_picture_full_of_ground_shows_it_everywhere():
-    assert ground_cells(plain(), camera_at()).all()
+def wall(low: float = 0.0, high: float = 60.0, step: float = 0.4) -> torch.Tensor:
+    """A cliff 20 in front of a camera that looks along y from the origin, up to a height."""
+    x, z = torch.meshgrid(torch.arange(-60.0, 60.0, step), torch.arange(low, high, step), indexing="ij")
+    return torch.stack([x.ravel(), torch.full((x.numel(),), 20.0), z.ravel()], dim=1)
 
 
-def test_sky_is_left_alone_and_so_is_its_border():
-    camera = camera_at(tilt=1.5)
-    shown = at_size(ground_cells(plain(step=0.1), camera), WIDTH, HEIGHT).numpy()
-    horizon = camera.project(np.array([[0.0, 1e6, 0.0]]))[0][0, 1]
-    below, above = np.arange(HEIGHT) > horizon + 40, np.arange(HEIGHT) < horizon
-    assert shown[below].all()
-    assert not shown[above].any()
+#: Looks along y, at no height: the lower half of its picture lies below the horizon.
+LEVEL = camera_at(height=0.0, tilt=math.pi / 2)
+UPPER = slice(0, HEIGHT // 2)
 
 
-def test_a_hole_that_ground_encloses_is_ground_and_one_that_it_does_not_is_none():
-    points = plain()
-    lake = points[:, :2].norm(dim=1) > 6
-    assert ground_cells(points[lake], camera_at()).all()
-    beach = points[points[:, 0] < 0]
-    shown = at_size(ground_cells(beach, camera_at()), WIDTH, HEIGHT)
+def shown(points: torch.Tensor, camera: Camera) -> np.ndarray:
+    return at_size(ground_cells(points, camera), WIDTH, HEIGHT).numpy()
+
+
+@settings(max_examples=20)
+@given(tilt=st.floats(-0.4, 0.4))
+def test_below_the_horizon_there_is_no_sky(tilt):
+    """Whatever is known of the place: water and woods hold no sparse points."""
+    assert shown(torch.zeros(0, 3), camera_at(tilt=tilt)).all()
+
+
+def test_sky_is_left_alone():
+    nothing, ground = torch.zeros(0, 3), plain(step=0.1)
+    for camera in (camera_at(tilt=1.5), camera_at(tilt=1.3)):
+        horizon = camera.project(np.array([[0.0, 1e6, 0.0]]))[0][0, 1]
+        cell, limit = WIDTH / CELLS, FOCAL * 2 * math.tan(math.radians(5.0))
+        below, above = np.arange(HEIGHT) > horizon + cell + limit, np.arange(HEIGHT) < horizon
+        for points in (nothing, ground):
+            assert shown(points, camera)[below].all()
+            assert not shown(points, camera)[above].any()
+
+
+def test_what_stands_above_the_horizon_is_solid_but_for_its_border():
+    top = 6.0
+    picture = shown(wall(high=top), LEVEL)
+    edge, cell = HEIGHT / 2 - FOCAL * top / 20.0, WIDTH / CELLS
+    assert not picture[: math.floor(edge)].any()
+    assert picture[math.ceil(edge + 2 * cell) : HEIGHT // 2 - 1].all()
+
+
+def test_a_hole_that_known_ground_encloses_is_solid_and_one_that_it_does_not_is_none():
+    points = wall()
+    window = (points[:, [0, 2]] - torch.tensor([0.0, 8.0])).norm(dim=1) > 4
+    assert shown(points[window], LEVEL)[UPPER].all()
+    half = shown(points[points[:, 0] < 0], LEVEL)[UPPER]
     edge = WIDTH / CELLS
-    assert shown[:, : int(WIDTH / 2 - 2 * edge)].all()
-    assert not shown[:, WIDTH // 2 :].any()
+    assert half[:, : int(WIDTH / 2 - 2 * edge)].all()
+    assert not half[: HEIGHT // 4, WIDTH // 2 :].any()
 
 
 def test_ground_that_too_few_cameras_see_is_not_known():
@@ -86,10 +113,6 @@ def test_ground_that_too_few_cameras_see_is_not_known():
     times = sum(torch.from_numpy(camera.sees(known.double().numpy())).int() for camera in cameras)
     assert 0 < len(known) < len(points)
     assert int(times.min()) == LEAST_VIEWS
-
-
-def test_no_ground_at_all_is_no_ground():
-    assert not ground_cells(torch.zeros(0, 3), camera_at()).any()
 
 
 # ------------------------------------------------------------------------------------------ the term of the loss

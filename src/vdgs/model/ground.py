@@ -1,8 +1,9 @@
-"""Where a picture shows ground that cameras know: there the scene must be opaque, not in the sky.
+"""Where a picture shows something solid and not sky: there the scene must be opaque.
 
-Ground is where anchors start (sparse points, and what fills the gaps between them). A picture is cut into cells; a cell
-shows ground where at least one such place that `LEAST_VIEWS` training cameras see falls into it. Nothing is hidden
-behind anything else: what hides ground from a camera is as solid as the ground.
+Below the horizon there is no sky. Above it, what stands there is known by the places where anchors start (sparse
+points, and what fills the gaps between them): a picture is cut into cells, and a cell shows something solid where at
+least one such place that `LEAST_VIEWS` training cameras see falls into it. Nothing is hidden behind anything else: what
+hides such a place from a camera is as solid as the place.
 """
 
 from __future__ import annotations
@@ -19,8 +20,11 @@ from vdgs.cameras import Camera
 from vdgs.model.frustum import project
 from vdgs.model.visibility import visibility_of
 
-#: Ground that fewer training cameras see has no certain place: nothing is asked of it.
+#: What fewer training cameras see has no certain place: it says nothing.
 LEAST_VIEWS = 3
+#: Rays that lead down by at least this much, in degrees, end on the ground (choice: as far as the vertical of a capture
+#: without GPS may be wrong).
+BELOW_HORIZON_DEG = 5.0
 #: Cells along the longer side of a picture (choice): wide enough to hold some of the sparse points each.
 CELLS = 32
 
@@ -31,10 +35,11 @@ def known_ground(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> 
 
 
 def ground_cells(ground: Float[Tensor, "g 3"], camera: Camera) -> Bool[Tensor, "rows columns"]:
-    """Which cells of a camera's picture show ground, `CELLS` along its longer side.
+    """Which cells of a camera's picture show something solid, `CELLS` along its longer side: those below the horizon,
+    and those that hold known ground.
 
-    Gaps of a cell, and what ground encloses, count as ground. The outermost cells of ground do not, unless the picture
-    ends there: part of them may be sky.
+    Of the latter, gaps of a cell and what ground encloses count too. The outermost cells do not, unless the picture ends
+    there: part of them may be sky.
     """
     longer = max(camera.width, camera.height)
     columns, rows = (max(1, round(CELLS * side / longer)) for side in (camera.width, camera.height))
@@ -45,8 +50,19 @@ def ground_cells(ground: Float[Tensor, "g 3"], camera: Camera) -> Bool[Tensor, "
     around = np.ones((3, 3), bool)
     # Beyond the picture is what its edge shows.
     closed = binary_closing(np.pad(held, 2, mode="edge"), around)[2:-2, 2:-2]
-    cells = binary_erosion(binary_fill_holes(closed), around, border_value=1)
-    return torch.from_numpy(cells).to(ground.device)
+    known = binary_erosion(binary_fill_holes(closed), around, border_value=1)
+    return torch.from_numpy(known | _below_horizon(camera, rows, columns)).to(ground.device)
+
+
+def _below_horizon(camera: Camera, rows: int, columns: int) -> Bool[np.ndarray, "rows columns"]:
+    """Cells through whose centre the view leads down (z is up)."""
+    if camera.model == "orthographic":
+        return np.full((rows, columns), camera.forward[2] < 0)
+    x = ((np.arange(columns) + 0.5) * (camera.width / columns) - camera.cx) / camera.fx
+    y = ((np.arange(rows) + 0.5) * (camera.height / rows) - camera.cy) / camera.fy
+    rays = np.stack([*np.meshgrid(x, y), np.ones((rows, columns))], axis=-1)
+    up = rays @ camera.camera_from_world[:3, 2] / np.linalg.norm(rays, axis=-1)
+    return up < -np.sin(np.radians(BELOW_HORIZON_DEG))
 
 
 def at_size(cells: Bool[Tensor, "rows columns"], width: int, height: int) -> Bool[Tensor, "height width"]:
