@@ -36,10 +36,16 @@ def known_ground(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> 
 
 def ground_cells(ground: Float[Tensor, "g 3"], camera: Camera) -> Bool[Tensor, "rows columns"]:
     """Which cells of a camera's picture show something solid, `CELLS` along its longer side: those below the horizon,
-    and those that hold known ground.
+    and those of known ground."""
+    known = known_cells(ground, camera)
+    return known | torch.from_numpy(_below_horizon(camera, *known.shape)).to(known.device)
 
-    Of the latter, gaps of a cell and what ground encloses count too. The outermost cells do not, unless the picture ends
-    there: part of them may be sky.
+
+def known_cells(ground: Float[Tensor, "g 3"], camera: Camera) -> Bool[Tensor, "rows columns"]:
+    """Which cells of a camera's picture hold known ground (`known_ground`).
+
+    Gaps of a cell, and what ground encloses, count too. The outermost cells do not, unless the picture ends there: part
+    of them may be sky.
     """
     longer = max(camera.width, camera.height)
     columns, rows = (max(1, round(CELLS * side / longer)) for side in (camera.width, camera.height))
@@ -50,8 +56,7 @@ def ground_cells(ground: Float[Tensor, "g 3"], camera: Camera) -> Bool[Tensor, "
     around = np.ones((3, 3), bool)
     # Beyond the picture is what its edge shows.
     closed = binary_closing(np.pad(held, 2, mode="edge"), around)[2:-2, 2:-2]
-    known = binary_erosion(binary_fill_holes(closed), around, border_value=1)
-    return torch.from_numpy(known | _below_horizon(camera, rows, columns)).to(ground.device)
+    return torch.from_numpy(binary_erosion(binary_fill_holes(closed), around, border_value=1)).to(ground.device)
 
 
 def _below_horizon(camera: Camera, rows: int, columns: int) -> Bool[np.ndarray, "rows columns"]:
