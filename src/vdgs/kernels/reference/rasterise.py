@@ -77,7 +77,8 @@ def rasterise_vjp(
         of_depths = None if drawn.depth is None else found[4]
         return RasterGradients(means, conics, found[2], found[3], of_depths, found[5])
 
-    return Raster(*(None if tensor is None else tensor.detach() for tensor in drawn)), pullback
+    shown_depth = None if drawn.depth is None else drawn.depth.detach()
+    return Raster(drawn.image.detach(), drawn.alpha.detach(), shown_depth, drawn.median_depth), pullback
 
 
 @torch.no_grad()
