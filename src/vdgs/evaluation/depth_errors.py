@@ -40,7 +40,7 @@ class DepthErrors:
         return int(self._counts.sum())
 
     def median(self) -> float | None:
-        """To 1 in 2,000; of two in the middle the smaller. Infinite if half are or more; None without any."""
+        """To 1 in 2,000; of two in the middle the smaller. Infinite if more than half are; None without any."""
         if not self.count:
             return None
         middle = np.searchsorted(np.cumsum(self._counts), (self.count + 1) // 2)

@@ -99,7 +99,7 @@ def evaluate_blocks(
     """Measure every test view, write `output`, and return what `by_block.json` holds. One view is in memory at a time,
     and those that are drawn.
 
-    `render_merged` draws depth, from which the labels follow. `render_block(index, camera)` is the image of a block as
+    `render_merged` draws depth; the labels follow from the median one. `render_block(index, camera)` is the image of a block as
     it was trained, among its frozen surroundings; None where the block was not trained, whose figure is then null.
     Raises RunError without views.
     """
