@@ -119,7 +119,7 @@ class Ours:
         image, alpha = np.empty((s.height, s.width, 3), np.float32), np.empty((s.height, s.width), np.float32)
         background = tuple(float(c) for c in s.background)
         frame = self.module.rasterise_forward(
-            *s.rows(), background, s.width, s.height, image, alpha, None, counting=True
+            *s.rows(), background, s.width, s.height, image, alpha, None, None, counting=True
         )
         return int(frame.statistics["pairs"])
 

@@ -12,6 +12,7 @@ from vdgs.bench import bench
 from vdgs.bench.measure import evaluated
 from vdgs.bench.notes import notes_of
 from vdgs.bench.plan import Choices, make_plan
+from vdgs.bench.results import SOLIDITY
 from vdgs.bench.verdict import verdict
 from vdgs.errors import VdgsError
 from vdgs.evaluation import saving
@@ -52,11 +53,17 @@ def theirs(output, tmp_path) -> Path:
 def test_renders_of_our_own_measure_as_our_own(data, output, theirs):
     both = benched(data, output, "baseline", renders=(f"Some Program 2={theirs}",))
     ours, foreign = both["baseline"], both["some-program-2"]
-    quality = {name: value for name, value in ours.figures.items() if name.startswith(("psnr", "ssim", "lpips"))}
+    quality = {
+        name: value for name, value in ours.figures.items()
+        if name.startswith(("psnr", "ssim", "lpips")) and name not in SOLIDITY
+    }  # fmt: skip
     assert quality["psnr"]
     assert quality["psnr@0"]
     assert {name: foreign.figures[name] for name in quality} == quality
     assert (foreign.groups, foreign.seen_by) == (ours.groups, ours.seen_by)
+    for of_alpha in SOLIDITY:  # an opaque picture does not say
+        assert foreign.figures[of_alpha] is None, of_alpha
+    assert ours.figures["solid_share"] is not None
     for cost in ("anchors", "gaussians", "iterations", "seconds", "peak_memory_bytes", "fps"):
         assert foreign.figures.get(cost) is None, cost
     text = (output / "table1" / "table.md").read_text()

@@ -129,6 +129,17 @@ def test_grids_are_written_in_every_form():
     assert float(rows[0]["mean"]) == 24.034
 
 
+def test_solidity_is_a_table_where_it_is_known():
+    plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full")))
+    results = made({"baseline": (0, 0), "full": (1, 0)})
+    assert not [grid for grid in grids_of(plan, results) if grid.name == "solidity-lab-uneven"]
+    for result, share in zip(results, (0.5, 0.5, 0.5, 0.9, 0.9, 0.9), strict=True):
+        result.figures.update({"solid_share": share, "splats_larger_than_picture": None})
+    (grid,) = [grid for grid in grids_of(plan, results) if grid.name == "solidity-lab-uneven"]
+    assert grid.columns == ("opaque % ↑",)
+    assert "| VDGS (full) | **90.00 ± 0.00** |" in markdown([grid], "T", [])
+
+
 def test_failures_are_shown_and_leave_a_gap(tmp_path):
     plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full")))
     results = made({"baseline": (0, 0), "full": (1, 0)}, method_failed="full")

@@ -53,7 +53,8 @@ def plane_depth(camera: Camera, alpha: float = 1.0) -> Raster:
     seen = (depth > 0) & (depth < 1e3)
     as_tensor = lambda array: torch.from_numpy(array.astype(np.float32))  # noqa: E731
     image = render_plane(camera) / 255
-    return Raster(as_tensor(image), as_tensor(alpha * seen), as_tensor(np.where(seen, alpha * depth, 0)))
+    median = as_tensor(np.where(seen & (alpha > 0.5), depth, 0))
+    return Raster(as_tensor(image), as_tensor(alpha * seen), as_tensor(np.where(seen, alpha * depth, 0)), median)
 
 
 @pytest.mark.parametrize("camera", CAMERAS)

@@ -212,6 +212,31 @@ def test_the_report_of_a_whole_run_holds_its_figures(whole):
     assert page.tags.count("img") == 5 + 3 + 1 + 11
 
 
+def test_the_least_solid_view_is_shown_and_solidity_compared(tmp_path):
+    run = whole_run(tmp_path)
+    known = metrics(28.375, "merged") | {
+        "solid_share": 0.8765,
+        "psnr_seen_black": 27.5,
+        "splats_larger_than_picture": 12,
+    }
+    write(tmp_path / "evaluation/metrics.json", known)
+    rows = views(28.0)
+    for row, share in zip(rows, (0.9, 0.25, 0.8), strict=True):
+        row |= {"solid_share": share, "alpha": str(row["render"]).replace("renders", "alpha"), "largest_splats": 4}
+        picture(tmp_path / "evaluation" / str(row["alpha"]))
+    write(tmp_path / "evaluation/per_view.json", rows)
+    page = Page(write_report(run))
+    assert page.row("share of seen pixels that is opaque ↑") == [
+        "share of seen pixels that is opaque ↑",
+        "–",
+        "0.8765",
+        "–",
+    ]
+    assert page.row("second.jpg")[-2:] == ["25.0 %", "4"]
+    assert "Least solid: alpha of second.jpg" in page.text()
+    assert "25.0 % have alpha" in page.text()
+
+
 def test_growth_is_summed_for_each_block(whole):
     table = whole.source[whole.source.index("Sums over all cycles") :]
     assert re.findall(r"<td>(.*?)</td>", table)[:6] == ["block 0", "3", "90", "30", "75.0 %", "40.0 %"]

@@ -15,7 +15,10 @@ pytest.importorskip("embreex")
 import pycolmap
 
 from vdgs.cameras import Camera
+from vdgs.captures.loading import load_capture
 from vdgs.errors import VdgsError
+from vdgs.evaluation.of_run import true_depth
+from vdgs.settings.capture import CaptureOptions
 from vdgs.synth import SynthOptions, generate
 from vdgs.synth.photography import sample_offsets
 from vdgs.synth.streets import street_plan
@@ -111,6 +114,27 @@ def test_depth_maps_agree_with_the_tracks(capture: Path, model: pycolmap.Reconst
         inside = (true_depth > np.min(around, 0) - 0.15) & (true_depth < np.max(around, 0) + 0.15)
         agreeing, total = agreeing + inside.sum(), total + len(inside)
     assert agreeing > 0.97 * total
+
+
+def test_true_depth_is_in_units_of_the_ground_frame(capture: Path) -> None:
+    """Sparse points, which loading brings into the ground frame, lie at the true depth of the pixels that show them."""
+    loaded = load_capture(capture, CaptureOptions())
+    assert abs(loaded.ground.scale - 1.0) > 0.1, "or metres and units would be the same"
+    depth_of = true_depth(loaded, loaded.views)
+    assert depth_of is not None
+    for view in loaded.test_views:
+        pixels, depths = view.camera.project(loaded.points[view.camera.sees(loaded.points)])
+        column, row = np.floor(pixels).astype(int).T
+        error = np.abs(depths - depth_of(view)[row, column]) / depths
+        assert np.median(error) < 0.01  # some are hidden in this view
+    smaller = replace(loaded.test_views[0], camera=loaded.test_views[0].camera.resized(48, 36))
+    assert depth_of(smaller).shape == (36, 48)
+
+
+def test_there_is_no_true_depth_of_what_was_not_written(capture: Path, tmp_path: Path) -> None:
+    loaded = load_capture(capture, CaptureOptions())
+    assert true_depth(loaded, [replace(loaded.views[0], name="stranger.jpg")]) is None
+    assert true_depth(replace(loaded, root=tmp_path), loaded.views) is None
 
 
 def test_the_same_options_give_the_same_bytes(capture: Path, tmp_path: Path) -> None:

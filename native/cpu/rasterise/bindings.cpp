@@ -52,14 +52,16 @@ void drop_idle_frames() {
 std::shared_ptr<Frame> py_forward(Floats means, Floats conics, Floats colours, Floats opacities,
                                   Floats depths, const nb::tuple& background, int width, int height,
                                   MutableFloats image, MutableFloats alpha,
-                                  std::optional<MutableFloats> depth, bool counting) {
+                                  std::optional<MutableFloats> depth,
+                                  std::optional<MutableFloats> median_depth, bool counting) {
   const Splats splats{static_cast<int64_t>(opacities.shape(0)),
                       means.data(),
                       conics.data(),
                       colours.data(),
                       opacities.data(),
                       depths.data()};
-  const Picture out{image.data(), alpha.data(), depth ? depth->data() : nullptr};
+  const Picture out{image.data(), alpha.data(), depth ? depth->data() : nullptr,
+                    median_depth ? median_depth->data() : nullptr};
   float back[3];
   for (size_t c = 0; c < 3; ++c) back[c] = nb::cast<float>(background[c]);
   auto frame = take_frame();  // with the GIL held: a fork never finds idle_mutex locked
@@ -114,9 +116,11 @@ VDGS_BIND(rasterise) {
   m.attr("ALPHA_MIN") = std::exp2(vdgs::kLog2AlphaMin);
   m.attr("ALPHA_MAX") = vdgs::kAlphaMax;
   m.attr("TRANSMITTANCE_MIN") = vdgs::kTransmittanceMin;
+  m.attr("MEDIAN_TRANSMITTANCE") = vdgs::kMedianTransmittance;
   m.def("rasterise_forward", &py_forward, nb::arg("means"), nb::arg("conics"), nb::arg("colours"),
         nb::arg("opacities"), nb::arg("depths"), nb::arg("background"), nb::arg("width"), nb::arg("height"),
-        nb::arg("image"), nb::arg("alpha"), nb::arg("depth").none(), nb::arg("counting") = false);
+        nb::arg("image"), nb::arg("alpha"), nb::arg("depth").none(), nb::arg("median_depth").none(),
+        nb::arg("counting") = false);
   m.def("rasterise_backward", &py_backward, nb::arg("frame"), nb::arg("background"), nb::arg("image").none(),
         nb::arg("alpha").none(), nb::arg("depth").none(), nb::arg("means"), nb::arg("conics"),
         nb::arg("colours"), nb::arg("opacities"), nb::arg("depths").none(), nb::arg("background_gradient"));

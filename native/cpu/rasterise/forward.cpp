@@ -37,10 +37,11 @@ void prepare_batch(const Record* records, const uint32_t* entries, int n, const 
   std::memset(batch.touched, 0, sizeof batch.touched);
 }
 
-// Blends the chosen entries of a batch into one block. Returns those that contributed.
+// Blends the chosen entries of a batch into one block. Returns those that contributed. `median_depth`
+// is that of the tile (not looked at without depth).
 template <bool with_depth, bool counting>
 VDGS_INLINE uint64_t blend_block(const Batch& batch, uint64_t chosen, int block, uint32_t first_index,
-                                 TilePixels& px, int64_t& pairs) {
+                                 TilePixels& px, float* median_depth, int64_t& pairs) {
   const int at = block * kTileBlocks;
   F16 t = load(px.transmittance + at);
   F16 c0 = load(px.colour[0] + at), c1 = load(px.colour[1] + at), c2 = load(px.colour[2] + at);
@@ -70,6 +71,14 @@ VDGS_INLINE uint64_t blend_block(const Batch& batch, uint64_t chosen, int block,
       }
     }
     const F16 weight = alpha * t;
+    if (with_depth) {
+      const F16 half = splat(kMedianTransmittance);
+      const M16 crossing = ge(t, half) & lt(t_next, half);
+      if (__builtin_expect(any(crossing), 0)) {  // once for each pixel at most
+        float* const median = median_depth + at;
+        store(median, select(crossing, splat(batch.paint[j].depth), load(median)));
+      }
+    }
     t = t_next;
     c0 = fma(weight, splat(batch.paint[j].colour[0]), c0);
     c1 = fma(weight, splat(batch.paint[j].colour[1]), c1);
@@ -92,7 +101,8 @@ unsigned live_blocks(const TilePixels& px) {
 
 // Draws entries until they end or all pixels are finished. Returns how many were looked at.
 template <bool with_depth, bool counting>
-uint32_t blend_entries(const Frame& frame, Slab& slab, int tile, TilePixels& px, int64_t& pairs) {
+uint32_t blend_entries(const Frame& frame, Slab& slab, int tile, TilePixels& px, float* median_depth,
+                       int64_t& pairs) {
   const uint32_t begin = slab.tile_begin[tile], end = slab.tile_begin[tile + 1];
   const BlockOrigins origins(frame.grid, tile);
   const Record* records = slab.records.data();
@@ -114,8 +124,8 @@ uint32_t blend_entries(const Frame& frame, Slab& slab, int tile, TilePixels& px,
       const int block = __builtin_ctz(blocks);
       const uint64_t chosen = bit_column(batch.in_reach, block);
       if (!chosen) continue;
-      const uint64_t touched =
-          blend_block<with_depth, counting>(batch, chosen, block, px.seen + (i - begin), px, pairs);
+      const uint64_t touched = blend_block<with_depth, counting>(batch, chosen, block, px.seen + (i - begin),
+                                                                 px, median_depth, pairs);
       set_bit_column(batch.touched, block, touched);
       if (!px.live[block]) live &= ~(1u << block);
     }
@@ -152,8 +162,8 @@ void clear_pixels(const TileGrid& grid, int tile, TilePixels& px) {
 }
 
 // The picture, and what the backward pass wants of the pixels.
-void finish_tile(Frame& frame, int tile, const TilePixels& px, const float background[3],
-                 const Picture& out) {
+void finish_tile(Frame& frame, int tile, const TilePixels& px, const float* median_depth,
+                 const float background[3], const Picture& out) {
   const F16 b0 = splat(background[0]), b1 = splat(background[1]), b2 = splat(background[2]);
   for_each_pixel_row(frame.grid, tile, [&](int n, int place, int64_t pixel) {
     const F16 t = load_quads(px.transmittance + place, kLanes);
@@ -161,7 +171,9 @@ void finish_tile(Frame& frame, int tile, const TilePixels& px, const float backg
     write_row3(out.image + 3 * pixel, n, fma(t, b0, load_quads(px.colour[0] + place, kLanes)),
                fma(t, b1, load_quads(px.colour[1] + place, kLanes)),
                fma(t, b2, load_quads(px.colour[2] + place, kLanes)));
-    if (out.depth) write_row(out.depth + pixel, n, load_quads(px.depth + place, kLanes));
+    if (!out.depth) return;
+    write_row(out.depth + pixel, n, load_quads(px.depth + place, kLanes));
+    write_row(out.median_depth + pixel, n, load_quads(median_depth + place, kLanes));
   });
   const size_t first = static_cast<size_t>(tile) * kTilePixels;
   std::memcpy(frame.transmittance.data() + first, px.transmittance, sizeof px.transmittance);
@@ -179,10 +191,14 @@ void draw_tile(Frame& frame, Slab& slab, int tile, bool last, const float backgr
   TilePixels on_stack;
   // Between slabs the pixels wait in memory; a tile that needs one slab only never leaves the cache.
   TilePixels& px = state == TileState::open ? frame.unfinished[index] : on_stack;
-  if (state == TileState::fresh) clear_pixels(frame.grid, tile, px);
-  slab.visited[index] = blend_entries<with_depth, counting>(frame, slab, tile, px, pairs);
+  float* const median_depth = with_depth ? frame.median_depth.data() + index * kTilePixels : nullptr;
+  if (state == TileState::fresh) {
+    clear_pixels(frame.grid, tile, px);
+    if (with_depth) std::memset(median_depth, 0, kTilePixels * sizeof(float));
+  }
+  slab.visited[index] = blend_entries<with_depth, counting>(frame, slab, tile, px, median_depth, pairs);
   if (last || live_blocks(px) == 0) {
-    finish_tile(frame, tile, px, background, out);
+    finish_tile(frame, tile, px, median_depth, background, out);
     state = TileState::finished;
   } else if (state == TileState::fresh) {
     frame.unfinished[index] = px;

@@ -121,6 +121,7 @@ struct Frame {
   Buffer<float> transmittance;    // [tiles, 256] at the end, block by block
   Buffer<float> stop;             // [tiles, 256] where any_stop
   Buffer<TilePixels> unfinished;  // [tiles] pixels between slabs, if there are several
+  Buffer<float> median_depth;     // [tiles, 256] block by block, if with_depth
   Buffer<int32_t> open_before;    // [rows + 1, columns + 1] summed-area table of unfinished tiles
   Buffer<float> background_sums;  // [tiles, 3]
   Statistics stats;

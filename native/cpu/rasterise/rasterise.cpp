@@ -20,6 +20,7 @@ void begin_frame(Frame& frame, const Splats& splats, int width, int height, bool
   frame.any_stop.reserve(tiles);
   frame.transmittance.reserve(tiles * kTilePixels);
   frame.stop.reserve(tiles * kTilePixels);
+  if (with_depth) frame.median_depth.reserve(tiles * kTilePixels);
 }
 
 Slab& add_slab(Frame& frame) {
@@ -92,7 +93,8 @@ void backward(Frame& frame, const float background[3], const PictureGradients& i
 }
 
 size_t Frame::bytes() const {
-  size_t total = work.bytes() + transmittance.bytes() + stop.bytes() + unfinished.bytes();
+  size_t total =
+      work.bytes() + transmittance.bytes() + stop.bytes() + unfinished.bytes() + median_depth.bytes();
   for (const auto& slab : slabs) {
     total += slab->records.bytes() + slab->entries.bytes() + slab->touched.bytes();
     for (const auto& part : slab->parts)

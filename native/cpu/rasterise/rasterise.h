@@ -5,7 +5,8 @@
 //     alpha_i = min(0.999, opacity_i exp(-1/2 (a dx^2 + 2 b dx dy + c dy^2)))   skipped below 1/255
 //     colour  = sum_i colour_i alpha_i T_i + T background,   T_i = product of (1 - alpha_j), j before i
 //
-// where a pixel is finished before T would fall below 1e-4. How it is made fast:
+// where a pixel is finished before T would fall below 1e-4. The median depth of a pixel is that of the
+// splat at which T falls from at least 1/2 to below it; it has no derivative. How it is made fast:
 //
 //   cull      which splats can reach a pixel, sixteen at a time                  cull.cpp
 //   slabs     a few ranges of depth, front to back; a tile of 16 x 16 pixels that
@@ -36,9 +37,10 @@ struct Splats {
 };
 
 struct Picture {
-  float* image;  // [h, w, 3]
-  float* alpha;  // [h, w]: 1 - T
-  float* depth;  // [h, w]: sum of w_i depth_i; null if not wanted
+  float* image;         // [h, w, 3]
+  float* alpha;         // [h, w]: 1 - T
+  float* depth;         // [h, w]: sum of w_i depth_i; null if not wanted
+  float* median_depth;  // [h, w]: depth_i at which T falls below 1/2, else 0; null where depth is
 };
 
 struct PictureGradients {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from vdgs.bench.definitions import Group
@@ -71,6 +71,23 @@ COSTS = (
     Column("model MB", "model_bytes", 1, 0, 1e-6),
     Column("frames/s", "fps", 0, 0),
 )
+SOLIDITY = (
+    Column("opaque % ↑", "solid_share", factor=100.0),
+    Column("PSNR, own background ↑", "psnr_seen_own"),
+    Column("PSNR, black ↑", "psnr_seen_black"),
+    Column("PSNR, white ↑", "psnr_seen_white"),
+    Column("error of expected depth % ↓", "depth_error_median_expected", 2, -1, 100.0),
+    Column("error of median depth % ↓", "depth_error_median_median", 2, -1, 100.0),
+    Column("expected depth within 1 %, % ↑", "depth_within_1_percent_expected", 1, 1, 100.0),
+    Column("median depth within 1 %, % ↑", "depth_within_1_percent_median", 1, 1, 100.0),
+    Column("large splats ↓", "splats_larger_than_picture", 0, -1),
+)
+#: Over which pixels, and what the columns hold.
+SOLID = (
+    "Over the pixels whose place at least 3 training cameras hold in their frustum, as the coarse model of each run "
+    "draws it. Opaque: alpha of at least 0.95. Error of depth: the median over these pixels, in percent of the camera "
+    "height; what is not drawn counts as infinitely far off. Large: longer than the picture, summed over the views."
+)
 #: An anchor is no Gaussian: what the two columns of sizes hold.
 SIZES = (
     "Gaussians: of 3DGS its own; of methods with anchors at most as many as these decode to, those without opacity "
@@ -85,7 +102,8 @@ SEEN_BY = {
 
 
 def grids_of(plan: Plan, results: Sequence[Result]) -> list[Grid]:
-    """Quality raw and corrected over all scenes; by visibility and cost for each scene; the paper's own numbers."""
+    """Quality raw and corrected over all scenes; by visibility, solidity and cost for each scene; the paper's own
+    numbers."""
     across = "mean ± standard deviation over seeds" if len(plan.seeds) > 1 else "one seed"
     views = "Validation views" if plan.validation else "Test views"
     grids = [
@@ -98,11 +116,19 @@ def grids_of(plan: Plan, results: Sequence[Result]) -> list[Grid]:
         if columns:
             title = f"{scene.title}: PSNR by visibility"
             grids.append(_measured(plan, mine, f"visibility-{scene.name}", title, columns, notes))
-        columns = [Column(c.title, c.key, c.digits, c.better, c.factor, scene.name) for c in COSTS]
+        columns = [_for_scene(c, scene.name) for c in SOLIDITY if any(r.figures.get(c.key) is not None for r in mine)]
+        if columns:
+            title = f"{scene.title}: solidity"
+            grids.append(_measured(plan, mine, f"solidity-{scene.name}", title, columns, (SOLID,)))
+        columns = [_for_scene(c, scene.name) for c in COSTS]
         title = f"{scene.title}: what each method got"
         grids.append(_measured(plan, mine, f"costs-{scene.name}", title, columns, (SIZES,)))
     quoted = _quoted(plan)
     return grids + ([quoted] if quoted else [])
+
+
+def _for_scene(column: Column, scene: str) -> Column:
+    return replace(column, scene=scene)
 
 
 def _for_scenes(plan: Plan, columns: Sequence[Column]) -> list[Column]:

@@ -18,6 +18,12 @@ from vdgs.storage.files import read_json
 
 #: What evaluations report, raw and after colour correction.
 QUALITY = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01", "psnr_cc", "ssim_cc", "lpips_vgg_cc", "lpips_vgg_01_cc")
+#: Over the pixels that training cameras see: how opaque they are, PSNR by background, errors of depth; and veils.
+SOLIDITY = (
+    "solid_share", "psnr_seen_own", "psnr_seen_black", "psnr_seen_white", "depth_error_median_expected",
+    "depth_error_median_median", "depth_within_1_percent_expected", "depth_within_1_percent_median",
+    "splats_larger_than_picture",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -64,7 +70,7 @@ def as_json(results: list[Result]) -> list[dict[str, Any]]:
 def _read(output: Path, planned: PlannedRun) -> tuple[dict[str, float | None], tuple[dict[str, Any], ...], str]:
     run = RunFolder(output / planned.folder)
     metrics, record = read_json(evaluated(run.path) / "metrics.json"), read_json(run.path / RECORD)
-    figures: dict[str, float | None] = {name: metrics.get(name) for name in QUALITY}
+    figures: dict[str, float | None] = {name: metrics.get(name) for name in (*QUALITY, *SOLIDITY)}
     figures |= {"model_bytes": metrics.get("model_bytes"), "fps": metrics["fps"]}
     if planned.renders is None:
         figures |= _sizes(metrics, planned) | _costs(run, planned.stages, record.get("seconds", {}))

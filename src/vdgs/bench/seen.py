@@ -18,7 +18,7 @@ from vdgs.captures.loading import load_capture
 from vdgs.evaluation.of_run import visibility_map
 from vdgs.runs.opening import open_run
 from vdgs.settings.capture import CaptureOptions
-from vdgs.synth.truth import load_truth
+from vdgs.synth.truth import has_truth, load_truth
 
 #: `truth`: training cameras that truly see the surface. `model`: whose frustum holds the place that a model draws.
 SeenBy = Literal["truth", "model"]
@@ -40,7 +40,7 @@ class Seen:
 def seen_truly(root: Path, options: CaptureOptions) -> Seen | None:
     """V by the truth beside a generated capture, read with `options`; None where there is none, or where it counts
     other training views than those that are used or does not know a test view."""
-    if not (root / "truth" / "views").is_dir():
+    if not has_truth(root):
         return None
     truth, capture = load_truth(root), load_capture(root, options)
     known = {kind: {file.stem for file in (truth.folder / kind).glob("*.npz")} for kind in ("depth", "views")}

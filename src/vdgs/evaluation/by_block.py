@@ -33,15 +33,15 @@ NOTHING = -1
 def label_map(drawn: Raster, camera: Camera, blocks: Blocks) -> Int16[np.ndarray, "h w"]:
     """The block that owns what each pixel shows, NOTHING where alpha is at most one half.
 
-    The place is the centre of the pixel at the expected depth (the drawn depth divided by alpha).
-    Raises ValueError if the view was drawn without depth.
+    The place is the centre of the pixel at the median depth: where a surface is, unlike the expected depth, which
+    at the edge of a roof lies between roof and ground. Raises ValueError if the view was drawn without depth.
     """
-    if drawn.depth is None:
+    if drawn.median_depth is None:
         raise ValueError("labels need a render with depth")
     alpha = drawn.alpha.double().cpu().numpy()
     seen = alpha > DRAWN_ALPHA
     labels = np.full(alpha.shape, NOTHING, np.int16)
-    depth = drawn.depth.double().cpu().numpy()[seen] / alpha[seen]
+    depth = drawn.median_depth.double().cpu().numpy()[seen]
     labels[seen] = blocks.owner(_back_projected(np.argwhere(seen), depth, camera)[:, :2])
     return labels
 

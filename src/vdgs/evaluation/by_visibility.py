@@ -19,7 +19,7 @@ QUANTILE_BINS = 5
 #: Sign, exponent and 11 bits of mantissa of a float32 remain: counts up to 4096 stay exact, fractions
 #: to 1 in 2,000, and no range need be known beforehand. The bits of non-negative floats sort as numbers.
 _DROPPED_BITS = 12
-_KEYS = 1 << (31 - _DROPPED_BITS)
+KEYS = 1 << (31 - _DROPPED_BITS)
 
 Bin = dict[str, float | int | None]
 
@@ -31,8 +31,8 @@ class VisibilityHistogram:
     """
 
     def __init__(self, names: Sequence[str]) -> None:
-        self._counts = np.zeros(_KEYS, np.int64)
-        self._sums = {name: np.zeros(_KEYS) for name in names}
+        self._counts = np.zeros(KEYS, np.int64)
+        self._sums = {name: np.zeros(KEYS) for name in names}
         self._empty_count = 0
         self._empty_sums = dict.fromkeys(names, 0.0)
 
@@ -46,11 +46,11 @@ class VisibilityHistogram:
         kept = np.ones(visibility.shape, bool) if mask is None else mask
         empty = kept & np.isnan(visibility)
         seen = kept & ~empty
-        keys = _key(visibility[seen])
-        self._counts += np.bincount(keys, minlength=_KEYS)
+        keys = key_of(visibility[seen])
+        self._counts += np.bincount(keys, minlength=KEYS)
         self._empty_count += int(empty.sum())
         for name, total in self._sums.items():
-            total += np.bincount(keys, weights=values[name][seen], minlength=_KEYS)
+            total += np.bincount(keys, weights=values[name][seen], minlength=KEYS)
             self._empty_sums[name] += float(values[name][empty].sum())
 
     def bins(self, n_bins: int = QUANTILE_BINS) -> list[Bin]:
@@ -66,7 +66,7 @@ class VisibilityHistogram:
         for group in quantile_groups(self._counts[keys], n_bins):
             chosen = keys[group]
             sums = {name: float(total[chosen].sum()) for name, total in self._sums.items()}
-            lower, upper = _value(chosen[[0, -1]])
+            lower, upper = value_of(chosen[[0, -1]])
             result.append(self._bin(float(lower), float(upper), int(self._counts[chosen].sum()), sums))
         return result
 
@@ -126,11 +126,13 @@ def quantile_groups(counts: np.ndarray, n_bins: int) -> list[np.ndarray]:
     return [np.flatnonzero(share == each) for each in np.unique(share)]
 
 
-def _key(visibility: np.ndarray) -> np.ndarray:
+def key_of(values: np.ndarray) -> np.ndarray:
+    """Where non-negative numbers (infinity too) are counted in a histogram of KEYS places, in their order."""
     # Adding zero turns a negative zero, whose bits would be a huge key, into a positive one.
-    positive = np.maximum(visibility, 0.0).astype(np.float32) + np.float32(0.0)
+    positive = np.maximum(values, 0.0).astype(np.float32) + np.float32(0.0)
     return (positive.view(np.uint32) >> _DROPPED_BITS).astype(np.int64)
 
 
-def _value(keys: np.ndarray) -> np.ndarray:
+def value_of(keys: np.ndarray) -> np.ndarray:
+    """The least number, float32, that is counted at each place."""
     return (keys.astype(np.uint32) << _DROPPED_BITS).view(np.float32)

@@ -1,10 +1,12 @@
 """Evaluate a model on views, mostly its test views: every figure that papers report, raw and colour-corrected, and by
-visibility, with the pictures behind them. One view is in memory at a time.
+visibility; whether it is opaque where photographs show ground; the pictures behind that. One view is in memory at a
+time.
 
     OUTPUT/
       metrics.json        means over the views, bins by visibility, size and speed of the model
       per_view.json       the same figures for each view
       renders/NAME.png    what the model shows, 8 bits: the images that are measured
+      alpha/NAME.png      how opaque it is: black nothing, white opaque; none if the renderer does not say
       comparisons/        photograph | render | error
       contact_sheet.png   all views (or an even choice of them) at a glance
 """
@@ -30,9 +32,19 @@ from vdgs.errors import CaptureError, RunError, TrainingDiverged
 from vdgs.evaluation import metrics, pictures, saving
 from vdgs.evaluation.by_visibility import QUANTILE_BINS, VisibilityHistogram, mean_or_none, view_bins
 from vdgs.evaluation.colour import correct_colours
+from vdgs.evaluation.depth_errors import DepthErrors, errors_of_view, figures_of
 from vdgs.evaluation.lpips import MIN_SIDE_PX, Lpips
 from vdgs.evaluation.reference_views import ReferenceViews
+from vdgs.evaluation.solidity import (
+    Rendered,
+    larger_than_picture,
+    largest_splats_of_all,
+    seen_pixels,
+    solidity_of_all,
+    solidity_of_view,
+)
 from vdgs.evaluation.tables import metrics_table
+from vdgs.kernels.types import Raster, Splats
 from vdgs.storage.files import jsonable, write_json
 
 RAW = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")
@@ -40,7 +52,7 @@ CORRECTED = tuple(f"{name}_cc" for name in RAW)
 
 
 class RenderedView(Protocol):
-    """What a renderer returns; more may come with it (alpha, depth)."""
+    """What a renderer returns; `alpha` [h, w] may come with it, as in `Raster`."""
 
     @property
     def image(self) -> Float[Tensor, "h w 3"]: ...
@@ -60,14 +72,31 @@ class ModelFacts:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredModel:
-    """A model as the evaluation sees it."""
+    """A model as the evaluation sees it. Whatever is None is not known, and so are the figures that need it."""
 
+    #: Timed: the plain picture, with alpha if the renderer has it.
     render: Callable[[Camera], RenderedView]
     #: V per pixel [h, w], NaN where the model shows nothing; without it there are no figures by visibility.
     visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]] | None = None
     facts: ModelFacts = ModelFacts()
     #: Whether the time that `render` takes says anything.
     timed: bool = True
+    #: What is behind the model in a render, RGB in [0, 1].
+    background: tuple[float, float, float] | None = None
+    #: Where photographs show ground in a view, for pixels where `visibility_map` is NaN.
+    ground_map: Callable[[Camera], Bool[np.ndarray, "h w"]] | None = None
+    #: Depth along the axis of a view's camera, inf for sky; then these two are needed as well: the model's own depth
+    #: (not timed), and how high cameras are above ground. All in the units of the model.
+    true_depth: Callable[[View], Float[np.ndarray, "h w"]] | None = None
+    render_depth: Callable[[Camera], Raster] | None = None
+    camera_height: float | None = None
+    #: The splats that a view is drawn from.
+    splats_of: Callable[[Camera], Splats] | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a true depth without what it is compared with."""
+        if self.true_depth is not None and (self.render_depth is None or not self.camera_height):
+            raise ValueError("true_depth needs render_depth and a camera_height above 0")
 
 
 @dataclass(frozen=True)
@@ -107,6 +136,7 @@ class _Gathered:
     seconds: list[float] = field(default_factory=list)
     cells: list[pictures.Thumbnail] = field(default_factory=list)
     histogram: VisibilityHistogram | None = None
+    depth_errors: dict[str, DepthErrors] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,13 +190,15 @@ def evaluate(
 def _evaluate_view(view: View, stem: str, on_sheet: bool, inputs: _Inputs, gathered: _Gathered) -> None:
     settings = inputs.settings
     reference, mask = _photograph(view, inputs.photographs)
-    image, seconds = _rendered(view, inputs.model.render)
+    rendered, seconds = _rendered(view, inputs.model)
+    image = metrics.to_8bit(rendered.image)
     saving.write_png(inputs.output / "renders" / f"{stem}.png", image)
     raw = _Pair(image, reference, mask)
     maps = _maps(raw, "")
     row: dict[str, Any] = {
         "name": view.name,
         "render": f"renders/{stem}.png",
+        "alpha": _write_alpha(inputs.output, stem, rendered),
         **_figures(raw, maps, "", inputs.lpips),
     }
     if settings.colour_correction:
@@ -178,7 +210,12 @@ def _evaluate_view(view: View, stem: str, on_sheet: bool, inputs: _Inputs, gathe
         maps |= corrected_maps
     else:
         row |= dict.fromkeys(CORRECTED)
-    row["mean_visibility"] = _count_visibility(view, inputs, gathered, maps, mask)
+    visibility = None if inputs.model.visibility_map is None else np.asarray(inputs.model.visibility_map(view.camera))
+    row["mean_visibility"] = _count_visibility(visibility, gathered, maps, mask)
+    seen = None if visibility is None else seen_pixels(visibility, _ground(view, inputs.model), mask)
+    row |= solidity_of_view(rendered, reference, seen)
+    row |= _depth_figures(view, inputs.model, seen, gathered)
+    row["largest_splats"] = _largest_splats(view, inputs.model)
     row["kept_pixels"] = image.shape[0] * image.shape[1] if mask is None else int(mask.sum())
     row["render_seconds"] = seconds
     gathered.rows.append(row)
@@ -203,15 +240,16 @@ def _photograph(
     return reference, mask
 
 
-def _rendered(view: View, render: Callable[[Camera], RenderedView]) -> tuple[UInt8[np.ndarray, "h w 3"], float]:
-    """The render in 8 bits and the seconds it took, the GPU's work included."""
+def _rendered(view: View, model: MeasuredModel) -> tuple[Rendered, float]:
+    """The render and the seconds it took, the GPU's work included."""
     with torch.inference_mode():
         _wait_for_gpu()
         start = time.perf_counter()
-        rendered = render(view.camera).image
+        rendered = model.render(view.camera)
         _wait_for_gpu()
         seconds = time.perf_counter() - start
-        pixels = torch.as_tensor(rendered).detach().to("cpu", torch.float32).numpy()
+        pixels = _on_cpu(rendered.image)
+        alpha = getattr(rendered, "alpha", None)
     if pixels.shape != (view.camera.height, view.camera.width, 3):
         raise ValueError(f"the render of {view.name} has shape {list(pixels.shape)}")
     if not np.isfinite(pixels).all():
@@ -219,7 +257,21 @@ def _rendered(view: View, render: Callable[[Camera], RenderedView]) -> tuple[UIn
             f"the render of {view.name} holds values that are not finite numbers: the model is damaged. "
             "Evaluate an earlier state, or train again with lower rates."
         )
-    return metrics.to_8bit(pixels), seconds
+    return Rendered(pixels, None if alpha is None else _on_cpu(alpha), model.background), seconds
+
+
+def _on_cpu(values: Tensor) -> np.ndarray:
+    pixels: np.ndarray = torch.as_tensor(values).detach().to("cpu", torch.float32).numpy()
+    return pixels
+
+
+def _write_alpha(output: Path, stem: str, rendered: Rendered) -> str | None:
+    """Write the picture of alpha, if it is known; its name in the output folder."""
+    if rendered.alpha is None:
+        return None
+    name = f"alpha/{stem}.png"
+    saving.write_png(output / name, np.repeat(metrics.to_8bit(rendered.alpha)[..., None], 3, axis=2))
+    return name
 
 
 def _wait_for_gpu() -> None:
@@ -253,19 +305,45 @@ def _figures(pair: _Pair, maps: Mapping[str, np.ndarray], suffix: str, lpips: Lp
 
 
 def _count_visibility(
-    view: View,
-    inputs: _Inputs,
+    visibility: Float[np.ndarray, "h w"] | None,
     gathered: _Gathered,
     maps: Mapping[str, np.ndarray],
     mask: Bool[np.ndarray, "h w"] | None,
 ) -> float | None:
     """Pool the pixels by V; the mean V of what the view sees, None where nothing is known."""
-    if inputs.model.visibility_map is None or gathered.histogram is None:
+    if visibility is None or gathered.histogram is None:
         return None
-    visibility = np.asarray(inputs.model.visibility_map(view.camera))
     gathered.histogram.add(visibility, maps, mask)
     seen = ~np.isnan(visibility) if mask is None else mask & ~np.isnan(visibility)
     return float(visibility[seen].mean(dtype=np.float64)) if seen.any() else None
+
+
+def _ground(view: View, model: MeasuredModel) -> Bool[np.ndarray, "h w"] | None:
+    return None if model.ground_map is None else np.asarray(model.ground_map(view.camera))
+
+
+def _depth_figures(
+    view: View, model: MeasuredModel, seen: Bool[np.ndarray, "h w"] | None, gathered: _Gathered
+) -> dict[str, float | None]:
+    """How far the model's depth is from the truth in this view, which is also pooled; None without a truth."""
+    if model.true_depth is None or model.render_depth is None or model.camera_height is None or seen is None:
+        return figures_of({})
+    with torch.inference_mode():
+        drawn = model.render_depth(view.camera)
+    found = errors_of_view(drawn, np.asarray(model.true_depth(view)), seen, model.camera_height)
+    own = {kind: DepthErrors() for kind in found}
+    for kind, errors in found.items():
+        own[kind].add(errors)
+        gathered.depth_errors.setdefault(kind, DepthErrors()).add(errors)
+    return figures_of(own)
+
+
+def _largest_splats(view: View, model: MeasuredModel) -> int | None:
+    """How many of the splats of a view are larger than its picture."""
+    if model.splats_of is None:
+        return None
+    with torch.inference_mode():
+        return larger_than_picture(model.splats_of(view.camera), view.camera.width, view.camera.height)
 
 
 def _draw(
@@ -304,6 +382,9 @@ def _summary(
         **means,
         "by_visibility": pixel_bins,
         "views_by_visibility": view_bins(visible, figures, settings.visibility_bins) if pixel_bins else None,
+        **solidity_of_all(rows),
+        **figures_of(gathered.depth_errors),
+        **largest_splats_of_all(rows),
         **asdict(model.facts),
         "fps": 1.0 / max(statistics.median(gathered.seconds), 1e-9) if model.timed else None,
         settings.title.replace(" ", "_"): len(rows),

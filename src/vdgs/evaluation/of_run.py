@@ -9,20 +9,23 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Bool, Float
 from rich.console import Console
 
 from vdgs.cameras import Camera
-from vdgs.captures.capture import View
+from vdgs.captures.capture import Capture, View
+from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
 from vdgs.errors import RunError
 from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.render import render, render_values
+from vdgs.model.render import decode_view, render, render_values
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import TrainedRun
 from vdgs.runs.visibility import visibility_of_run
+from vdgs.synth.truth import has_truth, load_truth
 
 #: Photographs kept decoded during an evaluation, which needs one at a time.
 EVALUATION_IMAGES_BYTES = 256_000_000
@@ -32,9 +35,18 @@ Views = Literal["test", "training"]
 
 
 def evaluate_run(
-    run: TrainedRun, lpips_weights: Path | None, bins: int, console: Console, views: Views = "test"
+    run: TrainedRun,
+    lpips_weights: Path | None,
+    bins: int,
+    console: Console,
+    views: Views = "test",
+    ground_map: Callable[[Camera], Bool[np.ndarray, "h w"]] | None = None,
 ) -> None:
-    """Measure a model of a run and print a table. Writes `evaluation_folder`."""
+    """Measure a model of a run and print a table. Writes `evaluation_folder`.
+
+    `ground_map` says where photographs show ground in a view: pixels there that the coarse model leaves open count as
+    seen. Without it they do not count, and `solid_share` says nothing about them.
+    """
     if bins < 1:
         raise RunError(f"--bins is {bins}; it must be at least 1")
     output = evaluation_folder(run.folder, run.name, views)
@@ -46,8 +58,18 @@ def evaluate_run(
         train_seconds=run.status.seconds,
         peak_memory_bytes=run.status.peak_memory_bytes,
     )
-    model = MeasuredModel(lambda camera: render(run.model, camera), visibility_map(run), facts)
     chosen = run.capture.test_views if views == "test" else run.capture.train_views
+    model = MeasuredModel(
+        lambda camera: render(run.model, camera),
+        visibility_map(run),
+        facts,
+        background=run.model.background,
+        ground_map=ground_map,
+        true_depth=true_depth(run.capture, chosen),
+        render_depth=lambda camera: render(run.model, camera, depth=True),
+        camera_height=camera_height(run.capture),
+        splats_of=lambda camera: decode_view(run.model, camera)[1],
+    )
     with cached_photographs(chosen) as photographs:
         evaluate(
             photographs, model, output,
@@ -88,3 +110,15 @@ def visibility_map(run: TrainedRun) -> Callable[[Camera], np.ndarray]:
         coarse = replace(run, model=model, name="coarse")
     visibility = visibility_of_run(coarse).float()
     return lambda camera: render_values(coarse.model, visibility, camera).cpu().numpy()
+
+
+def true_depth(capture: Capture, views: Sequence[View]) -> Callable[[View], Float[np.ndarray, "h w"]] | None:
+    """The true depth of views of a generated capture, in units of the ground frame, inf for sky; None where it was
+    written without."""
+    if not has_truth(capture.root):
+        return None
+    truth, units_per_metre = load_truth(capture.root), capture.ground.scale
+    if not all(truth.knows_depth(view) for view in views):
+        return None
+    # The world of a generated capture is in metres, and the ground frame is a similarity of it.
+    return lambda view: units_per_metre * truth.depth_map(view)

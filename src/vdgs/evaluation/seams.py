@@ -99,9 +99,9 @@ def evaluate_blocks(
     """Measure every test view, write `output`, and return what `by_block.json` holds. One view is in memory at a time,
     and those that are drawn.
 
-    `render_merged` draws depth, from which the labels follow. `render_block(index, camera)` is the image of a block as
-    it was trained, among its frozen surroundings; None where the block was not trained, whose figure is then null.
-    Raises RunError without views.
+    `render_merged` draws depth; the labels follow from the median one. `render_block(index, camera)` is the image of a
+    block as it was trained, among its frozen surroundings; None where the block was not trained, whose figure is then
+    null. Raises RunError without views.
     """
     views = photographs.views
     if not views:

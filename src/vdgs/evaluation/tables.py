@@ -17,10 +17,21 @@ FIGURES = (
     ("lpips_vgg", "LPIPS vgg ↓", "{:.4f}"),
     ("lpips_vgg_01", "LPIPS vgg, [0,1] input ↓", "{:.4f}"),
 )
+#: Of solidity: what is measured over the pixels that training cameras see; those that are null are not shown.
+SOLIDITY = (
+    ("solid_share", "opaque (alpha ≥ 0.95) ↑", "{:.2%}"),
+    ("psnr_seen_own", "PSNR before its own background (dB) ↑", "{:.2f}"),
+    ("psnr_seen_black", "PSNR before black (dB) ↑", "{:.2f}"),
+    ("psnr_seen_white", "PSNR before white (dB) ↑", "{:.2f}"),
+    ("depth_error_median_expected", "median error of expected depth (camera heights) ↓", "{:.2%}"),
+    ("depth_error_median_median", "median error of median depth (camera heights) ↓", "{:.2%}"),
+    ("depth_within_1_percent_expected", "expected depth within 1 % of the camera height ↑", "{:.2%}"),
+    ("depth_within_1_percent_median", "median depth within 1 % of the camera height ↑", "{:.2%}"),
+)
 
 
 def metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
-    """What `metrics.json` holds: quality raw and corrected, quality by visibility, size and speed."""
+    """What `metrics.json` holds: quality raw and corrected, quality by visibility, solidity, size and speed."""
     quality = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
     for column in ("", "raw", "colour-corrected"):
         quality.add_column(column, justify="left" if not column else "right")
@@ -29,6 +40,10 @@ def metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
     parts: list[RenderableType] = [quality]
     if result["by_visibility"]:
         parts.append(_visibility_table(result["by_visibility"]))
+    if result["psnr_seen_own"] is not None:
+        parts.append(_solidity_table(result))
+    if result["largest_splats"]:
+        parts.append(Text(_splats_line(result)))
     parts.append(Text(_model_line(result), style="dim"))
     parts += [Text(note, style="yellow") for note in result["notes"]]
     return Group(*parts)
@@ -50,6 +65,26 @@ def _visibility_table(bins: list[Mapping[str, Any]]) -> Table:
             shown(each.get("psnr_cc"), "{:.2f}"),
         )  # fmt: skip
     return table
+
+
+def _solidity_table(result: Mapping[str, Any]) -> Table:
+    table = Table(
+        box=box.SIMPLE_HEAD, show_header=False, title="of the pixels that at least 3 training cameras see",
+        title_justify="left",
+    )  # fmt: skip
+    table.add_column("")
+    table.add_column("", justify="right")
+    for key, label, form in SOLIDITY:
+        if result[key] is not None:
+            table.add_row(label, form.format(result[key]))
+    return table
+
+
+def _splats_line(result: Mapping[str, Any]) -> str:
+    return (
+        f"splats larger than the picture: {result['splats_larger_than_picture']:,}, most of them "
+        f"({result['largest_splats']:,}) in {result['largest_splats_view']}"
+    )
 
 
 def _model_line(result: Mapping[str, Any]) -> str:

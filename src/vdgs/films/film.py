@@ -88,9 +88,8 @@ def _frames(
             values = render_values(run.model, counts, camera).cpu().numpy()
         else:
             raster = render(run.model, camera, depth=True)
-            assert raster.depth is not None
-            alpha = raster.alpha.cpu().numpy()
-            values = np.where(alpha > 0.5, raster.depth.cpu().numpy() / np.maximum(alpha, 1e-6), np.nan)
+            assert raster.median_depth is not None
+            values = np.where(raster.alpha.cpu().numpy() > 0.5, raster.median_depth.cpu().numpy(), np.nan)
             span = span or _span(values)
         yield name, coloured(values, span or (0.0, 1.0))
 

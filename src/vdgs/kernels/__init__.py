@@ -17,7 +17,7 @@ Names and dimensions, fixed once for all files in this folder:
                  -> finite, gradients of the weights; anchors move and their updates are counted, in place
     d  project(means [m,3], scales [m,3], quaternions [m,4], camera) -> Projected
     d  rasterise(means_px [m,2], conics [m,3], colours [m,3], opacities [m], depths [m],
-                 background [3], width, height) -> Raster(image [h,w,3], alpha [h,w], depth [h,w])
+                 background [3], width, height) -> Raster(image [h,w,3], alpha [h,w], depth [h,w], median_depth [h,w])
        rasterise_vjp(the same) -> Raster, and the function that takes gradients of it back to the splats
     d  photometric_loss(image [h,w,3], target uint8 [h,w,3], mask) -> Photometric(loss, l1, ssim)
        adam_rows(parameter [n,...], rows [v], gradient [v,...], moments, ...) -> finite; in place

@@ -9,6 +9,8 @@ ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.999
 #: A pixel is finished before its transmittance would fall below this.
 TRANSMITTANCE_MIN = 1e-4
+#: The median depth of a pixel is that of the splat at which its transmittance falls below this.
+MEDIAN_TRANSMITTANCE = 0.5
 #: Added to the diagonal of every projected covariance, in square pixels.
 DILATION_PX2 = 0.3
 #: The Jacobian of the projection is taken no further out than this many half-angles of the frustum.

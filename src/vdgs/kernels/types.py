@@ -150,6 +150,10 @@ class Raster(NamedTuple):
     #: Expected depth, the sum of w_i depth_i: not divided by alpha, 0 where nothing is drawn.
     #: None if it was not asked for.
     depth: Float[Tensor, "h w"] | None
+    #: Depth of the splat at which the transmittance falls from at least 0.5 to below it, front to back; 0 where it
+    #: stays at 0.5 or above. It jumps from splat to splat, so no gradient passes through it. None without `depth`,
+    #: and from implementations that cannot tell (gsplat).
+    median_depth: Float[Tensor, "h w"] | None = None
 
 
 class RasterGradients(NamedTuple):

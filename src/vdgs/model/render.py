@@ -69,7 +69,7 @@ def joined(first: Splats, second: Splats) -> Splats:
 
 
 def draw(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:
-    """Splats to image, alpha and (on request) expected depth; differentiable."""
+    """Splats to image, alpha and (on request) expected depth, differentiable, and median depth, which is not."""
     kernels = choose(splats.means_px.device)
     return kernels.rasterise(splats, background, camera.width, camera.height, depth=depth)
 
@@ -83,7 +83,7 @@ def render(
     depth: bool = False,
     image: int | None = None,
 ) -> Raster:
-    """One view of a model: image [h, w, 3] (not clamped), alpha [h, w], depth [h, w] or None.
+    """One view of a model: image [h, w, 3] (not clamped), alpha [h, w], expected and median depth [h, w] or None.
 
     `background` replaces the model's own. `image` is the index of a training image whose appearance to use;
     None takes the mean appearance.

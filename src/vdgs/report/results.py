@@ -8,7 +8,7 @@ from vdgs.evaluation.saving import file_stems
 from vdgs.report.charts import draw_gains, draw_pairs
 from vdgs.report.page import Html, details, figure, gallery, paragraph, section, table
 from vdgs.report.reading import Record, Source
-from vdgs.report.words import ABSENT, count, decibels, figure_of, gain, memory, similarity
+from vdgs.report.words import ABSENT, count, decibels, figure_of, gain, memory, share, similarity
 
 COARSE, MERGED = "coarse/evaluation", "evaluation"
 #: Rows of the table of test views, and pictures of seams, at most.
@@ -23,6 +23,15 @@ MEASURES = (
     ("lpips_vgg_cc", "LPIPS vgg, colour-corrected ↓", "{:.4f}", "{:+.4f}"),
     ("lpips_vgg_01", "LPIPS vgg, [0, 1] input ↓", "{:.4f}", "{:+.4f}"),
     ("lpips_vgg_01_cc", "LPIPS vgg, [0, 1] input, colour-corrected ↓", "{:.4f}", "{:+.4f}"),
+    ("solid_share", "share of seen pixels that is opaque ↑", "{:.4f}", "{:+.4f}"),
+    ("psnr_seen_own", "PSNR of seen pixels before its own background (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("psnr_seen_black", "PSNR of seen pixels before black (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("psnr_seen_white", "PSNR of seen pixels before white (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("depth_error_median_expected", "median error of expected depth (camera heights) ↓", "{:.4f}", "{:+.4f}"),
+    ("depth_error_median_median", "median error of median depth (camera heights) ↓", "{:.4f}", "{:+.4f}"),
+    ("depth_within_1_percent_expected", "share with expected depth within 1 % ↑", "{:.4f}", "{:+.4f}"),
+    ("depth_within_1_percent_median", "share with median depth within 1 % ↑", "{:.4f}", "{:+.4f}"),
+    ("splats_larger_than_picture", "splats larger than the picture, all test views ↓", "{:,.0f}", "{:+,.0f}"),
 )
 
 
@@ -89,6 +98,7 @@ def views_section(root: Path) -> Html:
         parts.append(paragraph("No test view is evaluated yet.", "absent"))
     for kind, row in _best_median_worst(rows):
         parts.append(_comparison(source, folder, kind, row, other.get(row.text("name"), Record({}))))
+    parts.append(_least_solid(source, folder, rows))
     sheet = source.picture(f"{folder}/contact_sheet.png")
     parts.append(figure(sheet, "All test views (or an even choice of them).", "contact sheet of the test views", True))
     parts.append(details(f"All {len(rows)} test views in numbers", _views_table(rows, other)))
@@ -117,6 +127,20 @@ def _comparison(source: Source, folder: str, kind: str, row: Record, coarse: Rec
     return figure(picture, f"{caption}.", f"photograph, render and error of {name}", True)
 
 
+def _least_solid(source: Source, folder: str, rows: list[Record]) -> Html:
+    """Alpha of the view with the lowest share of opaque pixels: where ground is half transparent, it is grey."""
+    known = [(solid, row) for row in rows if (solid := row.number("solid_share")) is not None and row.text("alpha")]
+    if not known:
+        return Html("")
+    solid, row = min(known, key=lambda each: each[0])
+    name, stem = row.text("name") or "unnamed", PurePosixPath(row.text("alpha") or "").stem
+    caption = (
+        f"Least solid: alpha of {name}, white is opaque. Of its pixels that at least 3 training cameras see, "
+        f"{share(solid)} have alpha of at least 0.95."
+    )
+    return figure(source.picture(f"{folder}/alpha/{stem}.png"), caption, f"alpha of {name}")
+
+
 def _views_table(rows: list[Record], other: dict[str | None, Record]) -> Html:
     lines = []
     for row in rows[:MOST_VIEWS]:
@@ -124,9 +148,10 @@ def _views_table(rows: list[Record], other: dict[str | None, Record]) -> Html:
         lines.append(
             [row.text("name") or ABSENT, figure_of(row.number("mean_visibility"), "{:.2f}"), decibels(before),
              decibels(row.number("psnr")), gain(row.number("psnr"), before), decibels(row.number("psnr_cc")),
-             similarity(row.number("ssim")), similarity(row.number("lpips_vgg"))]
+             similarity(row.number("ssim")), similarity(row.number("lpips_vgg")), share(row.number("solid_share")),
+             count(row.number("largest_splats"))]
         )  # fmt: skip
-    head = ["view", "mean V", "PSNR coarse", "PSNR", "Δ", "PSNR cc", "SSIM", "LPIPS vgg"]
+    head = ["view", "mean V", "PSNR coarse", "PSNR", "Δ", "PSNR cc", "SSIM", "LPIPS vgg", "solid", "large splats"]
     caption = f"The first {MOST_VIEWS} of {len(rows)}" if len(rows) > MOST_VIEWS else ""
     return table(head, lines, caption)
 

@@ -71,7 +71,8 @@ class RenderRequest:
     width: int = 0
     """Image width; 0 takes that of the training views."""
     kind: Literal["image", "depth", "visibility"] = "image"
-    """What to draw: the picture, expected depth, or the number of cameras that see each place."""
+    """What to draw: the picture; the median depth, at which a pixel becomes half opaque (black where it never does); or
+    the number of cameras that see each place."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
     threads: int = 0

@@ -51,6 +51,14 @@ class Truth:
         stored = _read(self._file("views", name), ("depth", "visibility"))
         return np.where(stored["depth"] == 0, np.nan, stored["visibility"]).astype(np.float32)
 
+    def depth_map(self, view: View) -> Float[np.ndarray, "h w"]:
+        """The true depth in metres at the size at which the view is used (nearest pixel); inf for sky."""
+        return self._at_size(self.depth(view.name), view.camera)
+
+    def knows_depth(self, view: View) -> bool:
+        """Whether this photograph's depth was written."""
+        return any(self._file(kind, view.name).is_file() for kind in ("views", "depth"))
+
     def visibility_map(self, view: View) -> Float[np.ndarray, "h w"]:
         """The true visibility at the size at which the view is used (nearest pixel)."""
         return self._at_size(self.visibility(view.name), view.camera)
@@ -77,10 +85,15 @@ class Truth:
         return self.folder / kind / f"{Path(name).stem}.npz"
 
 
+def has_truth(capture_root: Path) -> bool:
+    """Whether a capture was generated and written with its truth."""
+    return (Path(capture_root) / _FOLDER / "views").is_dir()
+
+
 def load_truth(capture_root: Path) -> Truth:
     """The truth of a generated capture. Raises VdgsError if it was written without."""
     folder = Path(capture_root) / _FOLDER
-    if not (folder / "views").is_dir():
+    if not has_truth(capture_root):
         raise VdgsError(f"{folder}: no truth here. Only generated captures have it: vdgs synth OUTPUT --truth.")
     return Truth(folder)
 

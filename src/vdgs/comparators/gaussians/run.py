@@ -30,6 +30,7 @@ from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
 from vdgs.captures.checks import check_images
 from vdgs.captures.facts import capture_facts, refuse_another_capture
+from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
 from vdgs.comparators.gaussians.model import GaussiansModel
 from vdgs.comparators.gaussians.spherical_harmonics import MAX_DEGREE
@@ -38,7 +39,7 @@ from vdgs.comparators.gaussians.watching import continue_or_start, finish, train
 from vdgs.errors import RunError, VdgsError
 from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import load_lpips
-from vdgs.evaluation.of_run import cached_photographs
+from vdgs.evaluation.of_run import cached_photographs, true_depth
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.settings.plain import differences, to_dict
 from vdgs.settings.watching import WatchOptions
@@ -132,7 +133,15 @@ def evaluate_gaussians(
     """
     refuse_another_capture(output, model.facts.get("capture", {}), capture)
     lpips, note = load_lpips(lpips_weights)
-    measured = MeasuredModel(model.render, visibility_map, _facts(trained))
+    measured = MeasuredModel(
+        model.render,
+        visibility_map,
+        _facts(trained),
+        background=model.background,
+        true_depth=true_depth(capture, capture.test_views),
+        render_depth=lambda camera: model.render(camera, depth=True),
+        camera_height=camera_height(capture),
+    )
     with cached_photographs(capture.test_views) as photographs:
         result = evaluate(
             photographs, measured, output, lpips=lpips, lpips_note=note, settings=settings, console=console

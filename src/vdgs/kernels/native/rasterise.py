@@ -29,8 +29,9 @@ def rasterise(
     """Blend splats front to back (3DGS, eqs. 2-3), differentiable in their five tensors and the background.
 
     All are float32 on the CPU. `depth` asks for the expected depth, the sum of w_i depth_i, neither
-    divided by alpha nor given a background; without it the picture costs nothing extra. Thresholds as in
-    vdgs.kernels.constants. `module` is the build of the kernels to use (default: the one of this process).
+    divided by alpha nor given a background, and for the median depth, which is not differentiable; without
+    it the picture costs nothing extra. Thresholds as in vdgs.kernels.constants. `module` is the build of the
+    kernels to use (default: the one of this process).
 
     A splat whose row holds NaN or infinity, or whose conic is not positive definite, is not drawn and
     its gradient is zero. The result has the same bits for any number of threads.
@@ -63,9 +64,8 @@ def _draw(
     """The picture of means_px, conics, colours, opacities, depths before a background, and the way back."""
     _check(tensors, width, height)
     module = module or native_module.native()
-    raster = Raster(
-        torch.empty(height, width, 3), torch.empty(height, width), torch.empty(height, width) if depth else None
-    )
+    depths = (torch.empty(height, width), torch.empty(height, width)) if depth else (None, None)
+    raster = Raster(torch.empty(height, width, 3), torch.empty(height, width), *depths)
     behind = tuple(tensors[5].tolist())
     frame = module.rasterise_forward(
         *(t.detach().contiguous().numpy() for t in tensors[:5]), behind, width, height,
@@ -108,13 +108,16 @@ class _Rasterise(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, width: int, height: int, with_depth: bool, module: Any, *tensors: Tensor) -> Raster:
         raster, ctx.pullback = _draw(tensors, width, height, with_depth, module)
+        if raster.median_depth is not None:
+            ctx.mark_non_differentiable(raster.median_depth)
         ctx.set_materialize_grads(False)
         return raster
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *picture_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        return None, None, None, None, *ctx.pullback(*picture_gradients)
+        image, alpha, depth, _ = picture_gradients
+        return None, None, None, None, *ctx.pullback(image, alpha, depth)
 
 
 def _tensors(splats: Splats) -> tuple[Tensor, ...]:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vdgs.kernels.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from vdgs.kernels.constants import ALPHA_MAX, ALPHA_MIN, MEDIAN_TRANSMITTANCE, TRANSMITTANCE_MIN
 from vdgs.kernels.types import Raster, RasterGradients, RasterPullback, Splats
 
 
@@ -38,8 +38,10 @@ def rasterise(
     weights = alpha * transmittance[:-1]
     through = transmittance[-1]
     image = torch.einsum("mhw,mc->hwc", weights, colours) + through[..., None] * background
-    expected_depth = torch.einsum("mhw,m->hw", weights, depths) if depth else None
-    return Raster(image, 1 - through, expected_depth)
+    if not depth:
+        return Raster(image, 1 - through, None)
+    expected_depth = torch.einsum("mhw,m->hw", weights, depths)
+    return Raster(image, 1 - through, expected_depth, _median_depth(transmittance, depths))
 
 
 def rasterise_vjp(
@@ -75,8 +77,18 @@ def rasterise_vjp(
         of_depths = None if drawn.depth is None else found[4]
         return RasterGradients(means, conics, found[2], found[3], of_depths, found[5])
 
-    shown = Raster(drawn.image.detach(), drawn.alpha.detach(), None if drawn.depth is None else drawn.depth.detach())
-    return shown, pullback
+    shown_depth = None if drawn.depth is None else drawn.depth.detach()
+    return Raster(drawn.image.detach(), drawn.alpha.detach(), shown_depth, drawn.median_depth), pullback
+
+
+@torch.no_grad()
+def _median_depth(transmittance: Float[Tensor, "m_and_one h w"], depths: Float[Tensor, "m"]) -> Float[Tensor, "h w"]:
+    """Depth of the splat at which transmittance, which never grows, falls below one half; 0 where it does not.
+
+    `transmittance` is that before each splat, and behind the last.
+    """
+    crossing = (transmittance[:-1] >= MEDIAN_TRANSMITTANCE) & (transmittance[1:] < MEDIAN_TRANSMITTANCE)
+    return torch.einsum("mhw,m->hw", crossing.to(depths.dtype), depths)
 
 
 def _alphas(

@@ -1,0 +1,85 @@
+"""How far a model's depth is from the truth, where there is one: generated captures that were written with it.
+
+Errors are in camera heights above ground, so that they mean the same for every flight. A pixel that is not drawn has no
+depth: its error is infinite, and it counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from vdgs.evaluation.by_block import DRAWN_ALPHA
+from vdgs.evaluation.by_visibility import KEYS, key_of, value_of
+from vdgs.kernels.types import Raster
+
+#: Errors up to this share of the camera height count as within one percent.
+NEAR = 0.01
+#: Two depths of a pixel: the mean over what is blended, and where it becomes half opaque.
+KINDS = ("expected", "median")
+#: What is reported of each kind.
+NAMES = tuple(f"{name}_{kind}" for kind in KINDS for name in ("depth_error_median", "depth_within_1_percent"))
+
+
+class DepthErrors:
+    """Errors of pixels, of any number of views: counted in a histogram, so that memory does not grow with them."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(KEYS, np.int64)
+        self._near = 0
+
+    def add(self, errors: Float[np.ndarray, " n"]) -> None:
+        """Count errors: shares of the camera height, or infinity."""
+        self._counts += np.bincount(key_of(errors), minlength=KEYS)
+        self._near += int(np.count_nonzero(errors <= NEAR))
+
+    @property
+    def count(self) -> int:
+        return int(self._counts.sum())
+
+    def median(self) -> float | None:
+        """To 1 in 2,000; of two in the middle the smaller. Infinite if more than half are; None without any."""
+        if not self.count:
+            return None
+        middle = np.searchsorted(np.cumsum(self._counts), (self.count + 1) // 2)
+        return float(value_of(np.array([middle]))[0])
+
+    def share_near(self) -> float | None:
+        """Of the errors, how many are at most NEAR; exact."""
+        return self._near / self.count if self.count else None
+
+
+def errors_of_view(
+    drawn: Raster,
+    truth: Float[np.ndarray, "h w"],
+    seen: Bool[np.ndarray, "h w"],
+    camera_height: float,
+) -> dict[str, Float[np.ndarray, " n"]]:
+    """|depth - truth| / camera height at the seen pixels of which the truth is known (not of the sky), by kind.
+
+    `truth` is the depth along the camera's axis, in the units of the model like `camera_height` (> 0), infinite for
+    sky. `drawn` comes with depth; a kind that the renderer does not know is left out.
+    """
+    counted = seen & np.isfinite(truth)
+    alpha = drawn.alpha.double().cpu().numpy()[counted]
+    shown = alpha > DRAWN_ALPHA
+    found = {}
+    for kind, depth in zip(KINDS, (drawn.depth, drawn.median_depth), strict=True):
+        if depth is None:
+            continue
+        depths = depth.double().cpu().numpy()[counted]
+        if kind == "expected":
+            depths = depths / np.where(shown, alpha, 1.0)
+        found[kind] = np.where(shown, np.abs(depths - truth[counted]) / camera_height, np.inf)
+    return found
+
+
+def figures_of(errors: Mapping[str, DepthErrors]) -> dict[str, float | None]:
+    """What is reported, under NAMES; None of a kind that is not there."""
+    figures: dict[str, float | None] = dict.fromkeys(NAMES)
+    for kind, each in errors.items():
+        figures[f"depth_error_median_{kind}"] = each.median()
+        figures[f"depth_within_1_percent_{kind}"] = each.share_near()
+    return figures
