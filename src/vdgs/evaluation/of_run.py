@@ -21,8 +21,10 @@ from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFac
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.ground import at_size, known_cells
 from vdgs.model.render import decode_view, render, render_values
 from vdgs.runs.folder import RunFolder
+from vdgs.runs.ground import ground_of
 from vdgs.runs.opening import TrainedRun
 from vdgs.runs.visibility import visibility_of_run
 from vdgs.synth.truth import has_truth, load_truth
@@ -35,18 +37,9 @@ Views = Literal["test", "training"]
 
 
 def evaluate_run(
-    run: TrainedRun,
-    lpips_weights: Path | None,
-    bins: int,
-    console: Console,
-    views: Views = "test",
-    ground_map: Callable[[Camera], Bool[np.ndarray, "h w"]] | None = None,
+    run: TrainedRun, lpips_weights: Path | None, bins: int, console: Console, views: Views = "test"
 ) -> None:
-    """Measure a model of a run and print a table. Writes `evaluation_folder`.
-
-    `ground_map` says where photographs show ground in a view: pixels there that the coarse model leaves open count as
-    seen. Without it they do not count, and `solid_share` says nothing about them.
-    """
+    """Measure a model of a run and print a table. Writes `evaluation_folder`."""
     if bins < 1:
         raise RunError(f"--bins is {bins}; it must be at least 1")
     output = evaluation_folder(run.folder, run.name, views)
@@ -64,7 +57,7 @@ def evaluate_run(
         visibility_map(run),
         facts,
         background=run.model.background,
-        ground_map=ground_map,
+        ground_map=ground_map(run),
         true_depth=true_depth(run.capture, chosen),
         render_depth=lambda camera: render(run.model, camera, depth=True),
         camera_height=camera_height(run.capture),
@@ -110,6 +103,13 @@ def visibility_map(run: TrainedRun) -> Callable[[Camera], np.ndarray]:
         coarse = replace(run, model=model, name="coarse")
     visibility = visibility_of_run(coarse).float()
     return lambda camera: render_values(coarse.model, visibility, camera).cpu().numpy()
+
+
+def ground_map(run: TrainedRun) -> Callable[[Camera], Bool[np.ndarray, "h w"]]:
+    """Which pixels of a view show ground that at least three training cameras see, by the places where anchors start:
+    what the coarse model leaves open there counts as seen."""
+    ground = ground_of(run.capture, run.folder.method().training.anchors)
+    return lambda camera: at_size(known_cells(ground, camera), camera.width, camera.height).numpy()
 
 
 def true_depth(capture: Capture, views: Sequence[View]) -> Callable[[View], Float[np.ndarray, "h w"]] | None:
