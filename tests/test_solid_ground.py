@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,10 +18,11 @@ from checkerboard import Photographs
 from vdgs.cameras import NEAR, Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.frustum import project
-from vdgs.model.ground import CELLS, LEAST_VIEWS, at_size, ground_cells, known_ground
+from vdgs.model.ground import CELLS, UNKNOWN_WEIGHT, at_size, known_cells, opacity_wanted
 from vdgs.model.render import decode_view, render
 from vdgs.model.sizes import REACH, SPAN, largest_log_scales
-from vdgs.settings.method import BlockConfig, GrowthConfig, LossConfig
+from vdgs.runs.ground import ground_of
+from vdgs.settings.method import AnchorConfig, BlockConfig, GrowthConfig, LossConfig
 from vdgs.training import Stage, train
 from vdgs.training.target import Target
 
@@ -66,53 +69,60 @@ LEVEL = camera_at(height=0.0, tilt=math.pi / 2)
 UPPER = slice(0, HEIGHT // 2)
 
 
-def shown(points: torch.Tensor, camera: Camera) -> np.ndarray:
-    return at_size(ground_cells(points, camera), WIDTH, HEIGHT).numpy()
+def wanted(points: torch.Tensor, camera: Camera) -> np.ndarray:
+    return at_size(opacity_wanted(points, camera), WIDTH, HEIGHT).numpy()
 
 
 @settings(max_examples=20)
 @given(tilt=st.floats(-0.4, 0.4))
 def test_below_the_horizon_there_is_no_sky(tilt):
-    """Whatever is known of the place: water and woods hold no sparse points."""
-    assert shown(torch.zeros(0, 3), camera_at(tilt=tilt)).all()
+    """Water and woods may hold no sparse points: less is asked there, but something."""
+    assert (wanted(torch.zeros(0, 3), camera_at(tilt=tilt)) == UNKNOWN_WEIGHT).all()
+    assert (wanted(plain(), camera_at(tilt=tilt)) == 1).all()
 
 
 def test_sky_is_left_alone():
-    nothing, ground = torch.zeros(0, 3), plain(step=0.1)
     for camera in (camera_at(tilt=1.5), camera_at(tilt=1.3)):
         horizon = camera.project(np.array([[0.0, 1e6, 0.0]]))[0][0, 1]
         cell, limit = WIDTH / CELLS, FOCAL * 2 * math.tan(math.radians(5.0))
         below, above = np.arange(HEIGHT) > horizon + cell + limit, np.arange(HEIGHT) < horizon
-        for points in (nothing, ground):
-            assert shown(points, camera)[below].all()
-            assert not shown(points, camera)[above].any()
+        for points in (torch.zeros(0, 3), plain(step=0.1)):
+            assert (wanted(points, camera)[below] > 0).all()
+            assert not wanted(points, camera)[above].any()
 
 
 def test_what_stands_above_the_horizon_is_solid_but_for_its_border():
     top = 6.0
-    picture = shown(wall(high=top), LEVEL)
+    picture = wanted(wall(high=top), LEVEL)
     edge, cell = HEIGHT / 2 - FOCAL * top / 20.0, WIDTH / CELLS
     assert not picture[: math.floor(edge)].any()
-    assert picture[math.ceil(edge + 2 * cell) : HEIGHT // 2 - 1].all()
+    assert (picture[math.ceil(edge + 2 * cell) : HEIGHT // 2 - 1] == 1).all()
 
 
-def test_a_hole_that_known_ground_encloses_is_solid_and_one_that_it_does_not_is_none():
+def test_a_hole_that_known_ground_encloses_is_known_and_one_that_it_does_not_is_none():
     points = wall()
     window = (points[:, [0, 2]] - torch.tensor([0.0, 8.0])).norm(dim=1) > 4
-    assert shown(points[window], LEVEL)[UPPER].all()
-    half = shown(points[points[:, 0] < 0], LEVEL)[UPPER]
+    assert (wanted(points[window], LEVEL)[UPPER] == 1).all()
+    half = wanted(points[points[:, 0] < 0], LEVEL)[UPPER]
     edge = WIDTH / CELLS
-    assert half[:, : int(WIDTH / 2 - 2 * edge)].all()
+    assert (half[:, : int(WIDTH / 2 - 2 * edge)] == 1).all()
     assert not half[: HEIGHT // 4, WIDTH // 2 :].any()
 
 
-def test_ground_that_too_few_cameras_see_is_not_known():
-    points = plain()
+@pytest.mark.parametrize("least_views", [1, 3])
+def test_ground_that_too_few_cameras_see_is_not_known(least_views):
     cameras = [camera_at(x) for x in (-20.0, 0.0, 20.0, 30.0)]
-    known = known_ground(points, cameras)
-    times = sum(torch.from_numpy(camera.sees(known.double().numpy())).int() for camera in cameras)
+    points = plain(2.0).double().numpy()
+    views = [SimpleNamespace(camera=camera) for camera in cameras]
+    capture: Any = SimpleNamespace(points=points, point_colours=np.zeros(points.shape, np.uint8), train_views=views)
+    known = ground_of(capture, AnchorConfig(voxel=2.0), least_views).double().numpy()
+    times = sum(camera.sees(known).astype(int) for camera in cameras)
     assert 0 < len(known) < len(points)
-    assert int(times.min()) == LEAST_VIEWS
+    assert times.min() == least_views
+
+
+def test_no_ground_at_all_is_not_known():
+    assert not known_cells(torch.zeros(0, 3), camera_at()).any()
 
 
 # ------------------------------------------------------------------------------------------ the term of the loss
@@ -128,19 +138,19 @@ def test_the_gradient_of_transparency_is_that_of_finite_differences(masked):
     generator = torch.Generator().manual_seed(0)
     alpha = torch.rand(5, 7, generator=generator, dtype=torch.float64)
     mask = (torch.rand(5, 7, generator=generator) > 0.3).to(torch.uint8) if masked else None
-    ground = torch.rand(5, 7, generator=generator) > 0.3
-    wanted = target(ground if mask is None else ground & (mask > 0), mask)
-    _, gradient = wanted.transparency(alpha, 0.3)
+    ground = torch.rand(5, 7, generator=generator, dtype=torch.float64).round(decimals=1)
+    term = target(ground if mask is None else ground * (mask > 0), mask)
+    _, gradient = term.transparency(alpha, 0.3)
     for pixel in np.ndindex(5, 7):
         step = torch.zeros_like(alpha)
         step[pixel] = 1e-6
-        above, below = (wanted.transparency(alpha + sign * step, 0.3)[0] for sign in (1, -1))
+        above, below = (term.transparency(alpha + sign * step, 0.3)[0] for sign in (1, -1))
         assert float(gradient[pixel]) == pytest.approx(float(above - below) / 2e-6, rel=1e-5, abs=1e-12)
 
 
 def test_opaque_ground_costs_nothing_and_what_is_no_ground_neither():
-    ground = torch.zeros(4, 6, dtype=torch.bool)
-    ground[:, :3] = True
+    ground = torch.zeros(4, 6)
+    ground[:, :3] = 1.0
     opaque, clear = torch.ones(4, 6), torch.ones(4, 6)
     clear[:, 3:] = 0.0
     assert float(target(ground).transparency(opaque, 0.5)[0]) == pytest.approx(0.0, abs=1e-7)
@@ -154,8 +164,7 @@ def test_opaque_ground_costs_nothing_and_what_is_no_ground_neither():
 def trained(loss: LossConfig, background: tuple[float, float, float] = (0.5, 0.5, 0.5)) -> AnchorModel:
     stage, state = block_stage(BlockConfig())
     config = replace(stage.config, iterations=300, loss=loss, growth=GrowthConfig(levels=0, start=10_000))
-    cells = ground_cells(plain(0.1, 6.0), Photographs().camera(0))
-    ground = [torch.ones_like(cells)] * 8
+    ground = [torch.ones(24, 32)] * 8
     stage = replace(stage, config=config, background=background, surroundings=None, ground=ground)
     train(state, stage, stop=lambda: False, after_step=lambda *_: None)
     return AnchorModel(*state.result(), stage.voxel, background, {})

@@ -20,6 +20,7 @@ from vdgs.errors import RunError
 from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.reference_views import ReferenceViews
+from vdgs.evaluation.solidity import SEEN_BY
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.ground import at_size, known_cells
 from vdgs.model.render import decode_view, render, render_values
@@ -106,9 +107,9 @@ def visibility_map(run: TrainedRun) -> Callable[[Camera], np.ndarray]:
 
 
 def ground_map(run: TrainedRun) -> Callable[[Camera], Bool[np.ndarray, "h w"]]:
-    """Which pixels of a view show ground that at least three training cameras see, by the places where anchors start:
+    """Which pixels of a view show ground that enough training cameras see, by the places where anchors start:
     what the coarse model leaves open there counts as seen."""
-    ground = ground_of(run.capture, run.folder.method().training.anchors)
+    ground = ground_of(run.capture, run.folder.method().training.anchors, SEEN_BY)
     return lambda camera: at_size(known_cells(ground, camera), camera.width, camera.height).numpy()
 
 

@@ -6,13 +6,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.captures.capture import Capture
-from vdgs.model.ground import known_ground
 from vdgs.model.start import initial_anchors
+from vdgs.model.visibility import visibility_of
 from vdgs.settings.method import AnchorConfig
 
 
-def ground_of(capture: Capture, config: AnchorConfig) -> Float[Tensor, "g 3"]:
-    """The places where anchors start and that enough training cameras see (`model.ground`)."""
+def ground_of(capture: Capture, config: AnchorConfig, least_views: int = 1) -> Float[Tensor, "g 3"]:
+    """The places where anchors start and that at least so many training cameras hold (`model.ground`)."""
     cameras = [view.camera for view in capture.train_views]
     anchors, _ = initial_anchors(capture.points, capture.point_colours, cameras, config)
-    return known_ground(anchors.positions, cameras)
+    return anchors.positions[visibility_of(anchors.positions, cameras) >= least_views]

@@ -14,7 +14,7 @@ from vdgs.captures.images import ImageCache
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.ground import ground_cells, known_ground
+from vdgs.model.ground import opacity_wanted
 from vdgs.model.sizes import largest_log_scales
 from vdgs.model.start import initial_anchors
 from vdgs.runs.folder import RunFolder
@@ -58,7 +58,7 @@ def _train(
     # The voxel follows from the capture: recomputed when a run continues.
     cameras = [view.camera for view in views]
     anchors, voxel = initial_anchors(capture.points, capture.point_colours, cameras, config.anchors)
-    ground = known_ground(anchors.positions.to(device), cameras)
+    ground = anchors.positions.to(device)
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
     with ImageCache(views, image_budget(options), downscales=factors) as images:
         background = (0.0, 0.0, 0.0)
@@ -67,7 +67,7 @@ def _train(
         stage = Stage(
             config, images, len(views), voxel, camera_height(capture), background=background,
             shares=shares_for(config, anchors, cameras), device=device,
-            ground=[ground_cells(ground, camera) for camera in cameras],
+            ground=[opacity_wanted(ground, camera) for camera in cameras],
             largest=lambda positions: largest_log_scales(positions, cameras),
         )  # fmt: skip
         state = continue_or_start(folder, stage, lambda: _start(anchors, stage), console)

@@ -131,7 +131,7 @@ class Stage:
     frozen_decoder: bool = False
     #: The largest log-scale of Gaussians of anchors at places [p, 3]; None: any.
     largest: Callable[[Tensor], Tensor] | None = None
-    #: Which cells of each view's picture show ground (`model.ground`), where the scene must be opaque; None: nowhere.
+    #: How strongly each cell of each view's picture must be opaque (`model.ground`); None: not at all.
     ground: Sequence[Tensor] | None = None
     #: What is drawn and never moves: ring and context of a block.
     surroundings: Surroundings | None = None
