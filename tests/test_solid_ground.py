@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from block_support import block_stage
 from checkerboard import Photographs
 from vdgs.cameras import NEAR, Camera
+from vdgs.captures.capture import Capture, View
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.frustum import project
 from vdgs.model.ground import CELLS, UNKNOWN_WEIGHT, at_size, known_cells, opacity_wanted
@@ -113,8 +114,9 @@ def test_a_hole_that_known_ground_encloses_is_known_and_one_that_it_does_not_is_
 def test_ground_that_too_few_cameras_see_is_not_known(least_views):
     cameras = [camera_at(x) for x in (-20.0, 0.0, 20.0, 30.0)]
     points = plain(2.0).double().numpy()
-    views = [SimpleNamespace(camera=camera) for camera in cameras]
-    capture: Any = SimpleNamespace(points=points, point_colours=np.zeros(points.shape, np.uint8), train_views=views)
+    views = tuple(View(f"{i}.png", camera, Path(f"{i}.png"), None, "train") for i, camera in enumerate(cameras))
+    frame: Any = None  # asked by nobody
+    capture = Capture(Path(), "colmap", "images", views, points, np.zeros(points.shape, np.uint8), frame)
     known = ground_of(capture, AnchorConfig(voxel=2.0), least_views).double().numpy()
     times = sum(camera.sees(known).astype(int) for camera in cameras)
     assert 0 < len(known) < len(points)
