@@ -19,9 +19,10 @@ from vdgs.cameras import Camera
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.model.frustum import project
 
-#: Length of a Gaussian over the longer side of the picture, at most. The decoder makes the scales of an anchor about
-#: three times smaller, so that few Gaussians come near it (choice: bounds of a half and a quarter cost detail).
-SPAN = 1.0
+#: Length of a Gaussian over the longer side of the picture, at most (choice: a Gaussian may lie nearer to a camera than
+#: its anchor, and a view nearer than all cameras. With larger bounds, views of a town held some that were larger than
+#: the picture: docs/findings.md).
+SPAN = 0.25
 #: From the middle of a Gaussian of opacity 1 to where it is no longer drawn, in standard deviations.
 REACH = math.sqrt(-2.0 * math.log(ALPHA_MIN))
 
