@@ -92,7 +92,7 @@ def one_step(
         return torch.autograd.grad(photometric.loss, view.image)[0]
 
     image_gradient = timed(times, "loss", loss)
-    whole = Target(target, None, torch.ones(target.shape[:2]), camera)
+    whole = Target(target, None, torch.ones(target.shape[:2], dtype=torch.bool), camera)
     _, alpha_gradient = timed(times, "solid", lambda: whole.transparency(view.alpha, 0.02))
     gradients = timed(times, "backward", lambda: view.backward(image_gradient, alpha_gradient, 0.01))
 

@@ -19,7 +19,7 @@ from vdgs.cameras import NEAR, Camera
 from vdgs.captures.capture import Capture, View
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.frustum import project
-from vdgs.model.ground import CELLS, UNKNOWN_WEIGHT, at_size, known_cells, opacity_wanted
+from vdgs.model.ground import CELLS, at_size, known_cells, solid_cells
 from vdgs.model.render import decode_view, render
 from vdgs.model.sizes import REACH, SPAN, largest_log_scales
 from vdgs.runs.ground import ground_of
@@ -71,15 +71,14 @@ UPPER = slice(0, HEIGHT // 2)
 
 
 def wanted(points: torch.Tensor, camera: Camera) -> np.ndarray:
-    return at_size(opacity_wanted(points, camera), WIDTH, HEIGHT).numpy()
+    return at_size(solid_cells(points, camera), WIDTH, HEIGHT).numpy()
 
 
 @settings(max_examples=20)
 @given(tilt=st.floats(-0.4, 0.4))
 def test_below_the_horizon_there_is_no_sky(tilt):
-    """Water and woods may hold no sparse points: less is asked there, but something."""
-    assert (wanted(torch.zeros(0, 3), camera_at(tilt=tilt)) == UNKNOWN_WEIGHT).all()
-    assert (wanted(plain(), camera_at(tilt=tilt)) == 1).all()
+    """Whatever is known of the place: water and woods may hold no sparse points."""
+    assert wanted(torch.zeros(0, 3), camera_at(tilt=tilt)).all()
 
 
 def test_sky_is_left_alone():
@@ -88,7 +87,7 @@ def test_sky_is_left_alone():
         cell, limit = WIDTH / CELLS, FOCAL * 2 * math.tan(math.radians(5.0))
         below, above = np.arange(HEIGHT) > horizon + cell + limit, np.arange(HEIGHT) < horizon
         for points in (torch.zeros(0, 3), plain(step=0.1)):
-            assert (wanted(points, camera)[below] > 0).all()
+            assert wanted(points, camera)[below].all()
             assert not wanted(points, camera)[above].any()
 
 
@@ -97,16 +96,16 @@ def test_what_stands_above_the_horizon_is_solid_but_for_its_border():
     picture = wanted(wall(high=top), LEVEL)
     edge, cell = HEIGHT / 2 - FOCAL * top / 20.0, WIDTH / CELLS
     assert not picture[: math.floor(edge)].any()
-    assert (picture[math.ceil(edge + 2 * cell) : HEIGHT // 2 - 1] == 1).all()
+    assert picture[math.ceil(edge + 2 * cell) : HEIGHT // 2 - 1].all()
 
 
 def test_a_hole_that_known_ground_encloses_is_known_and_one_that_it_does_not_is_none():
     points = wall()
     window = (points[:, [0, 2]] - torch.tensor([0.0, 8.0])).norm(dim=1) > 4
-    assert (wanted(points[window], LEVEL)[UPPER] == 1).all()
+    assert wanted(points[window], LEVEL)[UPPER].all()
     half = wanted(points[points[:, 0] < 0], LEVEL)[UPPER]
     edge = WIDTH / CELLS
-    assert (half[:, : int(WIDTH / 2 - 2 * edge)] == 1).all()
+    assert half[:, : int(WIDTH / 2 - 2 * edge)].all()
     assert not half[: HEIGHT // 4, WIDTH // 2 :].any()
 
 
@@ -140,8 +139,8 @@ def test_the_gradient_of_transparency_is_that_of_finite_differences(masked):
     generator = torch.Generator().manual_seed(0)
     alpha = torch.rand(5, 7, generator=generator, dtype=torch.float64)
     mask = (torch.rand(5, 7, generator=generator) > 0.3).to(torch.uint8) if masked else None
-    ground = torch.rand(5, 7, generator=generator, dtype=torch.float64).round(decimals=1)
-    term = target(ground if mask is None else ground * (mask > 0), mask)
+    ground = torch.rand(5, 7, generator=generator) > 0.3
+    term = target(ground if mask is None else ground & (mask > 0), mask)
     _, gradient = term.transparency(alpha, 0.3)
     for pixel in np.ndindex(5, 7):
         step = torch.zeros_like(alpha)
@@ -151,8 +150,8 @@ def test_the_gradient_of_transparency_is_that_of_finite_differences(masked):
 
 
 def test_opaque_ground_costs_nothing_and_what_is_no_ground_neither():
-    ground = torch.zeros(4, 6)
-    ground[:, :3] = 1.0
+    ground = torch.zeros(4, 6, dtype=torch.bool)
+    ground[:, :3] = True
     opaque, clear = torch.ones(4, 6), torch.ones(4, 6)
     clear[:, 3:] = 0.0
     assert float(target(ground).transparency(opaque, 0.5)[0]) == pytest.approx(0.0, abs=1e-7)
@@ -166,7 +165,7 @@ def test_opaque_ground_costs_nothing_and_what_is_no_ground_neither():
 def trained(loss: LossConfig, background: tuple[float, float, float] = (0.5, 0.5, 0.5)) -> AnchorModel:
     stage, state = block_stage(BlockConfig())
     config = replace(stage.config, iterations=300, loss=loss, growth=GrowthConfig(levels=0, start=10_000))
-    ground = [torch.ones(24, 32)] * 8
+    ground = [torch.ones(24, 32, dtype=torch.bool)] * 8
     stage = replace(stage, config=config, background=background, surroundings=None, ground=ground)
     train(state, stage, stop=lambda: False, after_step=lambda *_: None)
     return AnchorModel(*state.result(), stage.voxel, background, {})

@@ -3,23 +3,20 @@
 Ground is known by the places where anchors start: sparse points, and what fills the gaps between them. A picture is
 cut into cells, and a cell shows known ground where at least one such place falls into it. Nothing is hidden behind
 anything else: what hides such a place from a camera is as solid as the place. What else lies below the horizon is
-ground too, for there is no sky; but nobody knows where in space it is.
+ground too, for there is no sky.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float
 from scipy.ndimage import binary_closing, binary_erosion, binary_fill_holes
 from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.model.frustum import project
 
-#: Weight of what lies below the horizon where no known ground is (choice: asked as strongly as known ground, anchors at
-#: the border of a scene spread over what no photograph fixes, and what is known suffers).
-UNKNOWN_WEIGHT = 0.25
 #: Rays that lead down by at least this much, in degrees, end on the ground (choice: as far as the vertical of a capture
 #: without GPS may be wrong).
 BELOW_HORIZON_DEG = 5.0
@@ -27,12 +24,11 @@ BELOW_HORIZON_DEG = 5.0
 CELLS = 32
 
 
-def opacity_wanted(ground: Float[Tensor, "g 3"], camera: Camera) -> Float[Tensor, "rows columns"]:
-    """How strongly each cell of a camera's picture must be opaque: 1 where it shows ground of the given places,
-    `UNKNOWN_WEIGHT` elsewhere below the horizon, 0 in the sky."""
+def solid_cells(ground: Float[Tensor, "g 3"], camera: Camera) -> Bool[Tensor, "rows columns"]:
+    """Which cells of a camera's picture must be opaque: those that show ground of the given places, and all that lie
+    below the horizon."""
     known = known_cells(ground, camera)
-    below = torch.from_numpy(_below_horizon(camera, *known.shape)).to(known.device)
-    return torch.maximum(known.float(), UNKNOWN_WEIGHT * below.float())
+    return known | torch.from_numpy(_below_horizon(camera, *known.shape)).to(known.device)
 
 
 def known_cells(ground: Float[Tensor, "g 3"], camera: Camera) -> Bool[Tensor, "rows columns"]:
@@ -64,7 +60,7 @@ def _below_horizon(camera: Camera, rows: int, columns: int) -> Bool[np.ndarray, 
     return up < -np.sin(np.radians(BELOW_HORIZON_DEG))
 
 
-def at_size(cells: Shaped[Tensor, "rows columns"], width: int, height: int) -> Shaped[Tensor, "height width"]:
+def at_size(cells: Bool[Tensor, "rows columns"], width: int, height: int) -> Bool[Tensor, "height width"]:
     """The cell of every pixel of a picture."""
     row, column = (
         ((torch.arange(pixels, device=cells.device) + 0.5) * (count / pixels)).long()

@@ -117,9 +117,9 @@ class LossConfig:
     volume_weight: float = 0.01
     """Weight of the mean product of the three scales of the Gaussians that are drawn."""
     alpha_weight: float = 0.02
-    """Weight of the root of 1 - alpha, averaged over a picture's pixels: in full where it shows known ground, a
-    quarter elsewhere below the horizon; the sky is left alone. Without it ground stays half transparent and borrows the
-    colour of the background (choice; the paper is silent on its background)."""
+    """Weight of the root of 1 - alpha, averaged over a picture's pixels: those below the horizon and those that show
+    known ground; the sky is left alone. Without it ground stays half transparent and borrows the colour of the
+    background (choice; the paper is silent on its background)."""
     background: Literal["mean", "black"] = "mean"
     """Colour behind the scene: the mean of the training photographs (choice: what no photograph shows is then drawn
     in a colour of the place), or black."""

@@ -14,7 +14,7 @@ from vdgs.captures.images import ImageCache
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.ground import opacity_wanted
+from vdgs.model.ground import solid_cells
 from vdgs.model.sizes import largest_log_scales
 from vdgs.model.start import initial_anchors
 from vdgs.runs.folder import RunFolder
@@ -67,7 +67,7 @@ def _train(
         stage = Stage(
             config, images, len(views), voxel, camera_height(capture), background=background,
             shares=shares_for(config, anchors, cameras), device=device,
-            ground=[opacity_wanted(ground, camera) for camera in cameras],
+            ground=[solid_cells(ground, camera) for camera in cameras],
             largest=lambda positions: largest_log_scales(positions, cameras),
         )  # fmt: skip
         state = continue_or_start(folder, stage, lambda: _start(anchors, stage), console)

@@ -131,7 +131,7 @@ class Stage:
     frozen_decoder: bool = False
     #: The largest log-scale of Gaussians of anchors at places [p, 3]; None: any.
     largest: Callable[[Tensor], Tensor] | None = None
-    #: How strongly each cell of each view's picture must be opaque (`model.ground`); None: not at all.
+    #: Which cells of each view's picture must be opaque (`model.ground`); None: none.
     ground: Sequence[Tensor] | None = None
     #: What is drawn and never moves: ring and context of a block.
     surroundings: Surroundings | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from vdgs.cameras import Camera
@@ -23,8 +23,8 @@ class Target:
     image: UInt8[Tensor, "h w 3"]
     #: 1 where a pixel counts; None: everywhere.
     mask: UInt8[Tensor, "h w"] | None
-    #: How strongly a pixel must be opaque (`model.ground`), 0 where it does not count; None: nothing is asked of alpha.
-    ground: Float[Tensor, "h w"] | None
+    #: Where it must be opaque (`model.ground`), among the pixels that count; None: nothing is asked of alpha.
+    ground: Bool[Tensor, "h w"] | None
     camera: Camera
     #: The share of the photograph's pixels that count in this part. Gradients are multiplied by it: those of a mean
     #: over the part become those of a mean over the whole picture, in which thresholds of growth are given (but for
@@ -32,8 +32,8 @@ class Target:
     share: float = 1.0
 
     def transparency(self, alpha: Float[Tensor, "h w"], weight: float) -> tuple[Tensor, Float[Tensor, "h w"]]:
-        """`weight` times the sum of `ground` √(1 - alpha), divided by how many pixels count at all; and its gradient by
-        alpha. Needs `ground`.
+        """`weight` times the sum of √(1 - alpha) over `ground`, divided by how many pixels count at all; and its
+        gradient by alpha. Needs `ground`.
 
         The background is a colour of the place, so a model can leave ground half transparent and borrow its colour:
         photographs alone do not object. Before any other background such a scene is a ghost, and its depth is wrong.
@@ -43,7 +43,7 @@ class Target:
         assert self.ground is not None
         counted = alpha.numel() if self.mask is None else max(int(self.mask.count_nonzero()), 1)
         root = (1.0 - alpha).clamp(min=0.0).add(NEARLY_OPAQUE).sqrt()
-        shown = self.ground * (weight / counted)
+        shown = self.ground.to(alpha.dtype) * (weight / counted)
         return (shown * (root - NEARLY_OPAQUE**0.5)).sum(), shown / (-2.0 * root)
 
 
@@ -66,8 +66,8 @@ def target_at(stage: Stage, view: int, downscale: int, iteration: int) -> Target
     return Target(image[inside], kept, ground, part, int(kept.count_nonzero()) / max(int(mask.count_nonzero()), 1))
 
 
-def _ground(stage: Stage, view: int, mask: Tensor | None, camera: Camera) -> Float[Tensor, "h w"] | None:
+def _ground(stage: Stage, view: int, mask: Tensor | None, camera: Camera) -> Bool[Tensor, "h w"] | None:
     if stage.ground is None or not stage.config.loss.alpha_weight:
         return None
     ground = at_size(stage.ground[view], camera.width, camera.height)
-    return ground if mask is None else ground * (mask > 0)
+    return ground if mask is None else ground & (mask > 0)
