@@ -77,7 +77,7 @@ def runs(tmp_path_factory) -> tuple[Path, Path, Path]:
 def test_both_sets_learn_the_place_alike(runs):
     native, twin, _ = runs
     for ours, theirs in zip(psnr(native), psnr(twin), strict=True):
-        assert ours > 13  # 12.0 for a plain grey picture
+        assert ours > 12.5  # 12.0 for a plain grey picture
         assert theirs == pytest.approx(ours, abs=0.6)
     before, after = (len(AnchorModel.load(twin / name / "model.safetensors").anchors) for name in ("coarse", "merged"))
     assert after != before  # blocks have trained and grown
