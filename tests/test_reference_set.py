@@ -21,7 +21,7 @@ from vdgs.runs.visibility import visibility_of_run
 
 #: As few and as small as lets anchors grow, blocks train and PSNR say something.
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "40", "--anchors.offsets", "2", "--anchors.voxel", "0.8",
+    "--preset", "laptop", "--iterations", "60", "--anchors.offsets", "2", "--anchors.voxel", "0.8",
     "--rates.features", "0.03", "0.03", "--growth.start", "10", "--growth.statistics-from", "0",
     "--growth.gate", "0.05", "--growth.interval", "10", "--growth.max-anchors", "200",
 )  # fmt: skip
@@ -77,7 +77,7 @@ def runs(tmp_path_factory) -> tuple[Path, Path, Path]:
 def test_both_sets_learn_the_place_alike(runs):
     native, twin, _ = runs
     for ours, theirs in zip(psnr(native), psnr(twin), strict=True):
-        assert ours > 12.5  # 12.0 for a plain grey picture
+        assert ours > 13  # 12.0 for a plain grey picture
         assert theirs == pytest.approx(ours, abs=0.6)
     before, after = (len(AnchorModel.load(twin / name / "model.safetensors").anchors) for name in ("coarse", "merged"))
     assert after != before  # blocks have trained and grown
