@@ -213,6 +213,10 @@ def test_what_no_camera_holds_is_bounded_by_the_nearest_and_nothing_without_came
     assert largest_log_scales(beside, []).tolist() == [math.inf]
 
 
+def test_an_anchor_in_the_centre_of_a_camera_has_a_size_that_can_be_trained():
+    assert largest_log_scales(torch.tensor([[0.0, 0.0, 20.0]]), [camera_at()]).isfinite().all()
+
+
 def test_training_leaves_no_gaussian_larger_than_its_bound():
     """Scales are driven up by a loss that wants them large; anchors that grow are bounded too."""
     stage, state = block_stage(BlockConfig())

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vdgs.cameras import Camera
+from vdgs.cameras import NEAR, Camera
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.model.frustum import project
 
@@ -38,5 +38,6 @@ def largest_log_scales(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera
         # What the longer side of the picture spans at the unit of depth.
         span = max(camera.width, camera.height) / max(camera.fx, camera.fy)
         held = torch.where(seen.inside, torch.minimum(held, span * seen.depth), held)
-        near = torch.minimum(near, span * seen.distance)
+        # An anchor in a camera's very centre would get a size of zero, whose logarithm is no number to train.
+        near = torch.minimum(near, span * seen.distance.clamp(min=NEAR))
     return (torch.where(held.isfinite(), held, near) * (SPAN / (2.0 * REACH))).log()

@@ -92,10 +92,8 @@ def _train(
     prepared = time.monotonic() - began
     note_without_growth(config, console, "--block.")
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
-    ground, flown = (
-        ground_of(capture, method.training.anchors).to(device),
-        [view.camera for view in capture.train_views],
-    )
+    ground = ground_of(capture, method.training.anchors).to(device)
+    flown = [view.camera for view in capture.train_views]
     with ImageCache(views, image_budget(options), downscales=factors) as images:
         stage = Stage(
             config, images, len(views), coarse.voxel, camera_height(capture), kind="block",
