@@ -32,7 +32,7 @@ from vdgs.training.target import target_at
 REFERENCE_HEIGHT = 10.0
 #: Every so many iterations anchors are put into Morton order, so that neighbours in space are neighbours in memory.
 REORDER_INTERVAL = 1000
-#: Every so many iterations sizes are brought back below their bounds; also where a model is averaged or leaves the loop.
+#: Every so many iterations sizes are brought back below their bounds, and whenever a model is averaged or complete.
 BOUND_INTERVAL = 10
 #: Every so many iterations the PSNR of the training view is taken, for people.
 PSNR_INTERVAL = 10
