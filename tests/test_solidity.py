@@ -18,11 +18,13 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from evaluation_support import load_mask, photograph, psnr, view
+from vdgs.cameras import Camera
 from vdgs.evaluation import metrics
 from vdgs.evaluation.depth_errors import NAMES, DepthErrors, errors_of_view
 from vdgs.evaluation.evaluate import MeasuredModel, evaluate
 from vdgs.evaluation.reference_views import ReferenceViews
-from vdgs.evaluation.solidity import PSNRS_SEEN, Rendered, larger_than_picture, seen_pixels
+from vdgs.evaluation.seen import seen_map
+from vdgs.evaluation.solidity import PSNRS_SEEN, Rendered, larger_than_picture
 from vdgs.kernels.types import Raster, Splats
 
 HEIGHT, WIDTH = 48, 64
@@ -48,14 +50,12 @@ def veil(alpha: float) -> Callable:
 
 
 def seen_from(columns: int) -> Callable:
-    """V: 5 in so many columns at the left, 2.9 in the next ten, NaN in the rest."""
+    """So many columns at the left are seen."""
 
-    def visibility(camera) -> np.ndarray:
-        v = np.full((HEIGHT, WIDTH), np.nan, np.float32)
-        v[:, :columns], v[:, columns : columns + 10] = 5.0, 2.9
-        return v
+    def seen(camera) -> np.ndarray:
+        return np.broadcast_to(np.arange(WIDTH) < columns, (HEIGHT, WIDTH))
 
-    return visibility
+    return seen
 
 
 def read(path: Path):
@@ -63,7 +63,7 @@ def read(path: Path):
 
 
 def test_what_is_opaque_everywhere_is_solid_before_any_background(tmp_path: Path):
-    model = MeasuredModel(veil(1.0), seen_from(40), background=BACKGROUND)
+    model = MeasuredModel(veil(1.0), seen_map=seen_from(40), background=BACKGROUND)
     result = evaluate(TAKEN, model, tmp_path)
     assert (result["solid_share"], result["seen_pixels"]) == (1.0, 2 * 40 * HEIGHT)
     assert result["psnr_seen_own"] == result["psnr_seen_black"] == result["psnr_seen_white"]
@@ -77,7 +77,7 @@ def test_what_is_opaque_everywhere_is_solid_before_any_background(tmp_path: Path
 
 
 def test_a_veil_is_not_solid_and_shows_what_is_behind_it(tmp_path: Path):
-    result = evaluate(TAKEN, MeasuredModel(veil(0.5), seen_from(40), background=BACKGROUND), tmp_path)
+    result = evaluate(TAKEN, MeasuredModel(veil(0.5), seen_map=seen_from(40), background=BACKGROUND), tmp_path)
     assert result["solid_share"] == 0.0
     expected = []
     for taken in PHOTOGRAPHS:
@@ -95,25 +95,57 @@ def test_before_its_own_background_a_picture_is_itself(alpha: float, background:
     assert np.array_equal(rendered.before(background), PHOTOGRAPHS[0])
 
 
-def test_pixels_that_the_coarse_model_leaves_open_count_where_photographs_show_ground():
-    visibility = np.array([[2.9, 3.0, np.nan, np.nan]])
-    ground = np.array([[True, True, True, False]])
-    assert seen_pixels(visibility).tolist() == [[False, True, False, False]]
-    assert seen_pixels(visibility, ground).tolist() == [[False, True, True, False]]
-    assert not seen_pixels(visibility, ground, np.zeros((1, 4), bool)).any()
+def plain_at(depth: float, alpha: np.ndarray) -> Callable:
+    """A renderer of a plain square to the axis of any camera."""
+
+    def draw(camera) -> Raster:
+        opacity = torch.from_numpy(alpha.astype(np.float32))
+        median = torch.where(opacity >= 0.5, depth, 0.0)
+        return Raster(torch.zeros(*alpha.shape, 3), opacity, opacity * depth, median)
+
+    return draw
 
 
-def test_open_ground_and_masks_in_an_evaluation(tmp_path: Path):
+def above(x: float, width: int = WIDTH, pitch: float = 90.0) -> Camera:
+    """A camera 10 above the ground that looks down by so many degrees; one pixel is 0.25 wide on the ground."""
+    down, up = np.sin(np.radians(pitch)), np.cos(np.radians(pitch))
+    rotation = np.array([[1, 0, 0], [0, -down, -up], [0, up, -down]], float)
+    rigid = np.eye(4)
+    rigid[:3, :3], rigid[:3, 3] = rotation, -rotation @ np.array([x, 0.0, 10.0])
+    return Camera(rigid, 40.0, 40.0, width / 2, HEIGHT / 2, width, HEIGHT)
+
+
+def test_seen_are_the_places_that_three_cameras_hold_whatever_splats_reach_beyond():
+    trained = [above(x) for x in (0.0, 1.0, 2.0)]
+    whole = np.ones((HEIGHT, WIDTH))
+    seen = seen_map(plain_at(10.0, whole), trained)(above(4.0))
+    # Ground from -8 to 8 lies in the first picture, the right edge of what all three hold; the view begins at -4.
+    assert seen[:, :48].all()
+    assert not seen[:, 48:].any()
+    assert not seen_map(plain_at(10.0, whole), trained[:2])(above(4.0)).any()
+
+
+def test_open_pixels_are_at_the_depth_of_their_neighbours_and_sky_is_not_seen():
+    trained = [above(0.0)] * 3
+    holes = np.ones((HEIGHT, WIDTH))
+    holes[20:25, 30:40] = 0.2
+    assert seen_map(plain_at(10.0, holes), trained)(above(0.0)).all()
+    assert not seen_map(plain_at(10.0, np.zeros((HEIGHT, WIDTH))), trained)(above(0.0)).any()
+    ahead = above(0.0, pitch=0.0)
+    lower = np.repeat(np.arange(HEIGHT)[:, None] >= HEIGHT // 2, WIDTH, axis=1)
+    seen = seen_map(plain_at(10.0, lower * 1.0), [ahead] * 3)(ahead)
+    assert np.array_equal(seen, lower)
+
+
+def test_masks_in_an_evaluation(tmp_path: Path):
     def half_open(camera) -> Raster:
         """Opaque in the left half only."""
         alpha = torch.ones(HEIGHT, WIDTH)
         alpha[:, 32:] = 0.0
         return veil(1.0)(camera)._replace(alpha=alpha)
 
-    model = MeasuredModel(half_open, seen_from(22), background=BACKGROUND)
-    assert evaluate(TAKEN, model, tmp_path / "unknown")["solid_share"] == 1.0
-    everywhere = replace(model, ground_map=lambda camera: np.ones((HEIGHT, WIDTH), bool))
-    assert evaluate(TAKEN, everywhere, tmp_path / "known")["solid_share"] == pytest.approx(22 / (22 + 32))
+    everywhere = MeasuredModel(half_open, seen_map=seen_from(WIDTH), background=BACKGROUND)
+    assert evaluate(TAKEN, everywhere, tmp_path / "whole")["solid_share"] == 0.5
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, 32:] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
@@ -126,7 +158,7 @@ def test_what_is_not_known_is_null(tmp_path: Path):
     names = ("solid_share", *PSNRS_SEEN, *NAMES, "splats_larger_than_picture", "largest_splats")
     result = evaluate(TAKEN, MeasuredModel(opaque, background=BACKGROUND), tmp_path / "no V")
     assert {result[name] for name in names} == {None}
-    image_only = MeasuredModel(lambda camera: SimpleNamespace(image=opaque(camera).image), seen_from(40))
+    image_only = MeasuredModel(lambda camera: SimpleNamespace(image=opaque(camera).image), seen_map=seen_from(40))
     result = evaluate(TAKEN, image_only, tmp_path / "no alpha")
     assert result["psnr_seen_own"] > 10
     assert {result[name] for name in names if name != "psnr_seen_own"} == {None}
@@ -134,7 +166,9 @@ def test_what_is_not_known_is_null(tmp_path: Path):
     assert row["alpha"] is None
     assert row["seen_pixels"] == 40 * HEIGHT
     assert not (tmp_path / "no alpha" / "alpha").exists()
-    result = evaluate(TAKEN, MeasuredModel(opaque, seen_from(0), background=BACKGROUND), tmp_path / "none seen")
+    result = evaluate(
+        TAKEN, MeasuredModel(opaque, seen_map=seen_from(0), background=BACKGROUND), tmp_path / "none seen"
+    )
     assert {result[name] for name in names} == {None}
 
 
@@ -158,7 +192,7 @@ def test_errors_of_depth_are_exact_shares_of_the_camera_height():
 
 def test_depth_in_an_evaluation(tmp_path: Path):
     model = MeasuredModel(
-        veil(1.0), seen_from(40), background=BACKGROUND, camera_height=100.0,
+        veil(1.0), seen_map=seen_from(40), background=BACKGROUND, camera_height=100.0,
         true_depth=lambda which: np.full((HEIGHT, WIDTH), 50.0 if which.name == "one.jpg" else 56.0),
         render_depth=lambda camera: drawn_at(50.5, np.ones((HEIGHT, WIDTH))),
     )  # fmt: skip
@@ -230,7 +264,7 @@ def test_large_splats_of_all_views_and_where_most_are(tmp_path: Path):
         return splats(*[large] * (1 + 2 * number(camera)), splat(1.0, 0.9))
 
     out = StringIO()
-    model = MeasuredModel(veil(1.0), seen_from(40), background=BACKGROUND, splats_of=splats_of)
+    model = MeasuredModel(veil(1.0), seen_map=seen_from(40), background=BACKGROUND, splats_of=splats_of)
     result = evaluate(TAKEN, model, tmp_path, console=Console(file=out, width=100))
     assert result["splats_larger_than_picture"] == 4
     assert (result["largest_splats"], result["largest_splats_view"]) == (3, "two.jpg")
@@ -240,3 +274,13 @@ def test_large_splats_of_all_views_and_where_most_are(tmp_path: Path):
     none = replace(model, splats_of=lambda camera: splats(splat(1.0, 0.9)))
     result = evaluate(TAKEN, none, tmp_path / "none")
     assert (result["splats_larger_than_picture"], result["largest_splats_view"]) == (0, None)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "orthographic"])
+def test_places_of_pixels_fall_back_onto_them(model):
+    camera = replace(above(3.0, pitch=50.0), model=model, cx=30.5, fy=37.0)
+    depth = 5.0 + np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) / 100
+    pixels, back = camera.project(camera.unproject(depth).reshape(-1, 3))
+    columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    assert np.allclose(pixels, np.column_stack([columns.ravel(), rows.ravel()]))
+    assert np.allclose(back, depth.ravel())

@@ -104,6 +104,16 @@ class Camera:
             y = self.fy * local[:, 1] / divisor + self.cy
         return np.stack([x, y], axis=1), depth
 
+    def unproject(self, depth: np.ndarray) -> np.ndarray:
+        """Depth [h, w] at the pixel centres to world points [h, w, 3] (float64): the inverse of `project`."""
+        x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
+        y = (np.arange(self.height) + 0.5 - self.cy) / self.fy
+        across = np.stack(np.meshgrid(x, y), axis=-1)
+        if self.model == "pinhole":
+            across = across * depth[..., None]
+        local = np.concatenate([across, np.asarray(depth, np.float64)[..., None]], axis=-1)
+        return (local - self.camera_from_world[:3, 3]) @ self.camera_from_world[:3, :3]
+
     def sees(self, points: np.ndarray) -> np.ndarray:
         """Which points fall inside the frustum: z > near and projected centre on the image, [n] bool."""
         pixels, depth = self.project(points)

@@ -39,7 +39,6 @@ from vdgs.evaluation.solidity import (
     Rendered,
     larger_than_picture,
     largest_splats_of_all,
-    seen_pixels,
     solidity_of_all,
     solidity_of_view,
 )
@@ -83,8 +82,8 @@ class MeasuredModel:
     timed: bool = True
     #: What is behind the model in a render, RGB in [0, 1].
     background: tuple[float, float, float] | None = None
-    #: Where photographs show ground in a view, for pixels where `visibility_map` is NaN.
-    ground_map: Callable[[Camera], Bool[np.ndarray, "h w"]] | None = None
+    #: Pixels that show what enough training cameras see (`evaluation.seen`); solidity and depth are measured on them.
+    seen_map: Callable[[Camera], Bool[np.ndarray, "h w"]] | None = None
     #: Depth along the axis of a view's camera, inf for sky; then these two are needed as well: the model's own depth
     #: (not timed), and how high cameras are above ground. All in the units of the model.
     true_depth: Callable[[View], Float[np.ndarray, "h w"]] | None = None
@@ -212,7 +211,7 @@ def _evaluate_view(view: View, stem: str, on_sheet: bool, inputs: _Inputs, gathe
         row |= dict.fromkeys(CORRECTED)
     visibility = None if inputs.model.visibility_map is None else np.asarray(inputs.model.visibility_map(view.camera))
     row["mean_visibility"] = _count_visibility(visibility, gathered, maps, mask)
-    seen = None if visibility is None else seen_pixels(visibility, _ground(view, inputs.model), mask)
+    seen = _seen(view, inputs.model, mask)
     row |= solidity_of_view(rendered, reference, seen)
     row |= _depth_figures(view, inputs.model, seen, gathered)
     row["largest_splats"] = _largest_splats(view, inputs.model)
@@ -318,8 +317,12 @@ def _count_visibility(
     return float(visibility[seen].mean(dtype=np.float64)) if seen.any() else None
 
 
-def _ground(view: View, model: MeasuredModel) -> Bool[np.ndarray, "h w"] | None:
-    return None if model.ground_map is None else np.asarray(model.ground_map(view.camera))
+def _seen(view: View, model: MeasuredModel, mask: Bool[np.ndarray, "h w"] | None) -> Bool[np.ndarray, "h w"] | None:
+    """The seen pixels of a view, of those that its mask keeps."""
+    if model.seen_map is None:
+        return None
+    seen = np.asarray(model.seen_map(view.camera))
+    return seen if mask is None else seen & mask
 
 
 def _depth_figures(

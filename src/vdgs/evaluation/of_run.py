@@ -20,12 +20,10 @@ from vdgs.errors import RunError
 from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.reference_views import ReferenceViews
-from vdgs.evaluation.solidity import SEEN_BY
+from vdgs.evaluation.seen import seen_map
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.ground import at_size, known_cells
 from vdgs.model.render import decode_view, render, render_values
 from vdgs.runs.folder import RunFolder
-from vdgs.runs.ground import ground_of
 from vdgs.runs.opening import TrainedRun
 from vdgs.runs.visibility import visibility_of_run
 from vdgs.synth.truth import has_truth, load_truth
@@ -53,12 +51,13 @@ def evaluate_run(
         peak_memory_bytes=run.status.peak_memory_bytes,
     )
     chosen = run.capture.test_views if views == "test" else run.capture.train_views
+    coarse = _coarse(run)
     model = MeasuredModel(
         lambda camera: render(run.model, camera),
-        visibility_map(run),
+        visibility_map(coarse),
         facts,
         background=run.model.background,
-        ground_map=ground_map(run),
+        seen_map=seen_by_run(coarse),
         true_depth=true_depth(run.capture, chosen),
         render_depth=lambda camera: render(run.model, camera, depth=True),
         camera_height=camera_height(run.capture),
@@ -93,24 +92,26 @@ def evaluation_folder(run: RunFolder, name: str, views: Views = "test") -> Path:
     return folder if views == "test" else folder.with_name(f"{folder.name}_training")
 
 
-def visibility_map(run: TrainedRun) -> Callable[[Camera], np.ndarray]:
-    """V at each pixel of a view, drawn with the coarse model whatever model is measured.
+def visibility_map(coarse: TrainedRun) -> Callable[[Camera], np.ndarray]:
+    """V at each pixel of a view, drawn with the coarse model of a run whatever model is measured.
 
     So the same pixels are compared between the models of a run.
     """
-    coarse = run
-    if run.name != "coarse":
-        model = AnchorModel.load(run.folder.coarse.model).to(run.device)
-        coarse = replace(run, model=model, name="coarse")
     visibility = visibility_of_run(coarse).float()
     return lambda camera: render_values(coarse.model, visibility, camera).cpu().numpy()
 
 
-def ground_map(run: TrainedRun) -> Callable[[Camera], Bool[np.ndarray, "h w"]]:
-    """Which pixels of a view show ground that enough training cameras see, by the places where anchors start:
-    what the coarse model leaves open there counts as seen."""
-    ground = ground_of(run.capture, run.folder.method().training.anchors, SEEN_BY)
-    return lambda camera: at_size(known_cells(ground, camera), camera.width, camera.height).numpy()
+def seen_by_run(coarse: TrainedRun) -> Callable[[Camera], Bool[np.ndarray, "h w"]]:
+    """Which pixels of a view show what enough training cameras see (`evaluation.seen`), by the coarse model's depth
+    whatever model is measured."""
+    cameras = [view.camera for view in coarse.capture.train_views]
+    return seen_map(lambda camera: render(coarse.model, camera, depth=True), cameras)
+
+
+def _coarse(run: TrainedRun) -> TrainedRun:
+    if run.name == "coarse":
+        return run
+    return replace(run, model=AnchorModel.load(run.folder.coarse.model).to(run.device), name="coarse")
 
 
 def true_depth(capture: Capture, views: Sequence[View]) -> Callable[[View], Float[np.ndarray, "h w"]] | None:

@@ -21,8 +21,6 @@ from vdgs.evaluation.metrics import psnr_of, squared_error, to_8bit
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.types import Splats
 
-#: A pixel is seen if at least so many training cameras see the place that it shows: fewer cannot fix a depth well.
-SEEN_BY = 3
 #: At least this opaque, a pixel counts as solid.
 SOLID_ALPHA = 0.95
 #: PSNR over seen pixels before the model's own background, a black and a white one.
@@ -50,22 +48,6 @@ class Rendered:
         # In the precision of the image: where alpha is 1, the bits stay, and with them what is rounded up or down.
         change = np.subtract(colour, self.background).astype(self.image.dtype)
         return to_8bit(self.image + (1.0 - self.alpha)[..., None] * change)
-
-
-def seen_pixels(
-    visibility: Float[np.ndarray, "h w"],
-    ground: Bool[np.ndarray, "h w"] | None = None,
-    mask: Bool[np.ndarray, "h w"] | None = None,
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels that show what at least SEEN_BY training cameras see, of those that the mask keeps.
-
-    Where the model that V is drawn with shows nothing, V is NaN and says nothing; `ground` is true where photographs
-    show ground nevertheless. Without it, those pixels are not counted as seen.
-    """
-    seen = visibility >= SEEN_BY  # false for NaN
-    if ground is not None:
-        seen |= np.isnan(visibility) & ground
-    return seen if mask is None else seen & mask
 
 
 def solidity_of_view(

@@ -28,7 +28,7 @@ def solid_cells(ground: Float[Tensor, "g 3"], camera: Camera) -> Bool[Tensor, "r
     """Which cells of a camera's picture must be opaque: those that show ground of the given places, and all that lie
     below the horizon."""
     known = known_cells(ground, camera)
-    return known | torch.from_numpy(_below_horizon(camera, *known.shape)).to(known.device)
+    return known | torch.from_numpy(below_horizon(camera, *known.shape)).to(known.device)
 
 
 def known_cells(ground: Float[Tensor, "g 3"], camera: Camera) -> Bool[Tensor, "rows columns"]:
@@ -49,7 +49,7 @@ def known_cells(ground: Float[Tensor, "g 3"], camera: Camera) -> Bool[Tensor, "r
     return torch.from_numpy(binary_erosion(binary_fill_holes(closed), around, border_value=1)).to(ground.device)
 
 
-def _below_horizon(camera: Camera, rows: int, columns: int) -> Bool[np.ndarray, "rows columns"]:
+def below_horizon(camera: Camera, rows: int, columns: int) -> Bool[np.ndarray, "rows columns"]:
     """Cells through whose centre the view leads down (z is up)."""
     if camera.model == "orthographic":
         return np.full((rows, columns), camera.forward[2] < 0)

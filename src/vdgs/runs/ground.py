@@ -11,8 +11,8 @@ from vdgs.model.visibility import visibility_of
 from vdgs.settings.method import AnchorConfig
 
 
-def ground_of(capture: Capture, config: AnchorConfig, least_views: int = 1) -> Float[Tensor, "g 3"]:
-    """The places where anchors start and that at least so many training cameras hold (`model.ground`)."""
+def ground_of(capture: Capture, config: AnchorConfig) -> Float[Tensor, "g 3"]:
+    """The places where anchors start and that any training camera holds (`model.ground`)."""
     cameras = [view.camera for view in capture.train_views]
     anchors, _ = initial_anchors(capture.points, capture.point_colours, cameras, config)
-    return anchors.positions[visibility_of(anchors.positions, cameras) >= least_views]
+    return anchors.positions[visibility_of(anchors.positions, cameras) >= 1]

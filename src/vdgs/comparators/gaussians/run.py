@@ -40,6 +40,8 @@ from vdgs.errors import RunError, VdgsError
 from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.of_run import cached_photographs, true_depth
+from vdgs.evaluation.seen import seen_map
+from vdgs.kernels.types import Raster
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.settings.plain import differences, to_dict
 from vdgs.settings.watching import WatchOptions
@@ -133,13 +135,18 @@ def evaluate_gaussians(
     """
     refuse_another_capture(output, model.facts.get("capture", {}), capture)
     lpips, note = load_lpips(lpips_weights)
+
+    def render_depth(camera: Camera) -> Raster:
+        return model.render(camera, depth=True)
+
     measured = MeasuredModel(
         model.render,
         visibility_map,
         _facts(trained),
         background=model.background,
+        seen_map=seen_map(render_depth, [view.camera for view in capture.train_views]),
         true_depth=true_depth(capture, capture.test_views),
-        render_depth=lambda camera: model.render(camera, depth=True),
+        render_depth=render_depth,
         camera_height=camera_height(capture),
     )
     with cached_photographs(capture.test_views) as photographs:
