@@ -12,15 +12,10 @@ from hypothesis import strategies as st
 from checkerboard import Photographs
 from vdgs.cameras import Camera
 from vdgs.comparators.gaussians.density import DensityConfig, control_density, reset_logits, split
-from vdgs.comparators.gaussians.model import (
-    Gaussians,
-    GaussiansModel,
-    draw_gaussians,
-    initial_gaussians,
-    visible_rows,
-)
-from vdgs.comparators.gaussians.spherical_harmonics import view_colours
+from vdgs.comparators.gaussians.model import GaussiansModel, initial_gaussians
 from vdgs.errors import VdgsError
+from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows
+from vdgs.model.spherical_harmonics import view_colours
 
 # What a view shows
 

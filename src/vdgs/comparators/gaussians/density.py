@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vdgs.comparators.gaussians.model import Gaussians
 from vdgs.kernels.rotations import rotation_matrices
+from vdgs.model.gaussians import Gaussians
 
 #: A Gaussian is split into so many (3DGS section 5.2).
 PARTS = 2

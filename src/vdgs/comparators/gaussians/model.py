@@ -16,59 +16,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64, UInt8
+from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.comparators.gaussians.spherical_harmonics import MAX_DEGREE, dc_of_colours, function_count, view_colours
 from vdgs.errors import VdgsError
-from vdgs.kernels import choose
-from vdgs.kernels.constants import ALPHA_MIN
-from vdgs.kernels.types import Raster, Splats
+from vdgs.kernels.types import Raster
+from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows
+from vdgs.model.spherical_harmonics import MAX_DEGREE, dc_of_colours, function_count
 from vdgs.storage.files import write_atomically
 from vdgs.storage.tensors import checksum, read_tensors, write_tensors
 
 FORMAT = "vdgs-gaussians-1"
-#: Beyond so many standard deviations not even an opaque Gaussian reaches the least alpha that is drawn.
-REACH = math.sqrt(-2 * math.log(ALPHA_MIN))
 #: The smallest first size, as a share of the median one: coincident points would have none.
 LEAST_SPACING = 1e-3
-
-
-@dataclass(frozen=True)
-class Gaussians:
-    """What training moves of each Gaussian. Tensors share their first dimension."""
-
-    means: Float[Tensor, "n 3"]
-    #: Logarithms of the standard deviations along the Gaussian's own axes.
-    log_scales: Float[Tensor, "n 3"]
-    #: Rotations, wxyz, of any length but zero.
-    quaternions: Float[Tensor, "n 4"]
-    #: Opacities before the sigmoid.
-    logits: Float[Tensor, " n"]
-    #: Spherical harmonics: coefficients of the constant function, and of the others.
-    dc: Float[Tensor, "n 3"]
-    rest: Float[Tensor, "n r 3"]
-
-    def __len__(self) -> int:
-        return self.means.shape[0]
-
-    def tensors(self) -> dict[str, Tensor]:
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
-
-    def select(self, rows: Tensor) -> Gaussians:
-        """The Gaussians of the given rows (indices or mask)."""
-        return Gaussians(**{name: tensor[rows] for name, tensor in self.tensors().items()})
-
-    def extended(self, more: Gaussians) -> Gaussians:
-        """These Gaussians followed by others."""
-        return Gaussians(**{name: torch.cat([t, more.tensors()[name]]) for name, t in self.tensors().items()})
-
-    @property
-    def degree(self) -> int:
-        """Degree of the spherical harmonics that there is room for."""
-        return math.isqrt(self.rest.shape[1] + 1) - 1
 
 
 def initial_gaussians(
@@ -91,44 +52,6 @@ def initial_gaussians(
         dc=dc_of_colours(torch.from_numpy(colours.astype(np.float32) / 255.0)),
         rest=torch.zeros(n, function_count(degree) - 1, 3),
     )
-
-
-@torch.no_grad()
-def visible_rows(gaussians: Gaussians, camera: Camera) -> Int64[Tensor, " v"]:
-    """Rows of the Gaussians in front of the camera whose extent touches the image, ascending."""
-    kernels = choose(gaussians.means.device)
-    seen = kernels.project(gaussians.means, gaussians.log_scales.exp(), gaussians.quaternions, camera)
-    a, b, c = seen.conics.unbind(-1)
-    # The inverse of the conic [[a, b], [b, c]] is the covariance, its diagonal the variances along x and y.
-    variances = torch.stack([c, a], -1) / (a * c - b * b)[:, None]
-    reach = REACH * variances.sqrt()
-    low, high = seen.means_px + reach, seen.means_px - reach
-    inside = (low > 0).all(-1) & (high[:, 0] < camera.width) & (high[:, 1] < camera.height)
-    # A needle whose determinant is lost to rounding has no extent that could be compared: it is drawn.
-    return (seen.valid & (inside | ~torch.isfinite(reach).all(-1))).nonzero()[:, 0]
-
-
-def draw_gaussians(
-    gaussians: Gaussians, camera: Camera, background: Float[Tensor, "3"], degree: int, depth: bool = False
-) -> tuple[Raster, Float[Tensor, "n 2"]]:
-    """The picture, and the centres in pixels that it was drawn from (growth asks for their gradient).
-
-    Differentiable in all tensors of `gaussians`.
-    """
-    kernels = choose(gaussians.means.device)
-    projected = kernels.project(gaussians.means, gaussians.log_scales.exp(), gaussians.quaternions, camera)
-    if camera.model == "pinhole":
-        centre = torch.from_numpy(camera.position.astype(np.float32)).to(gaussians.means)
-        directions = torch.nn.functional.normalize(gaussians.means - centre, dim=-1)
-    else:
-        directions = torch.from_numpy(camera.forward.astype(np.float32)).to(gaussians.means).expand(len(gaussians), 3)
-    splats = Splats(
-        projected.means_px, projected.conics, projected.depths,
-        view_colours(gaussians.dc, gaussians.rest, directions, degree),
-        torch.where(projected.valid, gaussians.logits.sigmoid(), 0.0),
-    )  # fmt: skip
-    raster = kernels.rasterise(splats, background, camera.width, camera.height, depth=depth)
-    return raster, projected.means_px
 
 
 @dataclass(frozen=True)

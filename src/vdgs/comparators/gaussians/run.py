@@ -33,7 +33,6 @@ from vdgs.captures.facts import capture_facts, refuse_another_capture
 from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
 from vdgs.comparators.gaussians.model import GaussiansModel
-from vdgs.comparators.gaussians.spherical_harmonics import MAX_DEGREE
 from vdgs.comparators.gaussians.training import GaussiansConfig, GaussiansStage, scene_extent
 from vdgs.comparators.gaussians.watching import continue_or_start, finish, train_watched
 from vdgs.errors import RunError, VdgsError
@@ -42,6 +41,7 @@ from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.of_run import cached_photographs, true_depth
 from vdgs.evaluation.seen import seen_map
 from vdgs.kernels.types import Raster
+from vdgs.model.spherical_harmonics import MAX_DEGREE
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.settings.plain import differences, to_dict
 from vdgs.settings.watching import WatchOptions

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.comparators.gaussians.density import DensityConfig, control_density, reset_logits
-from vdgs.comparators.gaussians.model import Gaussians, draw_gaussians, visible_rows
 from vdgs.errors import TrainingDiverged
 from vdgs.kernels import choose
 from vdgs.kernels.types import AdamState
+from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows
 from vdgs.storage.checkpoints import SavedState
 from vdgs.training import PSNR_INTERVAL, TrainingImages, view_at
 from vdgs.training.optimiser import Moments
