@@ -34,6 +34,17 @@ class HeadWeights:
         """The four tensors in the order of the fields."""
         return self.w1, self.b1, self.w2, self.b2
 
+    def outputs(self, inputs: Float[Tensor, "v 36"]) -> Float[Tensor, "v output"]:
+        """What the head makes of features, viewing directions and distances, the last of which it may not look at.
+
+        Raises ValueError if its first layer is neither 35 nor 36 wide.
+        """
+        width = self.w1.shape[1]
+        if width not in (FEATURE_SIZE + 3, FEATURE_SIZE + 4):
+            raise ValueError(f"a head's first layer must be 35 or 36 wide, not {width}")
+        hidden = torch.relu(torch.nn.functional.linear(inputs[:, :width], self.w1, self.b1))
+        return torch.nn.functional.linear(hidden, self.w2, self.b2)
+
 
 @dataclass(frozen=True, eq=False)
 class DecoderWeights:

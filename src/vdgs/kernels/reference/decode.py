@@ -9,7 +9,7 @@ from torch import Tensor
 from vdgs.cameras import Camera
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.reference.project import project_with_variances
-from vdgs.kernels.types import FEATURE_SIZE, AnchorSplats, DecoderWeights, HeadWeights
+from vdgs.kernels.types import AnchorSplats, DecoderWeights
 
 
 def decode(
@@ -43,12 +43,12 @@ def decode(
     )
     inputs = torch.cat([features, viewing], -1)
 
-    opacities = torch.tanh(_head(weights.opacity, inputs))
+    opacities = torch.tanh(weights.opacity.outputs(inputs))
     usable = (opacities > 0) & finite[:, None] & torch.isfinite(offsets).all(-1)
     anchor, offset = usable.nonzero(as_tuple=True)
     opacity = opacities[anchor, offset]
-    covariance = _head(weights.covariance, inputs).unflatten(1, (k, 7))[anchor, offset]
-    colour = torch.sigmoid(_head(weights.colour, inputs).unflatten(1, (k, 3))[anchor, offset])
+    covariance = weights.covariance.outputs(inputs).unflatten(1, (k, 7))[anchor, offset]
+    colour = torch.sigmoid(weights.colour.outputs(inputs).unflatten(1, (k, 3))[anchor, offset])
 
     extent = torch.exp(log_scales)[anchor]
     means = positions[anchor] + offsets[anchor, offset] * extent[:, :3]
@@ -75,14 +75,6 @@ def _viewing(positions: Tensor, camera: Camera) -> Float[Tensor, "v 4"]:
     else:
         direction = ray / distance
     return torch.cat([direction, distance], -1)
-
-
-def _head(head: HeadWeights, inputs: Float[Tensor, "v 36"]) -> Tensor:
-    width = head.w1.shape[1]
-    if width not in (FEATURE_SIZE + 3, FEATURE_SIZE + 4):
-        raise ValueError(f"a head's first layer must be 35 or 36 wide, not {width}")
-    hidden = torch.relu(torch.nn.functional.linear(inputs[:, :width], head.w1, head.b1))
-    return torch.nn.functional.linear(hidden, head.w2, head.b2)
 
 
 @torch.no_grad()

@@ -1,0 +1,185 @@
+"""An anchor model as explicit Gaussians that any program can draw.
+
+What anchors spawn depends on where it is seen from: opacity, shape and colour. A file of Gaussians holds one opacity
+and one shape of each, and colours as spherical harmonics. They are fitted over the training cameras, by how much of
+their pictures a Gaussian makes: the derivative of the sum of a picture by its colour. What no training view draws is
+left out.
+
+Two passes. The first draws every training view and keeps for each of its splats how many pixels it is worth; the second
+takes some thousand anchors at a time, decodes them for the cameras that saw them, and fits. Memory: 8 bytes for each
+splat of each view, 4 for each Gaussian, and what a part needs (`ANCHORS_AT_ONCE`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, Int32
+from torch import Tensor
+
+from vdgs.cameras import Camera
+from vdgs.export.harmonics_fit import fit_harmonics, segment_sums
+from vdgs.kernels import choose
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.gaussians import Gaussians
+from vdgs.model.render import decode_view
+from vdgs.model.world import places, spawned
+
+#: A splat that makes less of a view than so many pixels did not show there.
+LEAST_PIXELS = 1e-3
+#: Anchors that are fitted at once.
+ANCHORS_AT_ONCE = 16_384
+#: Opacities are kept away from 0 and 1, where their logits have no end.
+OPACITY_MARGIN = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What one view shows: Gaussians, ascending, by row · k + offset, and how many of its pixels each makes."""
+
+    gaussians: Int32[Tensor, " p"]
+    pixels: Float[Tensor, " p"]
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What the cameras see of a model."""
+
+    model: AnchorModel
+    cameras: Sequence[Camera]
+    shown: Sequence[Shown]
+    #: Pixels that each of the g = n · k Gaussians makes, over all views.
+    pixels: Float[np.ndarray, " g"]
+
+
+def survey(model: AnchorModel, cameras: Sequence[Camera], after_view: Callable[[], None] = lambda: None) -> Survey:
+    """Draw every view once, on the device of the model; `after_view` is called after each. Raises ValueError without
+    cameras."""
+    if not cameras:
+        raise ValueError("baking needs the training cameras")
+    k = model.anchors.offsets.shape[1]
+    pixels, shown = np.zeros(len(model.anchors) * k, np.float32), []
+    for camera in cameras:
+        view = _shown(model, camera, k)
+        pixels[view.gaussians.numpy()] += view.pixels.numpy()
+        shown.append(view)
+        after_view()
+    return Survey(model, cameras, shown, pixels)
+
+
+@torch.no_grad()
+def _shown(model: AnchorModel, camera: Camera, k: int) -> Shown:
+    rows, splats = decode_view(model, camera)
+    kernels = choose(rows.device)
+    _, pullback = kernels.rasterise_vjp(splats, splats.means_px.new_zeros(3), camera.width, camera.height)
+    pixels = pullback(splats.means_px.new_ones(camera.height, camera.width, 3)).colours[:, 0]
+    source = splats.source.long()
+    gaussians = rows[source // k] * k + source % k
+    kept = pixels >= LEAST_PIXELS
+    return Shown(gaussians[kept].to("cpu", torch.int32), pixels[kept].cpu())
+
+
+def bake(
+    seen: Survey, kept: Int[np.ndarray, " m"], degree: int, after_part: Callable[[int], None] = lambda done: None
+) -> Iterator[Gaussians]:
+    """The Gaussians of the given numbers (ascending, each shown by some view), part by part in this order.
+
+    `degree` is that of the spherical harmonics, 0 to 3. `after_part` is told how many Gaussians are done.
+    """
+    k = seen.model.anchors.offsets.shape[1]
+    anchors = len(seen.model.anchors)
+    kept = np.ascontiguousarray(kept)
+    done = 0
+    for first in range(0, anchors, ANCHORS_AT_ONCE):
+        bounds = np.searchsorted(kept, [first * k, min(first + ANCHORS_AT_ONCE, anchors) * k])
+        wanted = kept[slice(*bounds)]
+        if not len(wanted):
+            continue
+        yield _fitted(_gathered(seen, wanted), wanted, seen, degree)
+        done += len(wanted)
+        after_part(done)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """p pairs of a Gaussian and a camera that shows it, sorted by Gaussian."""
+
+    #: Where the pairs of each of the m Gaussians begin.
+    starts: Int[np.ndarray, " m"]
+    pixels: Float[Tensor, " p"]
+    directions: Float[Tensor, "p 3"]
+    colours: Float[Tensor, "p 3"]
+    opacities: Float[Tensor, " p"]
+    log_scales: Float[Tensor, "p 3"]
+    quaternions: Float[Tensor, "p 4"]
+
+
+def _gathered(seen: Survey, wanted: Int[np.ndarray, " m"]) -> _Pairs:
+    """How the cameras see the wanted Gaussians, which lie close together in number."""
+    columns: list[tuple[Tensor, ...]] = []
+    numbers = torch.from_numpy(wanted)
+    for camera, shown in zip(seen.cameras, seen.shown, strict=True):
+        low, high = np.searchsorted(shown.gaussians.numpy(), [wanted[0], wanted[-1] + 1])
+        gaussians, pixels = shown.gaussians[low:high].long(), shown.pixels[low:high]
+        place = torch.searchsorted(numbers, gaussians).clamp(max=len(wanted) - 1)
+        inside = numbers[place] == gaussians
+        if inside.any():
+            columns.append((place[inside], pixels[inside], *_seen_from(seen.model, gaussians[inside], camera)))
+    place, *rest = (torch.cat(column) for column in zip(*columns, strict=True))
+    order = place.sort(stable=True)
+    starts = np.searchsorted(order.values.numpy(), np.arange(len(wanted)))
+    return _Pairs(starts, *(column[order.indices] for column in rest))
+
+
+def _seen_from(model: AnchorModel, gaussians: Tensor, camera: Camera) -> tuple[Tensor, ...]:
+    """Direction, colour, opacity, logarithms of the scales and rotation of Gaussians (ascending) from a camera."""
+    anchors, k = model.anchors, model.anchors.offsets.shape[1]
+    rows, place = torch.unique_consecutive(gaussians // k, return_inverse=True)
+    offset = gaussians % k
+    rows = rows.to(anchors.positions.device)
+    pieces = []
+    for first, last, decoder in model.spans():
+        low, high = torch.searchsorted(rows, rows.new_tensor([first, last])).tolist()
+        if low < high:
+            pieces.append(spawned(anchors, rows[low:high], decoder.for_image(None), camera))
+    opacities, colours, scales, quaternions = (
+        torch.cat([getattr(piece, name) for piece in pieces]).cpu()[place, offset]
+        for name in ("opacities", "colours", "scales", "quaternions")
+    )
+    rays = places(anchors.select(rows)).cpu()[place, offset] - torch.from_numpy(camera.position.astype(np.float32))
+    return torch.nn.functional.normalize(rays, dim=1), colours, opacities, scales.log(), quaternions
+
+
+def _fitted(pairs: _Pairs, wanted: Int[np.ndarray, " m"], seen: Survey, degree: int) -> Gaussians:
+    anchors, k = seen.model.anchors, seen.model.anchors.offsets.shape[1]
+    coefficients = fit_harmonics(pairs.directions, pairs.colours, pairs.pixels, pairs.starts, degree)
+    opacities = _means(pairs.opacities[:, None], pairs)[:, 0].clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    rows = torch.from_numpy(wanted // k)
+    means = places(anchors.select(rows.to(anchors.positions.device))).cpu()
+    return Gaussians(
+        means=means[torch.arange(len(wanted)), torch.from_numpy(wanted % k)],
+        log_scales=_means(pairs.log_scales, pairs),
+        quaternions=torch.nn.functional.normalize(_means(_aligned(pairs), pairs), dim=1),
+        logits=opacities.logit(),
+        dc=coefficients[:, 0].contiguous(),
+        rest=coefficients[:, 1:].contiguous(),
+    )
+
+
+def _aligned(pairs: _Pairs) -> Float[Tensor, "p 4"]:
+    """Unit rotations, each with the sign that brings it nearer to the first of its Gaussian: q and -q are the same."""
+    unit = torch.nn.functional.normalize(pairs.quaternions, dim=1)
+    counts = np.diff(pairs.starts, append=len(unit))
+    first = unit[torch.from_numpy(np.repeat(pairs.starts, counts))]
+    return torch.where((unit * first).sum(1, keepdim=True) < 0, -unit, unit)
+
+
+def _means(values: Float[Tensor, "p d"], pairs: _Pairs) -> Float[Tensor, "m d"]:
+    """The mean of each Gaussian's values, by its pixels in each view."""
+    pixels = pairs.pixels.numpy()
+    total = segment_sums(pixels, pairs.starts)
+    columns = [segment_sums(pixels * column, pairs.starts) / total for column in values.numpy().T]
+    return torch.from_numpy(np.stack(columns, axis=1))

@@ -1,0 +1,154 @@
+"""Anchor models baked into explicit Gaussians: what they must keep, and what cannot be kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from merging_support import camera_above, model_at
+from vdgs.export import baking
+from vdgs.export.baking import Survey, bake, survey
+from vdgs.export.harmonics_fit import fit_harmonics
+from vdgs.kernels.types import DecoderWeights, HeadWeights
+from vdgs.model.anchor_model import AnchorModel, Part
+from vdgs.model.decoder import Decoder
+from vdgs.model.gaussians import Gaussians, draw_gaussians
+from vdgs.model.render import decode_view, render
+from vdgs.model.spherical_harmonics import function_count, view_colours
+from vdgs.model.world import places, spawned
+
+VIEWS = [camera_above(0.3, -0.2), camera_above(-2.0, 1.0, tilt_deg=30.0), camera_above(1.5, 2.0, tilt_deg=-25.0)]
+
+
+def scattered(n: int = 200, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform((-3, -3, 0), (3, 3, 0.5), (n, 3))
+
+
+def blind(decoder: Decoder) -> Decoder:
+    """The decoder without a view of where it is seen from."""
+
+    def without(head: HeadWeights) -> HeadWeights:
+        w1 = head.w1.clone()
+        w1[:, 32:] = 0.0
+        return replace(head, w1=w1)
+
+    weights = decoder.weights
+    return replace(
+        decoder,
+        weights=DecoderWeights(without(weights.opacity), without(weights.covariance), without(weights.colour)),
+    )
+
+
+def baked(seen: Survey, degree: int = 3, kept: np.ndarray | None = None) -> Gaussians:
+    parts = list(bake(seen, np.flatnonzero(seen.pixels > 0) if kept is None else kept, degree))
+    return Gaussians(**{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()})
+
+
+def drawn(gaussians: Gaussians, model: AnchorModel, camera) -> np.ndarray:
+    with torch.no_grad():
+        picture, _ = draw_gaussians(gaussians, camera, torch.tensor(model.background), gaussians.degree)
+    return picture.image.numpy()
+
+
+def test_what_is_spawned_is_what_the_kernels_decode():
+    model = model_at(scattered())
+    k = model.anchors.offsets.shape[1]
+    for camera in VIEWS:
+        rows, splats = decode_view(model, camera)
+        world = spawned(model.anchors, rows, model.decoder.weights, camera)
+        row, offset = splats.source.long() // k, splats.source.long() % k
+        assert torch.allclose(world.colours[row, offset], splats.colours, atol=1e-5)
+        assert torch.allclose(world.opacities[row, offset], splats.opacities, atol=1e-5)
+        assert torch.allclose(world.scales[row, offset].prod(-1), splats.volumes, rtol=1e-3)
+        pixels, _ = camera.project(places(model.anchors)[rows][row, offset].double().numpy())
+        assert np.allclose(pixels, splats.means_px.numpy(), atol=1e-2)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("parts", [(), (80, 0, 120)])
+def test_a_model_that_looks_alike_from_everywhere_is_baked_as_it_is(degree, parts):
+    model = model_at(scattered())
+    model = replace(model, decoder=blind(model.decoder), parts=tuple(Part(n, blind(model.decoder)) for n in parts))
+    gaussians = baked(survey(model, VIEWS), degree)
+    assert gaussians.rest.shape[1:] == (function_count(degree) - 1, 3)
+    for camera in VIEWS:
+        assert np.abs(drawn(gaussians, model, camera) - render(model, camera).image.numpy()).max() < 0.01
+
+
+def test_more_harmonics_come_nearer_to_a_model_that_looks_different_from_everywhere():
+    model = model_at(scattered())
+    colour = model.decoder.weights.colour
+    steep = replace(colour, w1=torch.cat([colour.w1[:, :32], 10 * colour.w1[:, 32:]], 1))
+    still = blind(model.decoder)
+    model = replace(model, decoder=replace(still, weights=replace(still.weights, colour=steep)))
+    views = [camera_above(x, y, tilt_deg=tilt) for x in (-2, 0, 2) for y in (-2, 0, 2) for tilt in (-30, 0, 30)]
+    seen = survey(model, views)
+    errors = []
+    for degree in (0, 1, 2, 3):
+        gaussians = baked(seen, degree)
+        errors.append(np.mean([(drawn(gaussians, model, v) - render(model, v).image.numpy()) ** 2 for v in views]))
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 0.1 * errors[0]
+
+
+def test_only_what_views_show_is_kept_and_pixels_count_what_is_drawn():
+    model = model_at(scattered())
+    seen = survey(model, VIEWS)
+    assert 0 < np.count_nonzero(seen.pixels) < seen.pixels.size
+    assert seen.pixels.sum() == pytest.approx(sum(float(render(model, v).alpha.sum()) for v in VIEWS), rel=1e-2)
+    away = survey(model, [camera_above(500.0, 500.0)])
+    assert not away.pixels.any()
+    assert list(bake(away, np.zeros(0, np.int64), 3)) == []
+    with pytest.raises(ValueError, match="cameras"):
+        survey(model, [])
+
+
+def test_parts_do_not_change_what_is_baked(monkeypatch):
+    model = model_at(scattered())
+    seen = survey(model, VIEWS)
+    kept = np.flatnonzero(seen.pixels > 0)[::3]
+    whole, done = baked(seen, 3, kept), list[int]()
+    monkeypatch.setattr(baking, "ANCHORS_AT_ONCE", 17)
+    parts = list(bake(seen, kept, 3, done.append))
+    assert len(parts) > 5
+    assert done[-1] == len(kept) == len(whole)
+    for name, tensor in whole.tensors().items():
+        assert torch.allclose(torch.cat([part.tensors()[name] for part in parts]), tensor, atol=1e-5), name
+
+
+def test_places_and_numbers_of_what_is_kept():
+    model = model_at(scattered())
+    seen = survey(model, VIEWS)
+    kept = np.flatnonzero(seen.pixels > 0)
+    gaussians = baked(seen, 0, kept)
+    assert torch.equal(gaussians.means, places(model.anchors).reshape(-1, 3)[torch.from_numpy(kept)])
+    assert torch.allclose(gaussians.quaternions.norm(dim=1), torch.ones(len(kept)), atol=1e-5)
+    assert all(bool(torch.isfinite(tensor).all()) for tensor in gaussians.tensors().values())
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics_that_were_seen_from_everywhere_are_found_again(degree):
+    generator = torch.Generator().manual_seed(degree)
+    m, views = 5, 400
+    dc = 0.3 * torch.randn(m, 3, generator=generator)
+    rest = 0.03 * torch.randn(m, function_count(degree) - 1, 3, generator=generator)
+    directions = torch.nn.functional.normalize(torch.randn(m * views, 3, generator=generator), dim=1)
+    colours = view_colours(dc.repeat_interleave(views, 0), rest.repeat_interleave(views, 0), directions, degree)
+    weights = 0.5 + torch.rand(m * views, generator=generator)
+    found = fit_harmonics(directions, colours, weights, np.arange(m) * views, degree)
+    assert torch.allclose(found[:, 0], dc, atol=0.02)
+    # The ridge shrinks by RIDGE against the mean square of a function, 1 / (4 pi).
+    assert torch.allclose(found[:, 1:], rest, atol=0.03)
+
+
+def test_one_view_says_one_colour_for_all_directions():
+    colour = torch.tensor([[0.2, 0.5, 0.9]])
+    one = torch.tensor([[0.0, 0.0, -1.0]])
+    found = fit_harmonics(one, colour, torch.ones(1), np.array([0]), 3)
+    shown = view_colours(found[:, 0], found[:, 1:], one, 3)
+    assert torch.allclose(shown, colour, atol=0.01)
+    sideways = view_colours(found[:, 0], found[:, 1:], torch.tensor([[1.0, 0.0, 0.0]]), 3)
+    assert (sideways - colour).abs().max() < 0.25
