@@ -260,3 +260,26 @@ def test_unsuitable_arguments_are_refused(implementation):
     ]:
         with pytest.raises(error):
             step(**changes)
+
+
+@BOTH
+@pytest.mark.parametrize("early", [1.0, 3.0, 1e6])
+def test_rows_with_few_updates_move_faster_by_no_more_than_what_is_allowed(implementation, early):
+    updates = torch.tensor([1, 20, 118, 900, 30_000], dtype=torch.int32)
+    rows = torch.arange(5)
+    moved = []
+    for factor in (1.0, early):
+        parameter, gradient, first, second = state(5, 3)
+        before = parameter.clone()
+        implementation.adam_rows(AdamState(parameter, first, second, 1e-3, factor), rows, gradient, updates)
+        moved.append((parameter - before).double())
+    expected = (1 / (1 - 0.999 ** updates.double()).sqrt()).clamp(max=early)
+    torch.testing.assert_close(moved[1] / moved[0], expected[:, None].expand(5, 3), rtol=1e-2, atol=0)
+
+
+@BOTH
+@pytest.mark.parametrize("early", [0.9, float("nan"), float("inf")])
+def test_rows_are_never_slowed_down(implementation, early):
+    parameter, gradient, first, second = state(5, 3)
+    with pytest.raises(ValueError, match="early"):
+        implementation.adam_rows(AdamState(parameter, first, second, 1e-3, early), None, gradient, 3)

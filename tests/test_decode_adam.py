@@ -18,11 +18,15 @@ RATES = (0.01, 0.02, 0.005)
 UPDATES = torch.tensor([(row * row * 7) % 997 * (1 if row % 5 else 30) for row in range(700)], dtype=torch.int32)
 
 
+#: How much faster anchors move that have moved seldom.
+EARLY = 4.0
+
+
 def states_of(scene: Scene) -> list[AdamState]:
     """The scene's parameters after some steps of Adam; copies."""
     g = torch.Generator().manual_seed(9)
     return [
-        AdamState(t.clone(), 0.1 * torch.randn(t.shape, generator=g), torch.rand(t.shape, generator=g), rate)
+        AdamState(t.clone(), 0.1 * torch.randn(t.shape, generator=g), torch.rand(t.shape, generator=g), rate, EARLY)
         for t, rate in zip((scene.features, scene.offsets, scene.log_scales), RATES, strict=True)
     ]
 

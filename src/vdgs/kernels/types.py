@@ -149,6 +149,9 @@ class AdamState(NamedTuple):
     first: Float[Tensor, "n *rest"]
     second: Float[Tensor, "n *rest"]
     learning_rate: float
+    #: Up to how many times faster than that a row moves that has had few updates: after u of them by
+    #: min(early, 1 / sqrt(1 - beta2^u)) (choice; at 1 this is Adam).
+    early: float = 1.0
 
 
 class Raster(NamedTuple):

@@ -25,7 +25,7 @@ DEPENDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 #: Settings that came after runs had been made without them, with the value that leaves those runs as they are: where a
 #: setting has it, keys do not mention it, so that a newer version takes older runs for finished, as they are.
 SINCE: dict[str, dict[str, Any]] = {
-    "training": {"sampling": "even", "average": 0.0},
+    "training": {"sampling": "even", "average": 0.0, "early": 1.0},
     "block": {"sampling": "even", "decoder": "frozen", "average": 0.0, "crop": "off", "max_anchors_total": 0},
 }
 

@@ -97,6 +97,8 @@ def _validate_training(config: TrainConfig) -> list[str]:
         problems.append(f"loss.ssim_weight is {config.loss.ssim_weight}; it lies between 0 and 1")
     if config.loss.alpha_weight < 0:
         problems.append(f"loss.alpha_weight is {config.loss.alpha_weight}; it must not be negative, and 0 is without")
+    if not config.early >= 1:
+        problems.append(f"early is {config.early}; it must be at least 1, which is Adam as it is")
     for rate in dataclasses.fields(config.rates):
         if min(getattr(config.rates, rate.name)) <= 0:
             problems.append(f"rates.{rate.name} must be positive")

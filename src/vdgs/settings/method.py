@@ -150,6 +150,10 @@ class TrainConfig:
     """The anchor model."""
     rates: RateConfig = field(default_factory=RateConfig)
     """Learning rates."""
+    early: float = 1.0
+    """Up to how many times faster an anchor moves while it has had few updates, here and in blocks: after u of them, by
+    the least of this and 1 / sqrt(1 - 0.999^u), which is 3 after 118 updates and 1.3 after 900 (choice: in short
+    trainings an anchor is seen a few hundred times; 1 is Adam as it is)."""
     growth: GrowthConfig = field(default_factory=GrowthConfig)
     """Growth and pruning of anchors."""
     loss: LossConfig = field(default_factory=LossConfig)

@@ -128,7 +128,7 @@ def _move(
     """One step of Adam for the visible anchors and the decoder."""
     config, step = stage.config, state.iteration + 1
     rates = rates_at(config.rates, state.iteration / config.iterations)
-    states, updates = state.optimiser.anchor_states(state.anchors, rates), state.optimiser.updates
+    states, updates = state.optimiser.anchor_states(state.anchors, rates, config.early), state.optimiser.updates
     finite = move_anchors(state.anchors, rows, gradients, weights, camera, states, updates, stage.mobility)
     finite &= state.optimiser.update_decoder(state.decoder, rates, step)
     if not finite:

@@ -47,10 +47,10 @@ class Optimiser:
         updates = torch.zeros_like(anchors.positions[:, 0], dtype=torch.int32)
         return Optimiser(Moments.zeros(trained), Moments.zeros(decoder.tensors()), updates)
 
-    def anchor_states(self, anchors: Anchors, rates: dict[str, float]) -> list[AdamState]:
-        """What moves of the anchors, in the order of `TRAINED`."""
+    def anchor_states(self, anchors: Anchors, rates: dict[str, float], early: float) -> list[AdamState]:
+        """What moves of the anchors, in the order of `TRAINED`; `early` as in `AdamState`."""
         return [
-            AdamState(getattr(anchors, name), self.anchors.first[name], self.anchors.second[name], rates[name])
+            AdamState(getattr(anchors, name), self.anchors.first[name], self.anchors.second[name], rates[name], early)
             for name in TRAINED
         ]
 

@@ -27,7 +27,7 @@ def adam_rows(
     Raises ValueError also where one of those is not contiguous. Same bits for any number of threads.
     """
     check_rows(state, rows, gradient)
-    factors = check_step(state.learning_rate, step, len(gradient), beta1, beta2, epsilon)
+    factors = check_step(state, step, len(gradient), beta1, beta2, epsilon)
     tensors = state[:3]
     if state.parameter.dtype != torch.float32:
         raise TypeError(f"parameter must be float32, not {state.parameter.dtype}")

@@ -62,7 +62,7 @@ def decode_backward_adam(
 
 def _step(state: AdamState) -> tuple[Any, ...]:
     """A parameter and its moments, the tables of its step, and the betas with epsilon."""
-    rates, roots, *rest = rounded(step_factors(state.learning_rate, None))
+    rates, roots, *rest = rounded(step_factors(state.learning_rate, None, early=state.early))
     return (*(t.detach() for t in state[:3]), rates, roots, rest)
 
 

@@ -4,6 +4,9 @@ A row that is not given keeps its parameters *and* its moments: an anchor that n
 does not drift on old momentum. Its moments are then means over its own updates, and so the bias correction must
 count those: with the global step, a row that is first seen late would make its first step
 (1 - beta1) / sqrt(1 - beta2) times too large, which is 3.2, and up to 6 times its rate soon after.
+
+Short trainings want longer steps of rows that have had few, and shorter ones later (`AdamState.early`): every row
+anneals over its own updates, whenever they come.
 """
 
 from __future__ import annotations
@@ -54,7 +57,7 @@ def adam_rows(
     do not match or settings out of range, TypeError for other types of elements: before any change.
     """
     check_rows(state, rows, gradient)
-    factors = check_step(state.learning_rate, step, len(gradient), beta1, beta2, epsilon)
+    factors = check_step(state, step, len(gradient), beta1, beta2, epsilon)
     if not bool(torch.isfinite(gradient).all()):
         return False
     index = slice(None) if rows is None else rows
@@ -76,20 +79,25 @@ def _of_rows(table: Float[np.ndarray, " t"], step: int | Tensor, gradient: Tenso
 
 
 def check_step(
-    learning_rate: float, step: int | Tensor, count: int, beta1: float, beta2: float, epsilon: float
+    state: AdamState, step: int | Tensor, count: int, beta1: float, beta2: float, epsilon: float
 ) -> StepFactors:
     """The factors of a step of `count` rows: of one number of updates, or where a tensor has that of each row, of any.
 
     Raises ValueError or TypeError for settings out of range, and unless a tensor counts the updates of each row.
     """
     if isinstance(step, int):
-        return step_factors(learning_rate, step, beta1, beta2, epsilon)
+        return step_factors(state.learning_rate, step, beta1, beta2, epsilon, state.early)
     check_updates(step, count, least=1)
-    return step_factors(learning_rate, None, beta1, beta2, epsilon)
+    return step_factors(state.learning_rate, None, beta1, beta2, epsilon, state.early)
 
 
 def step_factors(
-    learning_rate: float, updates: int | None, beta1: float = 0.9, beta2: float = 0.999, epsilon: float = 1e-15
+    learning_rate: float,
+    updates: int | None,
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    epsilon: float = 1e-15,
+    early: float = 1.0,
 ) -> StepFactors:
     """The factors after so many updates, or after any number of them (None), with both bias corrections folded in.
 
@@ -105,7 +113,10 @@ def step_factors(
         raise ValueError(f"step counts from 1, got {updates}")
     else:
         first, second = np.array([1 - beta1**updates]), np.array([1 - beta2**updates])
-    return StepFactors(learning_rate / first, 1 / np.sqrt(second), beta1, beta2, epsilon)
+    if not (math.isfinite(early) and early >= 1):
+        raise ValueError(f"early must be finite and at least 1, got {early}")
+    roots = 1 / np.sqrt(second)
+    return StepFactors(np.minimum(early, roots) * learning_rate / first, roots, beta1, beta2, epsilon)
 
 
 @cache
