@@ -22,7 +22,7 @@ PRESETS: dict[str, MethodConfig] = {
         training=TrainConfig(
             iterations=0,
             resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
-            early=3.0,
+            early=10.0,
             growth=GrowthConfig(statistics_from=300, start=500, until=0.6, threshold=1e-4),
         ),
         partition=PartitionConfig(blocks="auto"),
