@@ -185,10 +185,12 @@ class RunFolder:
     def evaluation(self) -> Path:
         return self.path / "evaluation"
 
-    def begin(self, settings: dict[str, Any], checked: Sequence[str] = SECTIONS) -> None:
+    def begin(
+        self, settings: dict[str, Any], checked: Sequence[str] = SECTIONS, command: str | None = None
+    ) -> None:
         """Write the settings of a new run, or check that those of the run that is there are the same.
 
-        Only the sections named in `checked` are compared. Raises RunError with the differences if they are not the
+        `command` is the one that begins it, kept so that people can be told how to continue. Only the sections named in `checked` are compared. Raises RunError with the differences if they are not the
         same, and if the folder holds something else.
         """
         if self.config_file.exists():
@@ -213,10 +215,10 @@ class RunFolder:
                 f"{self.path}: holds other files ({', '.join(sorted(strangers)[:3])}) and no config.yaml. "
                 "Choose an empty or a new folder for --output."
             )
-        self._write(settings)
+        self._write(settings, command)
 
-    def change_settings(self, settings: dict[str, Any], redo: bool) -> list[str]:
-        """Give a run other settings; returns what changed, one line each.
+    def change_settings(self, settings: dict[str, Any], redo: bool, command: str | None = None) -> list[str]:
+        """Give a run other settings; returns what changed, one line each. `command` as in `begin`.
 
         Raises RunError, with the differences, if trained work depends on what changed, unless `redo` allows to
         lose it. Stages delete what was made for other settings when they next run (`StageFolder.discard_unless`).
@@ -238,14 +240,24 @@ class RunFolder:
                 + f"\nThey make {' and '.join(lost)} useless. Add --redo to train that again, give the old settings to "
                 "continue, or take another --output."
             )  # fmt: skip
-        self._write(settings)
+        self._write(settings, command)
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
             self.coarse.discard_unless(after.coarse)
         return changed
 
-    def _write(self, settings: dict[str, Any]) -> None:
-        header = {"vdgs": {"version": __version__, "commit": _commit()}}
+    def _write(self, settings: dict[str, Any], command: str | None = None) -> None:
+        began = command or self.command()
+        header = {"vdgs": {"version": __version__, "commit": _commit()} | ({"command": began} if began else {})}
         write_text(self.config_file, yaml.safe_dump(header | settings, sort_keys=False, allow_unicode=True))
+
+    def command(self) -> str | None:
+        """The command that began the run, or gave it its settings; None where nothing says it."""
+        try:
+            header = yaml.safe_load(self.config_file.read_text(encoding="utf-8"))["vdgs"]
+        except (OSError, yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError):
+            return None
+        command = header.get("command") if isinstance(header, dict) else None
+        return command if isinstance(command, str) else None
 
     def settings(self) -> dict[str, Any]:
         """The settings of the run, every section whole, without the header that says which version wrote them."""
@@ -288,6 +300,20 @@ class RunFolder:
         """
         with _lock(self.path, fcntl.LOCK_SH if shared else fcntl.LOCK_EX):
             yield
+
+
+def is_locked(folder: Path) -> bool:
+    """Whether a process works on what is in a folder alone. Only looks: nothing is created."""
+    try:
+        handle = (folder / ".lock").open("rb")
+    except OSError:
+        return False
+    with handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 @contextmanager

@@ -73,7 +73,10 @@ def _train(
         state = continue_or_start(folder, stage, lambda: _start(anchors, stage), console)
         _announce(capture, state, config, console)
         train_watched(folder, state, stage, options, console)
-    facts = {"capture": capture_facts(capture), "version": __version__, "iterations": state.iteration}
+    facts = {
+        "capture": capture_facts(capture), "version": __version__, "iterations": state.iteration,
+        "key": run.keys().coarse,
+    }  # fmt: skip
     finish(folder, state, AnchorModel(*state.result(), voxel, background, facts), console)
 
 
