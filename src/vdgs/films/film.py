@@ -53,11 +53,8 @@ def render_run(asked: RenderRequest, console: Console) -> None:
     else:
         for name, frame in frames:
             write_png(asked.output / f"{name}.png", frame)
-    console.print(
-        f"{run.line}: {_extent(named, fps if asked.output.suffix else None)}, drawn in {time.monotonic() - began:.1f} s: "
-        f"{asked.output}",
-        highlight=False,
-    )
+    extent, seconds = _extent(named, fps if asked.output.suffix else None), time.monotonic() - began
+    console.print(f"{run.line}: {extent}, drawn in {seconds:.1f} s: {asked.output}", highlight=False)
 
 
 def _extent(named: list[tuple[str, Camera]], fps: float | None) -> str:

@@ -30,8 +30,9 @@ def begin_run(
     """Open the capture and a new run of it, or the run that is there if it was started with the same settings.
 
     `redo` None compares the settings of the coarse stage only and refuses others; True or False is about changing
-    them (`RunFolder.change_settings`). `command` is the one that asks, kept in the run. Raises CaptureError for a capture that cannot be used, RunError for other
-    settings than the run's, VdgsError for settings that do not work.
+    them (`RunFolder.change_settings`). `command` is the one that asks, kept in the run. Raises
+    CaptureError for a capture that cannot be used, RunError for other settings than the run's, VdgsError for settings
+    that do not work.
     """
     problems = validate(method)
     if problems:

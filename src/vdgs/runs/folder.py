@@ -185,12 +185,12 @@ class RunFolder:
     def evaluation(self) -> Path:
         return self.path / "evaluation"
 
-    def begin(
-        self, settings: dict[str, Any], checked: Sequence[str] = SECTIONS, command: str | None = None
-    ) -> None:
+    def begin(self, settings: dict[str, Any], checked: Sequence[str] = SECTIONS, command: str | None = None) -> None:
         """Write the settings of a new run, or check that those of the run that is there are the same.
 
-        `command` is the one that begins it, kept so that people can be told how to continue. Only the sections named in `checked` are compared. Raises RunError with the differences if they are not the
+        `command` is the one that begins it, kept so that people can be told how to continue.
+
+        Only the sections named in `checked` are compared. Raises RunError with the differences if they are not the
         same, and if the folder holds something else.
         """
         if self.config_file.exists():

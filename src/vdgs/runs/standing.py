@@ -11,12 +11,12 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from vdgs.errors import VdgsError
 from vdgs.partition.records import PartitionRecord
 from vdgs.runs.folder import RunFolder, StageFolder, is_locked
-from vdgs.runs.keys import StageKeys
+from vdgs.runs.keys import StageKeys, stage_keys
 from vdgs.runs.status import Status
 from vdgs.storage.files import read_record
 
@@ -95,14 +95,16 @@ class RunStanding:
         verbs = {
             "visibility": f"visibility {run}", "partition": f"partition {run}", "cameras": f"partition {run}",
             "merge": f"merge {run}", "coarse evaluation": f"eval {run} --model coarse", "evaluation": f"eval {run}",
+            "report": f"report {run}",
         }  # fmt: skip
         return f"vdgs {verbs.get(stage, f'train {run}')}"
 
 
-def standing_of(run: RunFolder) -> RunStanding:
-    """How far a run is. Reads only, and never fails on what it reads: what is damaged is `unknown`, and says why."""
+def standing_of(run: RunFolder, settings: dict[str, Any] | None = None) -> RunStanding:
+    """How far a run is, for its settings or for others. Reads only, and never fails on what it reads: what is damaged
+    is `unknown`, and says why."""
     try:
-        keys, why = run.keys(), ""
+        keys, why = run.keys() if settings is None else stage_keys(settings, run.coarse_identity()), ""
     except VdgsError as error:
         keys, why = None, _first_line(str(error))
     return RunStanding(run.path, tuple(_Survey(run, keys, why).stages()), run.command())
