@@ -14,12 +14,12 @@ from vdgs.captures.facts import refuse_another_capture
 from vdgs.captures.loading import load_capture
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.folder import RunFolder
 from vdgs.runs.standing import standing_of
 from vdgs.runs.status import Status
+from vdgs.runs.vouching import load_vouched
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.requests import ModelName
-from vdgs.storage.tensors import identity
 
 
 @dataclass(frozen=True)
@@ -67,29 +67,6 @@ def open_run(path: Path, which: ModelName = "best", device: torch.device | str =
     refuse_another_capture(stage.model, model.facts.get("capture", {}), capture)
     caution = _caution(folder, name) if which != "coarse" else ""
     return TrainedRun(folder, capture, model, stage.model, name, stage.status(), key, caution)
-
-
-def load_vouched(stage: StageFolder, key: str, block: int | None = None) -> AnchorModel:
-    """The model of a finished stage, of these settings and of this block.
-
-    Raises RunError for a file that the stage did not make, however it came there; VdgsError for one that is damaged.
-    """
-    model = AnchorModel.load(stage.model)
-    of_block, made_with = model.facts.get("block"), model.facts.get("key", key)  # older files do not say their key
-    wrong = ""
-    if of_block != block:
-        wrong = "a model of the whole scene" if of_block is None else f"the model of block {of_block}"
-    elif made_with != key:
-        wrong = "a model of other settings or of another run"
-    elif stage.status().model not in (None, identity(stage.model)):
-        wrong = "not the model that status.json beside it speaks of"
-    if wrong:
-        what = "this stage" if block is None else f"block {block}"
-        raise RunError(
-            f"{stage.model}: is {wrong}, not what {what} was trained to. Put the right file back, or delete this one "
-            "and give the command of the stage again: it is rebuilt from the last checkpoint."
-        )
-    return model
 
 
 def _not_there(folder: RunFolder, name: str) -> str:

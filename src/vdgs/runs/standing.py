@@ -18,6 +18,7 @@ from vdgs.partition.records import PartitionRecord
 from vdgs.runs.folder import RunFolder, StageFolder, is_locked
 from vdgs.runs.keys import StageKeys, stage_keys
 from vdgs.runs.status import Status
+from vdgs.runs.vouching import foreign, to_delete
 from vdgs.storage.files import read_record
 
 #: `stale`: made with other settings, for another cut or from another model than the run has now. `unknown`: something
@@ -27,7 +28,7 @@ State = Literal["done", "running", "queued", "stopped", "failed", "stale", "miss
 #: Why a result is stale, in words that end a sentence about it.
 OTHER_SETTINGS = "made with other settings than the run has now"
 OTHER_CUT = "trained for another cut or with other settings than the run has now"
-TRAINED_SINCE = "blocks were trained since it was merged"
+OTHER_BLOCKS = "its blocks are not those that it was merged from"
 OTHER_MODEL = "measured with another model than the run has now"
 
 
@@ -45,6 +46,8 @@ class Standing:
     """What the stage notes of itself, where it trains or merges."""
     made: str = ""
     """What tells what it made from any other."""
+    remedy: str = ""
+    """What to do before its command is of use."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ class RunStanding:
             return ""
         for stage in self.stages:
             if stage.state != "done":
-                return self._command_for(stage.name)
+                return stage.remedy + self._command_for(stage.name)
         return ""
 
     def _command_for(self, stage: str) -> str:
@@ -191,6 +194,9 @@ class _Survey:
         except VdgsError as error:
             return Standing(name, "unknown", inside, _first_line(str(error)))
         state, why = self._state_of(folder, status, key, other, locked)
+        if state == "done" and (wrong := foreign(folder, key or "", _number(name))):
+            remedy = f"delete {to_delete(folder)}, then "
+            return Standing(name, "stale", inside, f"model.safetensors is {wrong}", status, remedy=remedy)
         return Standing(name, state, inside, why, status, status.model or "")
 
     def _state_of(
@@ -218,7 +224,7 @@ class _Survey:
         models = tuple((b.status.model if b.status else None) if b.state == "done" else None for b in blocks)
         stands_in = [block.name for block, model in zip(blocks, models, strict=True) if model is None]
         if found.status.block_models != models:
-            return Standing("merge", "stale", found.folder, TRAINED_SINCE, found.status, found.made)
+            return Standing("merge", "stale", found.folder, OTHER_BLOCKS, found.status, found.made)
         why = f"the coarse model stands in for {', '.join(stands_in)}" if stands_in else ""
         return Standing("merge", "done", found.folder, why, found.status, found.made)
 
@@ -233,6 +239,11 @@ class _Survey:
         if self.run.gaussians.path.is_dir():  # of 3DGS: its figures are of no model with anchors
             found = None
         return self._judged(name, folder, there, found, found if found in known else None, made, OTHER_MODEL)
+
+
+def _number(name: str) -> int | None:
+    """Of a block, from the name of its standing."""
+    return int(name.split()[1]) if name.startswith("block ") else None
 
 
 def _first_line(text: str) -> str:

@@ -21,7 +21,8 @@ from vdgs.model.render import render
 from vdgs.partition.regions import split_anchors
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import TrainedRun, load_vouched, open_run
+from vdgs.runs.opening import TrainedRun, open_run
+from vdgs.runs.vouching import load_vouched
 from vdgs.settings.requests import ModelName
 from vdgs.storage.files import read_record, write_json
 

@@ -13,9 +13,10 @@ from vdgs.memory.process import forget_peak, peak_memory_bytes
 from vdgs.partition.merging import merge
 from vdgs.runs.cut import blocks_of, views_of_block
 from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import load_vouched, open_run
+from vdgs.runs.opening import open_run
 from vdgs.runs.standing import standing_of
 from vdgs.runs.status import Status
+from vdgs.runs.vouching import load_vouched
 from vdgs.storage.tensors import identity
 
 
