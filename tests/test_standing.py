@@ -167,6 +167,15 @@ def test_what_fails_and_stops_is_said_with_its_reason(run):
         assert "at work" in next_step(standing)
 
 
+def test_a_run_is_at_work_between_two_stages_too(run):
+    run.merged.model.unlink()
+    with run.driven():
+        assert next_step(whole_standing(run)) == "nothing to type: it is at work"
+        with pytest.raises(RunError, match="another vdgs process"), run.driven():
+            pass
+    assert standing_of(run).next_command() == f"vdgs merge {run.path}"
+
+
 def test_looking_changes_nothing_and_survives_damage(run):
     run.coarse.status_file.write_text('{"state": ')
     (run.partition / "partition.json").write_text("[")

@@ -8,6 +8,7 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.markup import escape
 
+from vdgs.captures.capture import Capture
 from vdgs.errors import RunError, VdgsError
 from vdgs.evaluation.of_run import evaluation_folder
 from vdgs.report import write_report
@@ -38,6 +39,12 @@ def run_all(asked: RunRequest, console: Console, command: str | None = None) -> 
     run, capture = begin_run(
         asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo, command=command
     )
+    with run.driven():
+        _stages(run, capture, asked, console)
+    console.print(escape(f"next: {next_step(whole_standing(run))}"), highlight=False)
+
+
+def _stages(run: RunFolder, capture: Capture, asked: RunRequest, console: Console) -> None:
     _title(console, "coarse model")
     train_coarse(run, capture, asked.watching, console, asked.device)
     stop_if_asked()
@@ -58,7 +65,6 @@ def run_all(asked: RunRequest, console: Console, command: str | None = None) -> 
     _verdict(run, console)
     stop_if_asked()
     console.print(f"report: {write_report(run)}", highlight=False)
-    console.print(escape(f"next: {next_step(whole_standing(run))}"), highlight=False)
 
 
 def _title(console: Console, name: str) -> None:

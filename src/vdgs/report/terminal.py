@@ -48,8 +48,8 @@ def status_facts(run: RunFolder) -> dict[str, Any]:
     """The same for programs."""
     standing = whole_standing(run)
     return {
-        "run": str(run.path), "whole": standing.whole, "next": standing.next_command() or None,
-        "stages": [_facts(stage) for stage in standing.stages],
+        "run": str(run.path), "whole": standing.whole, "at_work": standing.at_work,
+        "next": standing.next_command() or None, "stages": [_facts(stage) for stage in standing.stages],
     }  # fmt: skip
 
 
@@ -57,7 +57,7 @@ def next_step(standing: RunStanding) -> str:
     """What a person does next, in a line."""
     if command := standing.next_command():
         return command
-    if not standing.whole:
+    if standing.at_work:
         return "nothing to type: it is at work"
     run = shlex.quote(str(standing.path))
     return f"open {standing.path / FILE}, or film it: vdgs render {run} --views flyover --output flyover.mp4"

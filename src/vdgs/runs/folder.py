@@ -6,6 +6,7 @@ import fcntl
 import json
 import shutil
 import subprocess
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -26,6 +27,10 @@ from vdgs.storage.records import known, record_of
 
 #: The parts of config.yaml.
 SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
+
+#: A lock that is taken is tried so often, with so many seconds between: one who only looks (`is_locked`) holds it too,
+#: for a moment.
+LOCK_ATTEMPTS, LOCK_SECONDS = 3, 0.02
 
 
 @dataclass(frozen=True)
@@ -301,6 +306,22 @@ class RunFolder:
         with _lock(self.path, fcntl.LOCK_SH if shared else fcntl.LOCK_EX):
             yield
 
+    @contextmanager
+    def driven(self) -> Iterator[None]:
+        """Take this run from stage to stage, so that others can see it between two stages too (`is_driven`).
+
+        RunError if another process does.
+        """
+        with _lock(self._driver, fcntl.LOCK_EX):
+            yield
+
+    def is_driven(self) -> bool:
+        return is_locked(self._driver)
+
+    @property
+    def _driver(self) -> Path:
+        return self.path / ".run"
+
 
 def is_locked(folder: Path) -> bool:
     """Whether a process works on what is in a folder alone. Only looks: nothing is created."""
@@ -324,10 +345,16 @@ def _lock(folder: Path, kind: int) -> Iterator[None]:
     except OSError as error:
         raise RunError(f"{folder}: cannot be written ({error.strerror}). Choose another --output.") from error
     with handle:
-        try:
-            fcntl.flock(handle, kind | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RunError(f"{folder}: another vdgs process works on this run. Wait for it or stop it.") from error
+        for attempt in range(LOCK_ATTEMPTS):
+            try:
+                fcntl.flock(handle, kind | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if attempt + 1 == LOCK_ATTEMPTS:
+                    raise RunError(
+                        f"{folder}: another vdgs process works on this run. Wait for it or stop it."
+                    ) from error
+                time.sleep(LOCK_SECONDS)
         yield
 
 

@@ -59,6 +59,8 @@ class RunStanding:
     """In the order in which they are made."""
     command: str | None = None
     """The command that began the run, where it is known."""
+    driven: bool = False
+    """A command takes it from stage to stage."""
 
     def of(self, name: str) -> Standing:
         """A stage by its name: coarse, coarse evaluation, visibility, partition, cameras, block N, merge, evaluation.
@@ -77,6 +79,10 @@ class RunStanding:
         return all(stage.state == "done" for stage in self.stages)
 
     @property
+    def at_work(self) -> bool:
+        return self.driven or any(stage.state == "running" for stage in self.stages)
+
+    @property
     def digest(self) -> str:
         """What tells this standing from any other: a report of it is out of date once it differs."""
         content = [[stage.name, stage.state, stage.made] for stage in self.stages]
@@ -84,7 +90,7 @@ class RunStanding:
 
     def next_command(self) -> str:
         """What to type next; empty while something runs, and where all is done."""
-        if any(stage.state == "running" for stage in self.stages):
+        if self.at_work:
             return ""
         for stage in self.stages:
             if stage.state != "done":
@@ -110,7 +116,7 @@ def standing_of(run: RunFolder, settings: dict[str, Any] | None = None) -> RunSt
         keys, why = run.keys() if settings is None else stage_keys(settings, run.coarse_identity()), ""
     except VdgsError as error:
         keys, why = None, _first_line(str(error))
-    return RunStanding(run.path, tuple(_Survey(run, keys, why).stages()), run.command())
+    return RunStanding(run.path, tuple(_Survey(run, keys, why).stages()), run.command(), run.is_driven())
 
 
 @dataclass(frozen=True)
@@ -122,20 +128,23 @@ class _Survey:
     why_unknown: str
 
     def stages(self) -> Iterator[Standing]:
-        run, keys = self.run, self.keys
-        coarse = self._trained("coarse", run.coarse, keys and keys.coarse, OTHER_SETTINGS, run.path)
+        run = self.run
+        coarse = self._trained("coarse", run.coarse, self._key("coarse"), OTHER_SETTINGS, run.path)
         yield coarse
         yield self._visibility()
         yield self._measured("coarse evaluation", run.coarse.path / "evaluation", [coarse])
         yield from self._cut()
         blocks = [
-            self._trained(f"block {int(folder.path.name)}", folder, keys and keys.blocks, OTHER_CUT, folder.path)
+            self._trained(f"block {int(folder.path.name)}", folder, self._key("blocks"), OTHER_CUT, folder.path)
             for folder in self._block_folders()
         ]
         yield from blocks
         merged = self._merged(blocks)
         yield merged
         yield self._measured("evaluation", run.evaluation, [merged, coarse])
+
+    def _key(self, stage: str) -> str | None:
+        return None if self.keys is None else str(getattr(self.keys, stage))
 
     def _judged(
         self, name: str, folder: Path, there: bool, found: object, wanted: object, made: str, why: str = OTHER_SETTINGS
@@ -160,7 +169,7 @@ class _Survey:
     def _visibility(self) -> Standing:
         file = self.run.visibility / "visibility.json"
         found = read_record(file).get("key")
-        wanted = self.keys and self.keys.visibility
+        wanted = self._key("visibility")
         return self._judged("visibility", file.parent, file.exists(), found, wanted, str(found))
 
     def _record(self) -> PartitionRecord:
@@ -170,11 +179,11 @@ class _Survey:
             return PartitionRecord()
 
     def _cut(self) -> Iterator[Standing]:
-        folder, record, keys = self.run.partition, self._record(), self.keys
+        folder, record = self.run.partition, self._record()
         there = (folder / "partition.json").exists()
-        cut = self._judged("partition", folder, there, record.key, keys and keys.partition, str(record.key))
+        cut = self._judged("partition", folder, there, record.key, self._key("partition"), str(record.key))
         cameras = self._judged(
-            "cameras", folder, there, record.assignment_key, keys and keys.assignment, str(record.assignment_key)
+            "cameras", folder, there, record.assignment_key, self._key("assignment"), str(record.assignment_key)
         )
         yield cut
         yield cameras
@@ -217,8 +226,8 @@ class _Survey:
         return "stopped", "it has a checkpoint, and says nothing of itself"
 
     def _merged(self, blocks: list[Standing]) -> Standing:
-        merged, keys = self.run.merged, self.keys
-        found = self._trained("merge", merged, keys and keys.merge, OTHER_SETTINGS, self.run.path)
+        merged = self.run.merged
+        found = self._trained("merge", merged, self._key("merge"), OTHER_SETTINGS, self.run.path)
         if found.state != "done" or found.status is None:
             return found
         models = tuple((b.status.model if b.status else None) if b.state == "done" else None for b in blocks)
