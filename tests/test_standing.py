@@ -16,7 +16,8 @@ from vdgs.cli import main
 from vdgs.errors import RunError
 from vdgs.report import write_report
 from vdgs.report.terminal import NOT_WHOLE, next_step, whole_standing
-from vdgs.runs.folder import RunFolder, is_locked
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.locks import is_locked
 from vdgs.runs.opening import open_run
 from vdgs.runs.standing import OTHER_BLOCKS, OTHER_CUT, OTHER_MODEL, OTHER_SETTINGS, standing_of
 from vdgs.runs.status import Status
@@ -135,7 +136,7 @@ def test_a_block_trained_again_makes_the_merged_model_out_of_date(run):
     standing = standing_of(run)
     assert (standing.of("merge").state, standing.of("merge").why) == ("stale", OTHER_BLOCKS)
     assert standing.of("evaluation").state == "stale"
-    assert standing.next_command() == f"vdgs merge {run.path}"
+    assert standing.next_command() == COMMAND  # which merges and measures again
 
 
 def test_figures_of_another_model_are_out_of_date(run):
@@ -158,7 +159,7 @@ def test_what_fails_and_stops_is_said_with_its_reason(run):
     standing = standing_of(run)
     assert (standing.of("block 0").state, standing.of("block 0").why) == ("failed", "out of memory")
     assert standing.of("block 1").state == "stopped"  # no process works on it
-    assert standing.next_command() == f"vdgs train {run.path}"
+    assert standing.next_command() == COMMAND  # which takes it to its end
     with run.block(1).locked():
         assert is_locked(run.block(1).path)
         standing = standing_of(run)
@@ -173,7 +174,6 @@ def test_a_run_is_at_work_between_two_stages_too(run):
         assert next_step(whole_standing(run)) == "nothing to type: it is at work"
         with pytest.raises(RunError, match="another vdgs process"), run.driven():
             pass
-    assert standing_of(run).next_command() == f"vdgs merge {run.path}"
 
 
 def test_looking_changes_nothing_and_survives_damage(run):
@@ -252,10 +252,12 @@ def test_a_merged_model_of_other_blocks_is_opened_with_a_caution(run, opened_wit
     assert f"vdgs merge {run.path}" in opened.caution
 
 
-def test_the_command_that_began_a_run_survives_other_settings(run):
-    settings = run.settings()
-    settings["merge"] = {**settings["merge"], "rule": "best_seen"}
-    run.change_settings(settings, redo=True)
-    assert run.command() == COMMAND
+def test_the_command_that_began_a_run_is_advised_while_the_settings_are_its_own(run):
+    run.merged.model.unlink()
+    assert standing_of(run).next_command() == COMMAND
+    other = run.settings() | {"merge": asdict(MethodConfig().merge) | {"rule": "best_seen"}}
+    run.change_settings(other, redo=True)
+    assert run.command() is None
+    assert standing_of(run).next_command() == f"vdgs merge {run.path}"
     run.change_settings(run.settings() | {"merge": asdict(MethodConfig().merge)}, redo=True, command="vdgs run anew")
-    assert run.command() == "vdgs run anew"
+    assert standing_of(run).next_command() == "vdgs run anew"

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import shutil
 import subprocess
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +17,7 @@ from vdgs import __version__
 from vdgs.errors import RunError, VdgsError
 from vdgs.partition.records import PartitionRecord
 from vdgs.runs.keys import StageKeys, stage_keys
+from vdgs.runs.locks import hold, is_locked
 from vdgs.runs.status import Status
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import differences, from_dict, to_dict
@@ -27,10 +26,6 @@ from vdgs.storage.records import known, record_of
 
 #: The parts of config.yaml.
 SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
-
-#: A lock that is taken is tried so often, with so many seconds between: one who only looks (`is_locked`) holds it too,
-#: for a moment.
-LOCK_ATTEMPTS, LOCK_SECONDS = 3, 0.02
 
 
 @dataclass(frozen=True)
@@ -110,7 +105,7 @@ class StageFolder:
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Hold this stage for this process; RunError if another one works on it."""
-        with _lock(self.path, fcntl.LOCK_EX):
+        with hold(self.path):
             yield
 
     def is_held(self) -> bool:
@@ -251,12 +246,11 @@ class RunFolder:
         return changed
 
     def _write(self, settings: dict[str, Any], command: str | None = None) -> None:
-        began = command or self.command()
-        header = {"vdgs": {"version": __version__, "commit": _commit()} | ({"command": began} if began else {})}
+        header = {"vdgs": {"version": __version__, "commit": _commit()} | ({"command": command} if command else {})}
         write_text(self.config_file, yaml.safe_dump(header | settings, sort_keys=False, allow_unicode=True))
 
     def command(self) -> str | None:
-        """The command that began the run, or gave it its settings; None where nothing says it."""
+        """The command that gave the run the settings that it has; None where several did, or nothing says it."""
         try:
             header = yaml.safe_load(self.config_file.read_text(encoding="utf-8"))["vdgs"]
         except (OSError, yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError):
@@ -303,7 +297,7 @@ class RunFolder:
 
         RunError if another process stands in the way.
         """
-        with _lock(self.path, fcntl.LOCK_SH if shared else fcntl.LOCK_EX):
+        with hold(self.path, shared):
             yield
 
     @contextmanager
@@ -312,7 +306,7 @@ class RunFolder:
 
         RunError if another process does.
         """
-        with _lock(self._driver, fcntl.LOCK_EX):
+        with hold(self._driver):
             yield
 
     def is_driven(self) -> bool:
@@ -321,41 +315,6 @@ class RunFolder:
     @property
     def _driver(self) -> Path:
         return self.path / ".run"
-
-
-def is_locked(folder: Path) -> bool:
-    """Whether a process works on what is in a folder alone. Only looks: nothing is created."""
-    try:
-        handle = (folder / ".lock").open("rb")
-    except OSError:
-        return False
-    with handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
-
-
-@contextmanager
-def _lock(folder: Path, kind: int) -> Iterator[None]:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = (folder / ".lock").open("w")
-    except OSError as error:
-        raise RunError(f"{folder}: cannot be written ({error.strerror}). Choose another --output.") from error
-    with handle:
-        for attempt in range(LOCK_ATTEMPTS):
-            try:
-                fcntl.flock(handle, kind | fcntl.LOCK_NB)
-                break
-            except BlockingIOError as error:
-                if attempt + 1 == LOCK_ATTEMPTS:
-                    raise RunError(
-                        f"{folder}: another vdgs process works on this run. Wait for it or stop it."
-                    ) from error
-                time.sleep(LOCK_SECONDS)
-        yield
 
 
 def _commit() -> str | None:

@@ -15,8 +15,9 @@ from typing import Any, Literal
 
 from vdgs.errors import VdgsError
 from vdgs.partition.records import PartitionRecord
-from vdgs.runs.folder import RunFolder, StageFolder, is_locked
+from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.keys import StageKeys, stage_keys
+from vdgs.runs.locks import is_locked
 from vdgs.runs.status import Status
 from vdgs.runs.vouching import foreign, to_delete
 from vdgs.storage.files import read_record
@@ -58,7 +59,7 @@ class RunStanding:
     stages: tuple[Standing, ...]
     """In the order in which they are made."""
     command: str | None = None
-    """The command that began the run, where it is known."""
+    """The command that began the run, where its settings are still those that it asked for."""
     driven: bool = False
     """A command takes it from stage to stage."""
 
@@ -94,8 +95,17 @@ class RunStanding:
             return ""
         for stage in self.stages:
             if stage.state != "done":
+                if self._continues and not stage.remedy:
+                    return self.command or ""
                 return stage.remedy + self._command_for(stage.name)
         return ""
+
+    @property
+    def _continues(self) -> bool:
+        """The command that began the run takes it to its end: it asked for all stages, and for the settings that the
+        run has."""
+        others = any(stage.state == "stale" and stage.why in (OTHER_SETTINGS, OTHER_CUT) for stage in self.stages)
+        return (self.command or "").startswith("vdgs run ") and not others
 
     def _command_for(self, stage: str) -> str:
         run = shlex.quote(str(self.path))
