@@ -1,12 +1,15 @@
 """The command line: help comes without heavy imports, errors come without tracebacks."""
 
+import shlex
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from cli_support import PATIENCE_SECONDS, entry_point, vdgs
 from vdgs.cli import HELP, VERBS, main
+from vdgs.verbs.shared import as_typed, open_console
 
 HEAVY = ("torch", "numpy", "matplotlib", "pycolmap", "cv2", "scipy")
 
@@ -68,3 +71,21 @@ def test_settings_that_do_not_work_are_named(tmp_path):
     done = vdgs("coarse", str(tmp_path), "--output", str(tmp_path / "run"), "--iterations", "-1")
     assert done.returncode == 1
     assert "iterations is -1" in done.stderr
+
+
+def test_quiet_leaves_what_a_person_must_know(capsys):
+    for quiet, heard in ((True, ""), (False, "trained\n")):
+        console = open_console(quiet)
+        console.print("trained", highlight=False)
+        console.print("[yellow]warning[/] it may run out of memory", highlight=False)
+        said = capsys.readouterr()
+        assert said.out.replace("warning it may run out of memory\n", "") == heard
+        assert "warning it may run out of memory" in said.out + said.err
+
+
+def test_the_command_that_is_kept_works_in_every_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    typed = ["my place", "--output", "run", "--redo", "--blocks", "2", "--quiet"]
+    kept = as_typed("run", typed, (Path("my place"), Path("run")))
+    assert shlex.split(kept) == ["vdgs", "run", f"{tmp_path}/my place", "--output", f"{tmp_path}/run", "--blocks", "2"]
+    assert f"--output={tmp_path}/run" in as_typed("run", ["my place", "--output=run"], (Path("my place"), Path("run")))

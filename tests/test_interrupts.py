@@ -2,10 +2,12 @@
 
 import signal
 import threading
+from contextlib import suppress
 
 import pytest
 
-from vdgs.watching.interrupts import stop_requests
+from vdgs.errors import Interrupted
+from vdgs.watching.interrupts import stop_if_asked, stop_requests
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -49,6 +51,27 @@ def test_hangup_stays_ignored_under_nohup_and_is_left_alone_where_not_asked_for(
         signal.signal(signal.SIGHUP, before)
     with stop_requests():
         assert signal.getsignal(signal.SIGHUP) == before
+
+
+def test_a_request_that_the_inner_work_had_no_time_for_stops_the_outer():
+    """Ctrl-C with the last step of a stage: the stage is complete, what comes after it must not begin."""
+    with stop_requests(interrupts=True) as outer:
+        with stop_requests(second_interrupts=True) as inner:
+            signal.raise_signal(signal.SIGINT)
+        assert list(outer) == list(inner) == [signal.SIGINT]
+        with pytest.raises(Interrupted):
+            stop_if_asked()
+    stop_if_asked()  # another command in this process was not asked
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_that_was_swallowed_is_not_forgotten(number):
+    with stop_requests(interrupts=True):
+        stop_if_asked()
+        with suppress(KeyboardInterrupt):  # as in a callback of a library
+            signal.raise_signal(number)
+        with pytest.raises(Interrupted):
+            stop_if_asked()
 
 
 def test_outside_the_main_thread_nothing_is_noted():

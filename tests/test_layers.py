@@ -30,7 +30,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("watching",),
     ("executors", "evaluation"),
     ("stages", "films", "report", "comparators", "export"),
-    ("pipeline", "doctor", "bench"),
+    ("pipeline", "planning", "doctor", "bench"),
     ("verbs",),
     ("cli",),
 )

@@ -3,6 +3,7 @@
 import json
 import shutil
 import signal
+from contextlib import suppress
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -239,6 +240,63 @@ def test_a_block_that_is_killed_is_started_again(unbroken, copied):
     assert "crashed by SIGKILL" in done.stdout
     assert "continuing at iteration 20" in (copied / "blocks/01/output.log").read_text()
     assert model(copied, "blocks/01/model.safetensors") == model(unbroken, "blocks/01/model.safetensors")
+
+
+def swallow_ctrl_c() -> None:
+    """Let Ctrl-C come between two stages, inside something that swallows it."""
+    from vdgs import pipeline
+
+    def measure_visibility(*_: object) -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    pipeline.measure_visibility = measure_visibility  # type: ignore[assignment]
+
+
+def test_ctrl_c_between_stages_stops_the_run_and_the_same_command_continues(capture, copied):
+    shutil.rmtree(copied / "merged")
+    stopped = vdgs("run", capture, "--output", copied, *SETTINGS, prepare=swallow_ctrl_c)
+    assert stopped.returncode == 130
+    assert "interrupted. The same command continues" in stopped.stderr
+    assert not (copied / "merged").exists()
+    done = vdgs("run", capture, "--output", copied, *SETTINGS, "--quiet")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    status = vdgs("status", copied)
+    assert status.returncode == 0, status.stdout
+    assert "next: open" in status.stdout
+
+
+def test_a_dry_run_says_what_it_takes_and_writes_nothing(capture, copied, tmp_path):
+    before = moments(copied)
+    for output, done in ((copied, True), (tmp_path / "new", False)):
+        planned = vdgs("run", capture, "--output", output, *SETTINGS, "--dry-run")
+        assert planned.returncode == 0, planned.stderr
+        assert f"{ITERATIONS} iterations" in planned.stdout
+        assert f"2 blocks: about {BLOCK_ITERATIONS} iterations each, 2 at once" in planned.stdout
+        assert planned.stdout.count("done already") == 2 * done
+    changed = vdgs("run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0", "--dry-run")
+    assert "partition.lambda_vis: 1.0 -> 0.0" in changed.stdout
+    assert changed.stdout.count("done already") == 1
+    assert changed_files(copied, before) == set()
+    assert not (tmp_path / "new").exists()
+
+
+def test_another_cut_leaves_no_old_result_standing(copied):
+    """What was trained and measured for the cut of before is neither merged nor drawn nor reported as this one's."""
+    assert vdgs("partition", copied, "--lambda-vis", "0.5", "--redo").returncode == 0
+    refused = vdgs("merge", copied)
+    assert refused.returncode == 1
+    assert "block 0: trained for another cut" in refused.stderr
+    drawn = vdgs("render", copied, "--output", copied / "views", "--width", "32")
+    assert drawn.returncode == 0, drawn.stderr
+    assert "this is the coarse model, not the merged one" in drawn.stdout
+    assert "coarse model (" in drawn.stdout
+    assert "of 32x" in drawn.stdout
+    assert vdgs("report", copied).returncode == 0
+    assert "Coarse model: PSNR" in (copied / "report.html").read_text()
+    again = vdgs("train", copied, prepare=do_tasks_here)
+    assert again.returncode == 0, again.stderr
+    assert "trained again: blocks 0, 1" in again.stdout
 
 
 def test_one_block_alone_is_the_same_block(unbroken, copied):

@@ -38,6 +38,7 @@ def test_files_of_newer_and_older_versions_are_read(tmp_path):
         ("[1, 2]", "not an object"), ("3", "not an object"), ("{}", "says no state"), ('{"state": 3}', "state is 3"),
         ('{"state": "done", "iteration": "many"}', "iteration is 'many'"),
         ('{"state": "done", "anchors": true}', "anchors is True"),
+        ('{"state": "done", "seconds": 1' + "0" * 400 + "}", "seconds is 1000"),
         ('{"state": "done", "blocks": [{"block": 0}]}', "trained"), ('{"state": "done", "blocks": 4}', "not a list"),
         ('{"sta', "not valid JSON"),
     ],

@@ -251,7 +251,8 @@ def test_a_coarse_run_is_reported_with_what_it_has(tmp_path):
     assert page.row("PSNR (dB) ↑") == ["PSNR (dB) ↑", "27.12", "–", "–"]
     assert page.row("0.5 to 3.25")[2:5] == ["25.12", "–", "–"]
     assert "Best: third.jpg, 29.00 dB" in text
-    assert 'class="note"' not in page.source
+    assert page.source.count('class="note"') == 1  # its config.yaml is not whole
+    assert "It cannot be told whether these were made with the settings of the run: coarse, coarse eval" in text
 
 
 def test_the_coarse_model_may_be_the_one_that_is_evaluated(tmp_path):

@@ -13,6 +13,7 @@ vdgs turns a folder of drone photographs into one 3D Gaussian splatting scene.
 
   inspect CAPTURE --output FOLDER   what a capture holds and how well it covers the place
   run CAPTURE --output RUN          everything: model, blocks, merge, metrics, report; the same command continues
+  status RUN                        how far a run is, stage by stage, and what to type next
 
 its stages, one by one:
   coarse CAPTURE --output RUN       train the global model; the same command continues it
@@ -34,13 +35,16 @@ transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of Matri
 """
 
 VERBS = (
-    "inspect", "run", "coarse", "visibility", "partition", "train", "merge", "eval", "report", "render", "synth",
-    "bench", "doctor",
+    "inspect", "run", "status", "coarse", "visibility", "partition", "train", "merge", "eval", "report", "render",
+    "synth", "bench", "doctor",
 )  # fmt: skip
+#: Verbs that take up what they left when they were interrupted.
+CONTINUES = ("run", "coarse", "train", "bench")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of `vdgs`. Exit codes: 0 done, 1 an error that the message explains, 2 usage, 130 stopped."""
+    """Entry point of `vdgs`. Exit codes: 0 done, 1 an error that the message explains, 2 usage, 130 stopped; 3 from
+    `vdgs status`, of a run that is not whole."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(HELP, end="")
@@ -58,17 +62,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _run(verb: str, arguments: list[str]) -> int:
     from vdgs import verbs
-    from vdgs.errors import Stopped, VdgsError
+    from vdgs.errors import Interrupted, Stopped, VdgsError
+    from vdgs.watching.interrupts import stop_requests
 
     action: Callable[[list[str]], Any] = getattr(verbs, verb)
     try:
-        return int(action(arguments) or 0)
+        with stop_requests(interrupts=True):
+            return int(action(arguments) or 0)
+    except (KeyboardInterrupt, Interrupted):
+        again = "continues: what is finished is kept" if verb in CONTINUES else "begins it anew"
+        print(f"vdgs {verb}: interrupted. The same command {again}.", file=sys.stderr)
+        return 130
     except VdgsError as error:
         print(f"vdgs {verb}: {error}", file=sys.stderr)
         return 130 if isinstance(error, Stopped) else 1
-    except KeyboardInterrupt:
-        print(f"vdgs {verb}: interrupted", file=sys.stderr)
-        return 130
     except BrokenPipeError:
         return 1
     except OSError as error:  # a disk that is full, a folder that cannot be written: no news from a traceback

@@ -25,3 +25,7 @@ class TrainingDiverged(VdgsError):
 
 class Stopped(VdgsError):
     """Work was asked to stop; what it had done is saved."""
+
+
+class Interrupted(Stopped):
+    """Work was asked to stop between two steps of it: nothing had to be saved."""

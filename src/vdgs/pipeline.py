@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rich.console import Console
+from rich.markup import escape
 
+from vdgs.captures.capture import Capture
 from vdgs.errors import RunError, VdgsError
 from vdgs.evaluation.of_run import evaluation_folder
 from vdgs.report import write_report
+from vdgs.report.terminal import next_step, whole_standing
 from vdgs.runs.beginning import begin_run
 from vdgs.runs.folder import RunFolder
 from vdgs.settings.requests import RunRequest
@@ -20,19 +23,31 @@ from vdgs.stages.partition import partition_run
 from vdgs.stages.train import train_blocks
 from vdgs.stages.visibility import measure_visibility
 from vdgs.storage.files import read_json
+from vdgs.watching.interrupts import stop_if_asked
 
 
-def run_all(asked: RunRequest, console: Console) -> None:
+def run_all(asked: RunRequest, console: Console, command: str | None = None) -> None:
     """Everything from a capture to a report, on a device that is chosen already (`vdgs.kernels.devices`).
+
+    `command` is what asks for it, kept in the run for people who want to continue it.
 
     Raises what the stages raise; all that was finished before stays, and the same command continues.
     """
     asked.watching.check()
     if asked.jobs < 0 or asked.bins < 1:
         raise VdgsError("--jobs must not be negative and --bins must be at least 1")
-    run, capture = begin_run(asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo)
+    run, capture = begin_run(
+        asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo, command=command
+    )
+    with run.driven():
+        _stages(run, capture, asked, console)
+    console.print(escape(f"next: {next_step(whole_standing(run))}"), highlight=False)
+
+
+def _stages(run: RunFolder, capture: Capture, asked: RunRequest, console: Console) -> None:
     _title(console, "coarse model")
     train_coarse(run, capture, asked.watching, console, asked.device)
+    stop_if_asked()
     measure_visibility(run, console)
     _measure(run, "coarse", asked, console)
     _title(console, "blocks")
@@ -48,16 +63,19 @@ def run_all(asked: RunRequest, console: Console) -> None:
     merge_run(run.path, asked.incomplete, console)
     _measure(run, "merged", asked, console)
     _verdict(run, console)
+    stop_if_asked()
     console.print(f"report: {write_report(run)}", highlight=False)
 
 
 def _title(console: Console, name: str) -> None:
+    stop_if_asked()
     console.print()
     console.rule(f"[bold]{name}", align="left", style="dim")
 
 
 def _measure(run: RunFolder, which: Literal["coarse", "merged"], asked: RunRequest, console: Console) -> None:
     """Evaluate a model unless that was done already, for this very model and in the same way."""
+    stop_if_asked()
     if is_measured(run, which, asked.lpips_weights, asked.bins):
         console.print(f"{evaluation_folder(run, which)}: already measured; nothing to do", highlight=False)
         return

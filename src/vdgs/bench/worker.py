@@ -190,10 +190,12 @@ def _plain(value: Any) -> Any:
 def main(arguments: list[str]) -> int:
     """Exit codes as those of the command line: 0 done, 1 explained, 130 stopped."""
     from vdgs.executors.parent import stop_when_parent_dies
+    from vdgs.watching.interrupts import stop_requests
 
     stop_when_parent_dies()
     try:
-        work(Job.read(Path(arguments[0])))
+        with stop_requests(interrupts=True):
+            work(Job.read(Path(arguments[0])))
     except VdgsError as error:
         print(f"vdgs bench: {error}", file=sys.stderr)
         return 130 if isinstance(error, Stopped) else 1

@@ -45,6 +45,7 @@ from vdgs.evaluation.solidity import (
 from vdgs.evaluation.tables import metrics_table
 from vdgs.kernels.types import Raster, Splats
 from vdgs.storage.files import jsonable, write_json
+from vdgs.watching.interrupts import stop_if_asked
 
 RAW = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")
 CORRECTED = tuple(f"{name}_cc" for name in RAW)
@@ -67,6 +68,9 @@ class ModelFacts:
     model_bytes: int | None = None
     train_seconds: float | None = None
     peak_memory_bytes: int | None = None
+    #: What tells the model from any other, and the settings that it was made with (`runs.keys`).
+    model_identity: str | None = None
+    key: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +182,7 @@ def evaluate(
     stems = saving.file_stems([view.name for view in views])
     on_sheet = set(np.linspace(0, len(views) - 1, min(len(views), settings.contact_views)).round().astype(int))
     for index, view in enumerate(views):
+        stop_if_asked()
         _evaluate_view(view, stems[index], index in on_sheet, inputs, gathered)
     result = _summary(gathered, model, lpips_note, settings)
     _write(output, result, gathered, settings.title)

@@ -49,6 +49,8 @@ def evaluate_run(
         model_bytes=run.model_path.stat().st_size,
         train_seconds=run.status.seconds,
         peak_memory_bytes=run.status.peak_memory_bytes,
+        model_identity=run.status.model,
+        key=run.key,
     )
     chosen = run.capture.test_views if views == "test" else run.capture.train_views
     coarse = _coarse(run)

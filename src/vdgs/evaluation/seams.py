@@ -39,6 +39,7 @@ from vdgs.evaluation.tables import shown
 from vdgs.kernels.types import Raster
 from vdgs.partition.blocks import Blocks
 from vdgs.storage.files import jsonable, write_json
+from vdgs.watching.interrupts import stop_if_asked
 
 #: Renders that are measured by block: without blocks, the block as it was trained, all blocks together.
 RENDERS = ("coarse", "alone", "merged")
@@ -109,6 +110,7 @@ def evaluate_blocks(
     inputs = _Inputs(photographs, render_coarse, render_merged, render_block, blocks)
     gathered = _Gathered(BlockMetrics(len(blocks), RENDERS))
     for view, stem in zip(views, saving.file_stems([view.name for view in views]), strict=True):
+        stop_if_asked()
         _measure(view, stem, inputs, gathered)
     result = jsonable(
         {

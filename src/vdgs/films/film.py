@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 
 import matplotlib
@@ -19,6 +20,7 @@ from vdgs.model.render import render, render_values
 from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.runs.visibility import visibility_of_run
 from vdgs.settings.requests import RenderRequest
+from vdgs.watching.interrupts import stop_if_asked
 
 #: Pace of a film of separate views.
 SLIDES_PER_SECOND = 2.0
@@ -31,7 +33,10 @@ def render_run(asked: RenderRequest, console: Console) -> None:
     """
     if min(asked.width, asked.fps, asked.seconds) < 0:
         raise VdgsError("--width, --fps and --seconds must not be negative")
+    began = time.monotonic()
     run = open_run(asked.run, asked.model, asked.device)
+    if run.caution:
+        console.print(f"[yellow]warning[/] {run.caution}", highlight=False)
     named, fps = _cameras(asked, run)
     if asked.width:
         named = [(name, camera.resized(asked.width, _height(camera, asked.width))) for name, camera in named]
@@ -48,7 +53,16 @@ def render_run(asked: RenderRequest, console: Console) -> None:
     else:
         for name, frame in frames:
             write_png(asked.output / f"{name}.png", frame)
-    console.print(f"{len(named)} views: {asked.output}", highlight=False)
+    extent, seconds = _extent(named, fps if asked.output.suffix else None), time.monotonic() - began
+    console.print(f"{run.line}: {extent}, drawn in {seconds:.1f} s: {asked.output}", highlight=False)
+
+
+def _extent(named: list[tuple[str, Camera]], fps: float | None) -> str:
+    """How many frames of which sizes; of a film also how long it is."""
+    sizes = list(dict.fromkeys(f"{camera.width}x{camera.height}" for _, camera in named))
+    shown = sizes[0] if len(sizes) == 1 else f"{len(sizes)} sizes"
+    frames = f"{len(named):,} frame{'' if len(named) == 1 else 's'} of {shown}"
+    return frames if fps is None else f"{frames}, a film of {len(named) / fps:.1f} s at {fps:g} frames a second"
 
 
 def _cameras(asked: RenderRequest, run: TrainedRun) -> tuple[list[tuple[str, Camera]], float]:
@@ -81,6 +95,7 @@ def _frames(
     counts = visibility_of_run(run).float() if kind == "visibility" else None
     span: tuple[float, float] | None = None if counts is None else (0.0, float(counts.max()))
     for name, camera in track(named, "rendering", console=console, disable=not console.is_terminal):
+        stop_if_asked()
         if kind == "image":
             yield name, to_8bit(render(run.model, camera).image.cpu().numpy())
             continue

@@ -2,59 +2,58 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from vdgs.report.page import Html, details, paragraph, preformatted, section, table
-from vdgs.report.reading import Record, Source
+from vdgs.report.reading import Record, Shown, Source
 from vdgs.report.training import block_names
 from vdgs.report.words import duration, memory
-from vdgs.runs.folder import RunFolder
 
 #: Characters of config.yaml that are shown.
 LONGEST_SETTINGS = 60_000
+CAPTION = "Blocks trained side by side count one by one; what is out of date does not count"
 
 
-def costs_section(run: RunFolder) -> Html:
-    source = Source(run.path)
-    stages = [(name, record) for name, record in _stages(source, run) if record]
-    rows = [
-        [
-            name,
-            duration(record.number("seconds")),
-            memory(record.number("peak_memory_bytes")),
-            record.text("state") or "",
-        ]
-        for name, record in stages
-    ]
-    if rows:
-        seconds = [record.number("seconds") or 0.0 for _, record in stages]
-        peaks = [record.number("peak_memory_bytes") or 0.0 for _, record in stages]
+def costs_section(shown: Shown) -> Html:
+    source = shown.source()
+    stages = [(name, record) for name, record in _stages(source, shown) if record]
+    rows = [[name, *_cost(record), shown.state_of(_standing_name(name))] for name, record in stages]
+    counted = [record for name, record in stages if shown.standing.of(_standing_name(name)).state != "stale"]
+    if counted:
+        seconds = [record.number("seconds") or 0.0 for record in counted]
+        peaks = [record.number("peak_memory_bytes") or 0.0 for record in counted]
         rows.append(["sum, highest", duration(sum(seconds)), memory(max(peaks)), ""])
     parts = [
-        table(["stage", "time", "peak memory", "state"], rows, "Blocks trained side by side count one by one"),
+        table(["stage", "time", "peak memory", "state"], rows, CAPTION),
         Html("") if rows else paragraph("No stage has run yet.", "absent"),
     ]
     return section("costs", "Time and memory", parts, source.notes)
 
 
-def _stages(source: Source, run: RunFolder) -> list[tuple[str, Record]]:
+def _cost(record: Record) -> tuple[str, str]:
+    return duration(record.number("seconds")), memory(record.number("peak_memory_bytes"))
+
+
+def _standing_name(row: str) -> str:
+    """The stage that a row of the table is about."""
+    return {"coarse training": "coarse", "partition and assignment": "cameras"}.get(row, row)
+
+
+def _stages(source: Source, shown: Shown) -> list[tuple[str, Record]]:
     merged = source.record("merged/status.json").values
     merge = {
         "seconds": merged.get("merge_seconds"), "peak_memory_bytes": merged.get("merge_peak_memory_bytes"),
-        "state": merged.get("state"),
     }  # fmt: skip
     return [
         ("coarse training", source.record("coarse/status.json")),
         ("coarse evaluation", source.record("coarse/evaluation/status.json")),
         ("partition and assignment", source.record("partition/partition.json")),
-        *((f"block {index}", source.record(f"{name}/status.json")) for index, name in block_names(run)),
+        *((f"block {index}", source.record(f"{name}/status.json")) for index, name in block_names(shown.run)),
         ("merge", Record(merge if merged else {})),
         ("evaluation", source.record("evaluation/status.json")),
     ]
 
 
-def settings_section(root: Path) -> Html:
-    source = Source(root)
+def settings_section(shown: Shown) -> Html:
+    source = shown.source()
     text = source.text("config.yaml")
     parts: list[Html] = []
     if text is None:

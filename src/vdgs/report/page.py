@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NewType
 
 from vdgs.report.pictures import Picture
@@ -141,12 +141,14 @@ def contents(entries: Iterable[tuple[str, str]]) -> Html:
     return Html(f"<nav>{links}</nav>")
 
 
-def document(title: str, parts: Iterable[Html]) -> str:
+def document(title: str, parts: Iterable[Html], facts: Mapping[str, str] | None = None) -> str:
+    """A whole page; `facts` stand in its head, for programs."""
+    told = "".join(f'<meta name="{escaped(k)}" content="{escaped(v)}">\n' for k, v in (facts or {}).items())
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{escaped(POLICY)}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escaped(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<main>\n"
+        f"{told}<title>{escaped(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<main>\n"
         f"{joined(parts)}\n</main>\n</body>\n</html>\n"
     )
 

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from vdgs.report.pictures import Picture, PictureError, load_picture
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.standing import RunStanding, Standing
 
 #: Characters of one text, and entries of one list of texts, that a report shows.
 LONGEST_TEXT, MOST_TEXTS = 600, 40
@@ -52,15 +54,72 @@ class Record:
         return _rows(self.values.get(key))
 
 
-class Source:
-    """The files of a run folder, for one section: what cannot be read is left out, and `notes` says so."""
+@dataclass(frozen=True)
+class Shown:
+    """The run that a report shows, and how far its stages are."""
 
-    def __init__(self, root: Path):
-        self._root = root
+    run: RunFolder
+    standing: RunStanding
+
+    def source(self) -> Source:
+        """Its files, for one section: those that do not fit the run are left out."""
+        stale = {stage.folder: _out_of_date(stage) for stage in self.standing.stages if stage.state == "stale"}
+        return Source(self.run.path, stale)
+
+    def state_of(self, name: str) -> str:
+        """How far a stage is, in words."""
+        stage = self.standing.of(name)
+        state, why = STATES.get(stage.state, stage.state), stage.why
+        if stage.state == "unknown" and stage.status is not None:  # the caution at the top says the rest
+            state, why = stage.status.state, stage.status.why or ""
+        return state + (f": {why}" if why else "")
+
+    def cautions(self) -> list[str]:
+        """What to say of all that is shown though nobody knows whether it fits."""
+        unknown = [stage for stage in self.standing.stages if stage.state == "unknown"]
+        if not unknown:
+            return []
+        names = ", ".join(stage.name for stage in unknown)
+        return [f"It cannot be told whether these were made with the settings of the run: {names} ({unknown[0].why})."]
+
+
+#: States that need more words than their name.
+STATES = {"stale": "out of date", "unknown": "not known"}
+
+
+def _out_of_date(stage: Standing) -> str:
+    """Why a stage is left out, in a sentence."""
+    folder, why = stage.folder, stage.why
+    return f"{folder}: {why}; it is left out. `vdgs status` says which command makes it anew."
+
+
+class Source:
+    """The files of a run folder, for one section: what cannot be read is left out, and `notes` says so.
+
+    So are files below the folders in `stale`, each with the sentence that says why.
+    """
+
+    def __init__(self, root: Path, stale: Mapping[str, str] | None = None):
+        self._root, self._stale = root, stale or {}
         self.notes: list[str] = []
 
     def has(self, name: str) -> bool:
+        if self._is_stale(name):
+            return False
         return os.path.exists(self._root / name)  # unlike Path.exists, no error for names that no file can have
+
+    def exists(self, *names: str) -> bool:
+        """Whether one of these files is there, in date or not."""
+        return any(os.path.exists(self._root / name) for name in names)
+
+    def _is_stale(self, name: str) -> bool:
+        """Whether a file that is there does not fit the run; the notes then say why, once."""
+        why = next((why for folder, why in self._stale.items() if name.startswith(f"{folder}/")), None)
+        if why is None or name.endswith("/status.json") or not os.path.exists(self._root / name):
+            return False
+        if why not in self.notes:
+            self.notes.append(why)
+        return True
 
     def record(self, name: str) -> Record:
         """The JSON object of a file; empty if there is none."""

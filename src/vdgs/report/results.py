@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 from vdgs.evaluation.saving import file_stems
 from vdgs.report.charts import draw_gains, draw_pairs
 from vdgs.report.page import Html, details, figure, gallery, paragraph, section, table
-from vdgs.report.reading import Record, Source
+from vdgs.report.reading import Record, Shown, Source
 from vdgs.report.words import ABSENT, count, decibels, figure_of, gain, memory, share, similarity
 
 COARSE, MERGED = "coarse/evaluation", "evaluation"
@@ -84,17 +84,17 @@ def result_table(coarse: Record, merged: Record) -> Html:
         if pair != (None, None):
             rows.append([label, words(pair[0]), words(pair[1]), ""])
     notes = dict.fromkeys(merged.texts("notes") + coarse.texts("notes"))
-    shown = [table(["", "coarse", "merged", "Δ"], rows), *(paragraph(note, "facts") for note in notes)]
-    return Html("\n".join(shown))
+    lines = [table(["", "coarse", "merged", "Δ"], rows), *(paragraph(note, "facts") for note in notes)]
+    return Html("\n".join(lines))
 
 
-def views_section(root: Path) -> Html:
-    source = Source(root)
+def views_section(shown: Shown) -> Html:
+    source = shown.source()
     folder = MERGED if source.has(f"{MERGED}/per_view.json") else COARSE
     rows = [row for row in source.rows(f"{folder}/per_view.json") if row.number("psnr") is not None]
     other = {row.text("name"): row for row in source.rows(f"{COARSE}/per_view.json")} if folder == MERGED else {}
     parts: list[Html] = []
-    if not rows and not source.has(f"{folder}/per_view.json"):
+    if not rows and not source.exists(f"{MERGED}/per_view.json", f"{COARSE}/per_view.json"):
         parts.append(paragraph("No test view is evaluated yet.", "absent"))
     for kind, row in _best_median_worst(rows):
         parts.append(_comparison(source, folder, kind, row, other.get(row.text("name"), Record({}))))
@@ -156,8 +156,8 @@ def _views_table(rows: list[Record], other: dict[str | None, Record]) -> Html:
     return table(head, lines, caption)
 
 
-def by_visibility_section(root: Path) -> Html:
-    source = Source(root)
+def by_visibility_section(shown: Shown) -> Html:
+    source = shown.source()
     coarse, merged = metrics_of(source)
     bins = merged.rows("by_visibility") or coarse.rows("by_visibility")
     theirs = {_bounds(row): row for row in coarse.rows("by_visibility")}
@@ -197,11 +197,11 @@ def _bins_table(bins: list[Record], pairs: list[tuple[Record, Record]]) -> Html:
     return table(head, rows)
 
 
-def seams_section(root: Path) -> Html:
-    source = Source(root)
+def seams_section(shown: Shown) -> Html:
+    source = shown.source()
     facts = source.record(f"{MERGED}/by_block.json")
     parts: list[Html] = []
-    if not facts and not source.has(f"{MERGED}/by_block.json"):
+    if not facts and not source.exists(f"{MERGED}/by_block.json"):
         parts.append(paragraph("There are no figures by block: fewer than two blocks are merged.", "absent"))
     rows = [_block_row(count(row.number("block")), row) for row in facts.rows("blocks")]
     if rows and facts.inner("all"):

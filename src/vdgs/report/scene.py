@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from vdgs.report.page import Html, figure, heading, paragraph, section, table
-from vdgs.report.reading import Record, Source
+from vdgs.report.reading import Record, Shown
 from vdgs.report.words import ABSENT, count, figure_of, share
 
 
-def visibility_section(root: Path) -> Html:
-    source = Source(root)
+def visibility_section(shown: Shown) -> Html:
+    source = shown.source()
     facts = source.record("visibility/visibility.json")
     parts = [
         paragraph(
@@ -21,7 +19,7 @@ def visibility_section(root: Path) -> Html:
     if facts:
         parts.append(paragraph(_visibility_sentence(facts)))
         parts.append(_distribution(facts))
-    elif not source.has("visibility/visibility.json"):
+    elif not source.exists("visibility/visibility.json"):
         parts.append(paragraph("Visibility is not measured yet.", "absent"))
     parts.append(
         figure(source.picture("visibility/map.png"), "The place from above, coloured by V.", "map of visibility", True)
@@ -31,11 +29,11 @@ def visibility_section(root: Path) -> Html:
     return section("visibility", "The place and its visibility", parts, source.notes)
 
 
-def blocks_section(root: Path) -> Html:
-    source = Source(root)
+def blocks_section(shown: Shown) -> Html:
+    source = shown.source()
     facts = source.record("partition/partition.json")
     parts: list[Html] = []
-    if not facts and not source.has("partition/partition.json"):
+    if not facts and not source.exists("partition/partition.json"):
         parts.append(paragraph("The scene is not cut into blocks yet.", "absent"))
     rows = facts.rows("blocks")
     if rows:
@@ -59,8 +57,8 @@ def blocks_section(root: Path) -> Html:
     return section("blocks", "Blocks", parts, source.notes)
 
 
-def assignment_section(root: Path) -> Html:
-    source = Source(root)
+def assignment_section(shown: Shown) -> Html:
+    source = shown.source()
     facts = source.record("partition/partition.json")
     rows = facts.rows("blocks")
     parts: list[Html] = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from vdgs.partition.figures.words import block_colour
 from vdgs.report.charts import MERGED, Curve, draw_curves
 from vdgs.report.page import Html, figure, gallery, heading, joined, paragraph, section, table
-from vdgs.report.reading import Record, Source
+from vdgs.report.reading import Record, Shown
 from vdgs.report.words import count, decibels, figure_of, share
 from vdgs.runs.folder import RunFolder
 
@@ -22,21 +22,21 @@ def block_names(run: RunFolder) -> list[tuple[int, str]]:
     return [(int(name), f"blocks/{name}") for name in names if name.isdecimal()]
 
 
-def training_section(run: RunFolder) -> Html:
-    source = Source(run.path)
+def training_section(shown: Shown) -> Html:
+    source, run = shown.source(), shown.run
     parts = [heading("Coarse model")]
     coarse = source.lines("coarse/log.jsonl")
     parts.append(_curves([("coarse", MERGED, coarse)]))
-    if not coarse:
+    if not coarse and not source.exists("coarse/log.jsonl"):
         parts.append(paragraph("The coarse model has no log yet.", "absent"))
     parts.append(heading("Blocks"))
     names = block_names(run)
     logs = [(f"block {index}", block_colour(index), source.lines(f"{name}/log.jsonl")) for index, name in names]
     statuses = [(f"block {index}", source.record(f"{name}/status.json")) for index, name in names]
     parts.append(_curves(logs))
-    if not any(records for _, _, records in logs):
+    if not any(records for _, _, records in logs) and not source.exists(*(f"{name}/log.jsonl" for _, name in names)):
         parts.append(paragraph("No block has a log yet.", "absent"))
-    parts.append(_states([("coarse", source.record("coarse/status.json")), *statuses]))
+    parts.append(_states([("coarse", source.record("coarse/status.json")), *statuses], shown))
     parts += _growth(logs)
     return section("training", "Training", parts, source.notes)
 
@@ -84,16 +84,15 @@ def _series(logs: list[Log], key: str, named: bool = True, dashed: bool = False)
     return curves
 
 
-def _states(statuses: list[tuple[str, Record]]) -> Html:
+def _states(statuses: list[tuple[str, Record]], shown: Shown) -> Html:
     rows = []
     for name, status in statuses:
         if not status:
             continue
         done, wanted = status.number("iteration"), status.number("iterations")
-        state = (status.text("state") or "") + (f": {why}" if (why := status.text("why")) else "")
         rows.append(
             [name, f"{count(done)} / {count(wanted)}", count(status.number("anchors")),
-             decibels(status.number("psnr_training")), state]
+             decibels(status.number("psnr_training")), shown.state_of(name)]
         )  # fmt: skip
     return table(["", "iterations", "anchors", "PSNR while training (dB)", "state"], rows, wordy=True)
 

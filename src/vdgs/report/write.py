@@ -11,11 +11,12 @@ import yaml
 from vdgs.errors import RunError
 from vdgs.report.costs import costs_section, settings_section
 from vdgs.report.page import Html, contents, document, escaped, joined, paragraph
-from vdgs.report.reading import Record, Source
+from vdgs.report.reading import Record, Shown, Source
 from vdgs.report.results import by_visibility_section, metrics_of, result_table, seams_section, verdict, views_section
 from vdgs.report.scene import assignment_section, blocks_section, visibility_section
 from vdgs.report.training import training_section
 from vdgs.runs.folder import RunFolder
+from vdgs.runs.standing import RunStanding, Standing, standing_of
 from vdgs.storage.files import write_text
 
 #: name and title of the sections, for the links at the top
@@ -24,6 +25,10 @@ CONTENTS = (
     ("views", "test views"), ("by-visibility", "quality by visibility"), ("seams", "per block"),
     ("costs", "time and memory"), ("settings", "settings"),
 )  # fmt: skip
+
+FILE = "report.html"
+#: Name of the line of the page that says which standing of the run it shows, and where it is to be found at the latest.
+STANDING, HEAD_CHARACTERS = "vdgs-standing", 2000
 
 
 def write_report(run: RunFolder) -> Path:
@@ -34,25 +39,39 @@ def write_report(run: RunFolder) -> Path:
     """
     if not run.path.is_dir():
         raise RunError(f"{run.path}: is not a run folder. Train first: vdgs run CAPTURE --output RUN")
+    shown = Shown(run, standing_of(run))
     sections = [
-        visibility_section(run.path),
-        blocks_section(run.path),
-        assignment_section(run.path),
-        training_section(run),
-        views_section(run.path),
-        by_visibility_section(run.path),
-        seams_section(run.path),
-        costs_section(run),
-        settings_section(run.path),
+        visibility_section(shown),
+        blocks_section(shown),
+        assignment_section(shown),
+        training_section(shown),
+        views_section(shown),
+        by_visibility_section(shown),
+        seams_section(shown),
+        costs_section(shown),
+        settings_section(shown),
     ]
-    source = Source(run.path)
-    header, title = _header(source)
-    path = run.path / "report.html"
-    write_text(path, document(title, [header, contents(CONTENTS), *sections]))
+    header, title = _header(shown)
+    path = run.path / FILE
+    write_text(path, document(title, [header, contents(CONTENTS), *sections], {STANDING: shown.standing.digest}))
     return path
 
 
-def _header(source: Source) -> tuple[Html, str]:
+def report_standing(run: RunFolder, standing: RunStanding) -> Standing:
+    """Whether the report is there and shows the run as it stands."""
+    path = run.path / FILE
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            head = file.read(HEAD_CHARACTERS)
+    except OSError:
+        return Standing("report", "missing", FILE)
+    if f'<meta name="{STANDING}" content="{standing.digest}">' in head:
+        return Standing("report", "done", FILE)
+    return Standing("report", "stale", FILE, "the run went on since it was written")
+
+
+def _header(shown: Shown) -> tuple[Html, str]:
+    source = shown.source()
     config = _config(source)
     version = config.inner("vdgs")
     made_of = source.record("capture.json")
@@ -68,7 +87,7 @@ def _header(source: Source) -> tuple[Html, str]:
     parts = [
         Html(f"<h1>{escaped(name)}</h1>"),
         paragraph(" · ".join(fact for fact in facts if fact), "facts"),
-        *(paragraph(note, "note") for note in source.notes),
+        *(paragraph(note, "note") for note in [*source.notes, *shown.cautions()]),
         paragraph(verdict(coarse, merged), "verdict"),
         result_table(coarse, merged),
         *(paragraph(warning, "note") for warning in made_of.texts("warnings")),

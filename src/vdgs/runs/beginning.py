@@ -25,12 +25,14 @@ def begin_run(
     method: MethodConfig,
     *,
     redo: bool | None = None,
+    command: str | None = None,
 ) -> tuple[RunFolder, Capture]:
     """Open the capture and a new run of it, or the run that is there if it was started with the same settings.
 
     `redo` None compares the settings of the coarse stage only and refuses others; True or False is about changing
-    them (`RunFolder.change_settings`). Raises CaptureError for a capture that cannot be used, RunError for other
-    settings than the run's, VdgsError for settings that do not work.
+    them (`RunFolder.change_settings`). `command` is the one that asks, kept in the run. Raises
+    CaptureError for a capture that cannot be used, RunError for other settings than the run's, VdgsError for settings
+    that do not work.
     """
     problems = validate(method)
     if problems:
@@ -43,9 +45,9 @@ def begin_run(
             refuse_another_capture(run.capture_file, read_json(run.capture_file), capture)
         settings = run_settings(capture_path, capture_options, method)
         if redo is None or not run.config_file.exists():
-            run.begin(settings, ("capture", "training"))
+            run.begin(settings, ("capture", "training"), command)
         else:
-            run.change_settings(settings, redo)
+            run.change_settings(settings, redo, command)
     return run, capture
 
 

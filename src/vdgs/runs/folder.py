@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import shutil
 import subprocess
@@ -18,6 +17,7 @@ from vdgs import __version__
 from vdgs.errors import RunError, VdgsError
 from vdgs.partition.records import PartitionRecord
 from vdgs.runs.keys import StageKeys, stage_keys
+from vdgs.runs.locks import hold, is_locked
 from vdgs.runs.status import Status
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import differences, from_dict, to_dict
@@ -105,7 +105,7 @@ class StageFolder:
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Hold this stage for this process; RunError if another one works on it."""
-        with _lock(self.path, fcntl.LOCK_EX):
+        with hold(self.path):
             yield
 
     def is_held(self) -> bool:
@@ -185,8 +185,10 @@ class RunFolder:
     def evaluation(self) -> Path:
         return self.path / "evaluation"
 
-    def begin(self, settings: dict[str, Any], checked: Sequence[str] = SECTIONS) -> None:
+    def begin(self, settings: dict[str, Any], checked: Sequence[str] = SECTIONS, command: str | None = None) -> None:
         """Write the settings of a new run, or check that those of the run that is there are the same.
+
+        `command` is the one that begins it, kept so that people can be told how to continue.
 
         Only the sections named in `checked` are compared. Raises RunError with the differences if they are not the
         same, and if the folder holds something else.
@@ -213,10 +215,10 @@ class RunFolder:
                 f"{self.path}: holds other files ({', '.join(sorted(strangers)[:3])}) and no config.yaml. "
                 "Choose an empty or a new folder for --output."
             )
-        self._write(settings)
+        self._write(settings, command)
 
-    def change_settings(self, settings: dict[str, Any], redo: bool) -> list[str]:
-        """Give a run other settings; returns what changed, one line each.
+    def change_settings(self, settings: dict[str, Any], redo: bool, command: str | None = None) -> list[str]:
+        """Give a run other settings; returns what changed, one line each. `command` as in `begin`.
 
         Raises RunError, with the differences, if trained work depends on what changed, unless `redo` allows to
         lose it. Stages delete what was made for other settings when they next run (`StageFolder.discard_unless`).
@@ -238,14 +240,23 @@ class RunFolder:
                 + f"\nThey make {' and '.join(lost)} useless. Add --redo to train that again, give the old settings to "
                 "continue, or take another --output."
             )  # fmt: skip
-        self._write(settings)
+        self._write(settings, command)
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
             self.coarse.discard_unless(after.coarse)
         return changed
 
-    def _write(self, settings: dict[str, Any]) -> None:
-        header = {"vdgs": {"version": __version__, "commit": _commit()}}
+    def _write(self, settings: dict[str, Any], command: str | None = None) -> None:
+        header = {"vdgs": {"version": __version__, "commit": _commit()} | ({"command": command} if command else {})}
         write_text(self.config_file, yaml.safe_dump(header | settings, sort_keys=False, allow_unicode=True))
+
+    def command(self) -> str | None:
+        """The command that gave the run the settings that it has; None where several did, or nothing says it."""
+        try:
+            header = yaml.safe_load(self.config_file.read_text(encoding="utf-8"))["vdgs"]
+        except (OSError, yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError):
+            return None
+        command = header.get("command") if isinstance(header, dict) else None
+        return command if isinstance(command, str) else None
 
     def settings(self) -> dict[str, Any]:
         """The settings of the run, every section whole, without the header that says which version wrote them."""
@@ -286,23 +297,24 @@ class RunFolder:
 
         RunError if another process stands in the way.
         """
-        with _lock(self.path, fcntl.LOCK_SH if shared else fcntl.LOCK_EX):
+        with hold(self.path, shared):
             yield
 
+    @contextmanager
+    def driven(self) -> Iterator[None]:
+        """Take this run from stage to stage, so that others can see it between two stages too (`is_driven`).
 
-@contextmanager
-def _lock(folder: Path, kind: int) -> Iterator[None]:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = (folder / ".lock").open("w")
-    except OSError as error:
-        raise RunError(f"{folder}: cannot be written ({error.strerror}). Choose another --output.") from error
-    with handle:
-        try:
-            fcntl.flock(handle, kind | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RunError(f"{folder}: another vdgs process works on this run. Wait for it or stop it.") from error
-        yield
+        RunError if another process does.
+        """
+        with hold(self._driver):
+            yield
+
+    def is_driven(self) -> bool:
+        return is_locked(self._driver)
+
+    @property
+    def _driver(self) -> Path:
+        return self.path / ".run"
 
 
 def _commit() -> str | None:

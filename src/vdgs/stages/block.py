@@ -70,6 +70,7 @@ def _train(
     chosen = views_of_block(run, capture, index)
     views = [capture.train_views[i] for i in chosen]
     facts = {"capture": capture_facts(capture), "version": __version__, "block": index, "views": len(views)}
+    facts["key"] = run.keys().blocks
     own, around = split_anchors(coarse.anchors, blocks, index, method.block)
     around &= drawn_by(coarse.anchors, [view.camera for view in views])
     anchors, surroundings = coarse.anchors.select(own), coarse.anchors.select(around)

@@ -54,30 +54,43 @@ def train_coarse(
 def _train(
     run: RunFolder, capture: Capture, config: TrainConfig, options: WatchOptions, console: Console, device: torch.device
 ) -> None:
-    folder, views = run.coarse, capture.train_views
-    # The voxel follows from the capture: recomputed when a run continues.
-    cameras = [view.camera for view in views]
-    anchors, voxel = initial_anchors(capture.points, capture.point_colours, cameras, config.anchors)
-    ground = anchors.positions.to(device)
+    folder = run.coarse
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
-    with ImageCache(views, image_budget(options), downscales=factors) as images:
-        background = (0.0, 0.0, 0.0)
-        if config.loss.background != "black":
-            background = mean_colour(images, len(views), factors[-1])
-        stage = Stage(
-            config, images, len(views), voxel, camera_height(capture), background=background,
-            shares=shares_for(config, anchors, cameras), device=device,
-            ground=[solid_cells(ground, camera) for camera in cameras],
-            largest=lambda positions: largest_log_scales(positions, cameras),
-        )  # fmt: skip
-        state = continue_or_start(folder, stage, lambda: _start(anchors, stage), console)
+    with ImageCache(capture.train_views, image_budget(options), downscales=factors) as images:
+        stage, anchors = open_stage(capture, config, images, device)
+        state = continue_or_start(folder, stage, lambda: start(anchors, stage), console)
         _announce(capture, state, config, console)
         train_watched(folder, state, stage, options, console)
-    facts = {"capture": capture_facts(capture), "version": __version__, "iterations": state.iteration}
-    finish(folder, state, AnchorModel(*state.result(), voxel, background, facts), console)
+    facts = {
+        "capture": capture_facts(capture), "version": __version__, "iterations": state.iteration,
+        "key": run.keys().coarse,
+    }  # fmt: skip
+    finish(folder, state, AnchorModel(*state.result(), stage.voxel, stage.background, facts), console)
 
 
-def _start(anchors: Anchors, stage: Stage) -> TrainingState:
+def open_stage(
+    capture: Capture, config: TrainConfig, images: ImageCache, device: torch.device | str
+) -> tuple[Stage, Anchors]:
+    """What the coarse stage works with, and the anchors that it starts from."""
+    cameras = [view.camera for view in capture.train_views]
+    # The voxel follows from the capture: recomputed when a run continues.
+    anchors, voxel = initial_anchors(capture.points, capture.point_colours, cameras, config.anchors)
+    ground = anchors.positions.to(device)
+    background = (0.0, 0.0, 0.0)
+    if config.loss.background != "black":
+        smallest = max(factor for _, factor in config.resolutions)
+        background = mean_colour(images, len(cameras), smallest)
+    stage = Stage(
+        config, images, len(cameras), voxel, camera_height(capture), background=background,
+        shares=shares_for(config, anchors, cameras), device=torch.device(device),
+        ground=[solid_cells(ground, camera) for camera in cameras],
+        largest=lambda positions: largest_log_scales(positions, cameras),
+    )  # fmt: skip
+    return stage, anchors
+
+
+def start(anchors: Anchors, stage: Stage) -> TrainingState:
+    """The state before the first step."""
     config = stage.config
     generator = torch.Generator().manual_seed(config.seed)
     decoder = Decoder.initial(

@@ -22,6 +22,7 @@ from vdgs.partition.regions import split_anchors
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import TrainedRun, open_run
+from vdgs.runs.vouching import load_vouched
 from vdgs.settings.requests import ModelName
 from vdgs.storage.files import read_record, write_json
 
@@ -41,6 +42,10 @@ def evaluate_stage(
     """Measure a model of a run; of the merged one, on test views, also block by block and at the seams."""
     opened = open_run(path, which, device)
     output = evaluation_folder(opened.folder, opened.name, views)
+    if opened.caution:
+        console.print(f"[yellow]warning[/] {opened.caution}", highlight=False)
+    of_views = opened.capture.test_views if views == "test" else opened.capture.train_views
+    console.print(f"measuring the {opened.line} on {len(of_views)} {views} views", highlight=False)
     _forget(output)
     forget_peak()
     began = time.monotonic()
@@ -57,13 +62,16 @@ def evaluate_stage(
 def is_measured(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> bool:
     """Whether the figures that are there are those of the model that is there, measured in this way."""
     wanted = _record_of(run, name, lpips_weights, bins)
+    wanted.pop("key")  # the model says it; older figures do not mention it
     record = read_record(evaluation_folder(run, name) / "status.json")
     return {key: record.get(key) for key in wanted} == wanted
 
 
 def _record_of(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> dict[str, Any]:
     stage = run.merged if name == "merged" else run.coarse
-    return {"model": stage.status().model, "lpips_weights": str(lpips_weights), "bins": bins}
+    keys = run.keys()
+    key = keys.merge if name == "merged" else keys.coarse
+    return {"key": key, "model": stage.status().model, "lpips_weights": str(lpips_weights), "bins": bins}
 
 
 def _forget(output: Path) -> None:
@@ -94,6 +102,7 @@ class BlocksAlone:
     def __init__(self, run: RunFolder, coarse: AnchorModel):
         self._run, self._coarse = run, coarse
         blocks, config, key = blocks_of(run), run.method().block, run.keys().blocks
+        self._key = key
         self._around = [split_anchors(coarse.anchors, blocks, index, config)[1] for index in range(len(blocks))]
         self._done = [run.block(index).is_done(key) for index in range(len(blocks))]
         self._held: OrderedDict[int, AnchorModel] = OrderedDict()
@@ -111,7 +120,7 @@ class BlocksAlone:
 
     def assembled(self, index: int) -> AnchorModel:
         """A block's own anchors and what stood around them in its training, each with its decoder."""
-        own = AnchorModel.load(self._run.block(index).model).to(self._coarse.anchors.positions.device)
+        own = load_vouched(self._run.block(index), self._key, index).to(self._coarse.anchors.positions.device)
         around = self._coarse.anchors.select(self._around[index])
         parts = Part(len(own.anchors), own.decoder), Part(len(around), self._coarse.decoder)
         return replace(own, anchors=own.anchors.extended(around), parts=parts)

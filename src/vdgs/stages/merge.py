@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 
 from vdgs.errors import RunError
 from vdgs.memory.process import forget_peak, peak_memory_bytes
-from vdgs.model.anchor_model import AnchorModel
 from vdgs.partition.merging import merge
 from vdgs.runs.cut import blocks_of, views_of_block
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
+from vdgs.runs.standing import standing_of
 from vdgs.runs.status import Status
+from vdgs.runs.vouching import load_vouched
 from vdgs.storage.tensors import identity
 
 
@@ -41,9 +43,10 @@ def merge_run(path: Path, incomplete: bool, console: Console) -> None:
         cameras = [
             [capture.train_views[i].camera for i in views_of_block(run, capture, index)] for index in range(len(blocks))
         ]
-        trained = [AnchorModel.load(run.block(i).model) if whole else None for i, whole in enumerate(done)]
+        trained = [load_vouched(run.block(i), keys.blocks, i) if whole else None for i, whole in enumerate(done)]
         merged, became = merge(coarse, trained, blocks, cameras, run.method().merge, allow_missing=incomplete)
         run.merged.discard_unless(key)
+        merged = replace(merged, facts={**merged.facts, "key": key})
         merged.save(run.merged.model)
         trained_in = [run.block(i).status() for i, whole in enumerate(done) if whole]
         stages = [opened.status, *trained_in]
@@ -65,12 +68,17 @@ def merge_run(path: Path, incomplete: bool, console: Console) -> None:
 
 def _refuse(run: RunFolder, done: list[bool]) -> None:
     lines = []
+    standing = standing_of(run)
     for index, whole in enumerate(done):
         if not whole:
-            status = run.block(index).status()
-            state = "not trained yet" if status.state in ("new", "queued") else status.state
-            lines.append(f"block {index}: {state}" + (f" ({status.why})" if status.why else ""))
+            found = standing.of(f"block {index}")
+            state = "not trained yet" if found.state in ("missing", "queued") else found.state
+            lines.append(f"block {index}: {found.why if state == 'stale' else state}" + _because(state, found.why))
     raise RunError(
         f"{run.path}: not all blocks are trained:\n  " + "\n  ".join(lines)
         + f"\nTrain them with `vdgs train {run.path}`, or give --incomplete to let the coarse model stand in for them."
     )  # fmt: skip
+
+
+def _because(state: str, why: str) -> str:
+    return f" ({why})" if why and state != "stale" else ""

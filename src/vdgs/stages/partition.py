@@ -36,6 +36,7 @@ from vdgs.runs.visibility import keep_visibility
 from vdgs.settings.method import AssignmentConfig, PartitionConfig
 from vdgs.storage.files import write_json
 from vdgs.storage.records import plain
+from vdgs.watching.interrupts import stop_if_asked
 
 
 @dataclass(frozen=True)
@@ -153,10 +154,12 @@ def _score(
 ) -> Scores:
     with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
         task = bar.add_task("assigning cameras")
-        scores = score_matrix(
-            scene.opened.model, blocks, scene.cameras, config,
-            lambda done, total: bar.update(task, completed=done, total=total),
-        )  # fmt: skip
+
+        def show(done: int, total: int) -> None:
+            stop_if_asked()
+            bar.update(task, completed=done, total=total)
+
+        scores = score_matrix(scene.opened.model, blocks, scene.cameras, config, show)
     if partition.strategy == "visibility":
         return scores
     return STRATEGIES[partition.strategy].rescored(scores, scene.positions, blocks, scene.cameras)

@@ -60,6 +60,7 @@ def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console,
                 "--block.growth.max-anchors",
                 highlight=False,
             )
+        _note_discarded(run, left, key, console)
         began = time.monotonic()
         for index in left:
             _mark_queued(run.block(index), key)
@@ -87,6 +88,17 @@ def _command(
     if options.tensorboard:
         command.append("--tensorboard")
     return BlockCommand(index, run.block(index), command)
+
+
+def _note_discarded(run: RunFolder, left: list[int], key: str, console: Console) -> None:
+    """Say which blocks were trained for another cut or with other settings: what they hold is about to go."""
+    old = [index for index in left if run.block(index).holds_work() and run.block(index).key() != key]
+    if old:
+        console.print(
+            f"[yellow]note[/] trained for another cut or with other settings, and trained again: block"
+            f"{'s' if len(old) > 1 else ''} {', '.join(map(str, old))}",
+            highlight=False,
+        )
 
 
 def _mark_queued(folder: StageFolder, key: str) -> None:

@@ -52,7 +52,10 @@ def _read(hint: Any, value: Any, name: str) -> Any:
     accepted = (int, float) if hint is float else hint
     if not isinstance(value, accepted) or (isinstance(value, bool) and hint is not bool):
         raise ValueError(f"{name} is {_shown(value)}")
-    return float(value) if hint is float else value
+    try:
+        return float(value) if hint is float else value
+    except OverflowError as error:  # a number that JSON can hold and no float can
+        raise ValueError(f"{name} is {_shown(value)}") from error
 
 
 def _shown(value: Any) -> str:

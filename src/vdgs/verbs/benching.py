@@ -51,6 +51,8 @@ class BenchArguments:
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     bins: int = 4
     """Number of groups by visibility."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     """How folders among --scenes are read; scenes with names have their own. --validation holds for all."""
 
@@ -68,5 +70,5 @@ def bench(arguments: list[str]) -> None:
         BenchSettings(
             asked.table, asked.output, choices, asked.data, asked.jobs, asked.bins, asked.lpips_weights, asked.redo
         ),
-        open_console(),
+        open_console(asked.quiet),
     )

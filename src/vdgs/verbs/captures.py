@@ -45,6 +45,8 @@ class SynthArguments:
 
     output: Positional[Path]
     """Folder for the capture; it must not exist or be empty."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
     options: Annotated[SynthOptions, arg(name="")] = field(default_factory=SynthOptions)
 
 
@@ -54,7 +56,7 @@ def synth(arguments: list[str]) -> None:
 
     from vdgs.synth import generate
 
-    console = open_console()
+    console = open_console(asked.quiet)
     with Progress(console=console, disable=not console.is_terminal) as bar:
         tasks: dict[str, TaskID] = {}
 

@@ -1,4 +1,4 @@
-"""Verbs that show what a run came to: `eval`, `report`, `render`."""
+"""Verbs that show what a run came to: `status`, `eval`, `report`, `render`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,35 @@ from tyro.conf import Positional
 
 from vdgs.settings.requests import ModelName, RenderRequest
 from vdgs.verbs.shared import open_console, use_device, use_threads
+
+
+@dataclass(frozen=True)
+class StatusArguments:
+    """Say how far a run is, stage by stage and block by block, and what to type next.
+
+    Stages are done, running, queued, stopped (they continue), failed (with the reason), missing, stale (made with other
+    settings, for another cut or from another model) or unknown (no record says it). Exit code 0: all is done and in
+    date; 3: not so.
+    """
+
+    run: Positional[Path]
+    """Run folder."""
+    json: bool = False
+    """Print JSON instead of lines."""
+
+
+def status(arguments: list[str]) -> int:
+    asked = tyro.cli(StatusArguments, args=arguments, prog="vdgs status")
+    from vdgs.report.terminal import NOT_WHOLE, print_status, status_facts
+    from vdgs.runs.folder import RunFolder
+
+    if not asked.json:
+        return print_status(RunFolder(asked.run), open_console())
+    import json
+
+    facts = status_facts(RunFolder(asked.run))
+    print(json.dumps(facts, indent=1, ensure_ascii=False))
+    return 0 if facts["whole"] else NOT_WHOLE
 
 
 @dataclass(frozen=True)
@@ -33,6 +62,8 @@ class EvalArguments:
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
 
 
 def eval(arguments: list[str]) -> None:
@@ -41,7 +72,9 @@ def eval(arguments: list[str]) -> None:
 
     device = use_device(asked.device)
     use_threads(asked.threads)
-    evaluate_stage(asked.run, asked.model, asked.lpips_weights, asked.bins, open_console(), asked.views, device)
+    evaluate_stage(
+        asked.run, asked.model, asked.lpips_weights, asked.bins, open_console(asked.quiet), asked.views, device
+    )
 
 
 @dataclass(frozen=True)
@@ -66,6 +99,8 @@ class RenderArguments(RenderRequest):
 
     run: Positional[Path]
     """Run folder."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
 
 
 def render(arguments: list[str]) -> None:
@@ -74,4 +109,4 @@ def render(arguments: list[str]) -> None:
 
     device = use_device(asked.device)
     use_threads(asked.threads)
-    render_run(replace(asked, device=device), open_console())
+    render_run(replace(asked, device=device), open_console(asked.quiet))

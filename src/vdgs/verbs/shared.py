@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.presets import PRESETS, PresetName
+
+#: What lines begin with that are printed even where a person asked for quiet.
+LOUD = ("[yellow]", "[red]")
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -39,7 +43,7 @@ def recorded_run(arguments: list[str], kind: type, prog: str) -> tuple[RunFolder
     return run, run.method()
 
 
-def change_settings(run: RunFolder, method: MethodConfig, redo: bool) -> None:
+def change_settings(run: RunFolder, method: MethodConfig, redo: bool, quiet: bool = False) -> None:
     """Give the run other settings for later stages, if they are other."""
     from vdgs.errors import VdgsError
     from vdgs.settings.checks import validate
@@ -52,7 +56,7 @@ def change_settings(run: RunFolder, method: MethodConfig, redo: bool) -> None:
     if wanted != run.settings():
         with run.locked():
             for line in run.change_settings(wanted, redo):
-                open_console().print(f"[yellow]changed[/] {line}", highlight=False)
+                open_console(quiet).print(f"[yellow]changed[/] {line}", highlight=False)
 
 
 def use_threads(count: int) -> None:
@@ -68,7 +72,30 @@ def use_device(asked: str) -> str:
     return choose(asked).device
 
 
-def open_console() -> Console:
+def open_console(quiet: bool = False) -> Console:
+    """Where verbs print to; with `quiet` only notes and warnings are, on standard error."""
     from rich.console import Console
 
-    return Console(soft_wrap=True)
+    if not quiet:
+        return Console(soft_wrap=True)
+
+    class Warnings(Console):
+        """Prints what a person must know, and leaves out how work goes."""
+
+        def print(self, *objects: Any, **options: Any) -> None:
+            if objects and str(objects[0]).startswith(LOUD):
+                super().print(*objects, **options)
+
+        def rule(self, *_: Any, **__: Any) -> None:
+            pass
+
+    return Warnings(soft_wrap=True, stderr=True, force_terminal=False, force_interactive=False)
+
+
+def as_typed(verb: str, arguments: list[str], paths: tuple[Path, ...]) -> str:
+    """The command that was given, for every folder to type it in: paths are whole, `--redo` and `--quiet` left out."""
+    whole = {str(path): str(path.resolve()) for path in paths}
+    kept = [each for each in arguments if each not in ("--redo", "--quiet")]
+    for name, path in list(whole.items()):
+        whole[f"--output={name}"] = f"--output={path}"
+    return shlex.join(["vdgs", verb, *(whole.get(each, each) for each in kept)])

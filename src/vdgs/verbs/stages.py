@@ -20,6 +20,8 @@ class VisibilityArguments:
 
     run: Positional[Path]
     """Run folder with a coarse model."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
 
 
 def visibility(arguments: list[str]) -> None:
@@ -27,7 +29,7 @@ def visibility(arguments: list[str]) -> None:
     from vdgs.runs.folder import RunFolder
     from vdgs.stages.visibility import measure_visibility
 
-    measure_visibility(RunFolder(asked.run), open_console())
+    measure_visibility(RunFolder(asked.run), open_console(asked.quiet))
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,8 @@ class PartitionArguments:
 
     run: Positional[Path]
     """Run folder with a coarse model."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
     redo: bool = False
     """Allow another cut to discard blocks that are trained."""
     why: str | None = None
@@ -53,10 +57,12 @@ def partition(arguments: list[str]) -> None:
     from vdgs.stages.partition import explain_view, partition_run
 
     use_threads(asked.threads)
-    change_settings(run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.redo)
-    partition_run(run, open_console())
+    change_settings(
+        run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.redo, asked.quiet
+    )
+    partition_run(run, open_console(asked.quiet))
     if asked.why is not None:
-        explain_view(run, asked.why, open_console())
+        explain_view(run, asked.why, open_console(asked.quiet))
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,8 @@ class TrainArguments:
 
     run: Positional[Path]
     """Run folder that is cut into blocks."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
     block: int | None = None
     """Only this block, in this process; without it all of them, several at once."""
     jobs: int = 0
@@ -84,18 +92,18 @@ def train(arguments: list[str]) -> None:
     default = TrainArguments(tyro.MISSING, settings=method.block)
     asked = tyro.cli(TrainArguments, args=arguments, prog="vdgs train", default=default)
     device = use_device(asked.device)
-    change_settings(run, replace(method, block=asked.settings), asked.redo)
+    change_settings(run, replace(method, block=asked.settings), asked.redo, asked.quiet)
     if asked.block is not None:
         from vdgs.executors.parent import stop_when_parent_dies
         from vdgs.stages.block import train_block
 
         stop_when_parent_dies()
         use_threads(asked.threads)
-        train_block(asked.run, asked.block, asked.watching, open_console(), device)
+        train_block(asked.run, asked.block, asked.watching, open_console(asked.quiet), device)
     else:
         from vdgs.stages.train import train_blocks
 
-        train_blocks(asked.run, asked.watching, asked.jobs, open_console(), device)
+        train_blocks(asked.run, asked.watching, asked.jobs, open_console(asked.quiet), device)
 
 
 @dataclass(frozen=True)
@@ -104,6 +112,8 @@ class MergeArguments:
 
     run: Positional[Path]
     """Run folder whose blocks are trained."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
     incomplete: bool = False
     """Let the coarse model stand in for blocks that are missing or failed."""
     merge: Annotated[MergeConfig, arg(name="")] = field(default_factory=MergeConfig)
@@ -115,5 +125,5 @@ def merge(arguments: list[str]) -> None:
     asked = tyro.cli(MergeArguments, args=arguments, prog="vdgs merge", default=default)
     from vdgs.stages.merge import merge_run
 
-    change_settings(run, replace(method, merge=asked.merge), redo=False)
-    merge_run(asked.run, asked.incomplete, open_console())
+    change_settings(run, replace(method, merge=asked.merge), redo=False, quiet=asked.quiet)
+    merge_run(asked.run, asked.incomplete, open_console(asked.quiet))

@@ -14,7 +14,7 @@ from vdgs.settings.method import PartitionConfig, TrainConfig
 from vdgs.settings.presets import PRESETS, PresetName
 from vdgs.settings.requests import RunRequest
 from vdgs.settings.watching import WatchOptions
-from vdgs.verbs.shared import named_preset, open_console, use_device, use_threads
+from vdgs.verbs.shared import as_typed, named_preset, open_console, use_device, use_threads
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,8 @@ class CoarseArguments:
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
@@ -46,8 +48,9 @@ def coarse(arguments: list[str]) -> None:
     device = use_device(asked.device)
     use_threads(asked.threads)
     method = replace(PRESETS[preset], training=asked.training)
-    run, capture = begin_run(asked.capture, asked.output, asked.options, method)
-    train_coarse(run, capture, asked.watching, open_console(), device)
+    command = as_typed("coarse", arguments, (asked.capture, asked.output))
+    run, capture = begin_run(asked.capture, asked.output, asked.options, method, command=command)
+    train_coarse(run, capture, asked.watching, open_console(asked.quiet), device)
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,10 @@ class RunArguments(RunRequest):
 
     capture: Positional[Path]
     """Folder of the capture."""
+    dry_run: bool = False
+    """Only say what it would take: blocks, memory, time, by estimate and a few steps that are timed. Writes nothing."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
     options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
     training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
@@ -73,8 +80,14 @@ def run(arguments: list[str]) -> None:
         assignment=settings.assignment, block=settings.block, merge=settings.merge,
     )  # fmt: skip
     asked = tyro.cli(RunArguments, args=arguments, prog="vdgs run", default=default)
-    from vdgs.pipeline import run_all
-
     device = use_device(asked.device)
     use_threads(asked.threads)
-    run_all(replace(asked, device=device), open_console())
+    if asked.dry_run:
+        from vdgs.planning import plan_run
+
+        plan_run(replace(asked, device=device), open_console())
+        return
+    from vdgs.pipeline import run_all
+
+    command = as_typed("run", arguments, (asked.capture, asked.output))
+    run_all(replace(asked, device=device), open_console(asked.quiet), command)

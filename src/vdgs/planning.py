@@ -1,0 +1,177 @@
+"""`vdgs run --dry-run`: what a run would take, by estimate, before it begins. Nothing is written.
+
+Time is measured, not guessed: a few steps at each size of the photographs, on this machine and with these settings.
+What cannot be known before is how far anchors grow, so times are given as two ends.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from rich.console import Console
+
+from vdgs.captures.capture import Capture
+from vdgs.captures.facts import refuse_another_capture
+from vdgs.captures.images import ImageCache
+from vdgs.captures.loading import load_capture
+from vdgs.errors import VdgsError
+from vdgs.executors.blocks import default_jobs
+from vdgs.kernels import threads as threads_available
+from vdgs.memory.estimate import GROWTH, Need, estimate, in_gb
+from vdgs.memory.process import available_bytes
+from vdgs.partition.cut import SEEN, choose_block_count
+from vdgs.runs.beginning import run_settings
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.standing import RunStanding, standing_of
+from vdgs.settings.checks import validate
+from vdgs.settings.method import MethodConfig, TrainConfig, block_limit, block_training, with_iterations
+from vdgs.settings.plain import differences
+from vdgs.settings.requests import RunRequest
+from vdgs.stages.coarse import open_stage, start
+from vdgs.storage.files import read_json
+from vdgs.training import TrainingState, train
+from vdgs.watching.images import image_budget
+from vdgs.watching.interrupts import stop_if_asked
+from vdgs.watching.memory_notes import need_of
+
+#: Steps at each size that are timed at least, the first of them not; then as many as fit into so many seconds.
+TIMED_STEPS, TIMED_SECONDS = 4, 2.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run takes by estimate. Seconds are pairs: anchors as many as at the start, and grown all the while."""
+
+    anchors: int
+    blocks: int
+    coarse_iterations: int
+    block_iterations: int
+    """Of one block, where all have equally many photographs and no step draws a part."""
+    jobs: int
+    coarse_bytes: int
+    block_bytes: int
+    coarse_seconds: tuple[float, float]
+    blocks_seconds: tuple[float, float]
+
+
+def plan_run(asked: RunRequest, console: Console) -> Plan:
+    """Say what `vdgs run` would do and take. Raises what reading the capture raises, VdgsError for bad settings."""
+    method = asked.method()
+    if problems := validate(method):
+        raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
+    if asked.options.undistort:
+        raise VdgsError("--dry-run writes nothing, and --undistort writes photographs: leave one of the two out.")
+    capture = load_capture(asked.capture, asked.options)
+    for warning in capture.warnings:
+        console.print(f"[yellow]note[/] {warning}", highlight=False)
+    method = replace(method, training=with_iterations(method.training, len(capture.train_views)))
+    standing = _standing(asked, capture, method, console)
+    plan = _plan(capture, method, asked)
+    _say(plan, method, standing, console)
+    return plan
+
+
+def _standing(asked: RunRequest, capture: Capture, method: MethodConfig, console: Console) -> RunStanding | None:
+    """How far the run is that is there already, with the settings that are asked for; None where there is none."""
+    run = RunFolder(asked.output)
+    if not run.config_file.exists():
+        return None
+    if run.capture_file.exists():
+        refuse_another_capture(run.capture_file, read_json(run.capture_file), capture)
+    settings = run_settings(asked.capture, asked.options, method)
+    for line in differences(run.settings(), settings):
+        console.print(f"[yellow]changed[/] {line}", highlight=False)
+    return standing_of(run, settings)
+
+
+def _plan(capture: Capture, method: MethodConfig, asked: RunRequest) -> Plan:
+    config, views = method.training, len(capture.train_views)
+    factors = sorted({factor for _, factor in (*config.resolutions, *method.block.resolutions)})
+    with ImageCache(capture.train_views, image_budget(asked.watching), downscales=tuple(factors)) as images:
+        stage, anchors = open_stage(capture, config, images, asked.device)
+        state = start(anchors, stage)
+        need = need_of(state, stage)
+        timed = {}
+        for factor in factors:
+            at_size = replace(stage, config=replace(config, resolutions=((0.0, factor),)))
+            timed[factor] = _seconds_a_step(start(anchors, at_size), at_size)
+    camera = capture.train_views[0].camera
+    blocks = choose_block_count(need.grown, views, camera.width * camera.height, method.partition, need.offsets)
+    in_block = -(-need.grown // blocks)
+    each = estimate(
+        Need(
+            in_block, block_limit(method.block, in_block, need.grown), need.offsets, SEEN, 0, 0,
+            surroundings=need.grown - in_block,
+        )
+    ).total  # fmt: skip
+    jobs = asked.jobs or default_jobs(blocks, threads_available(), available_bytes(), each)[0]
+    block = block_training(method, max(1, round(views * min(1.0, 1.5 / blocks))))
+    coarse = _seconds(config, timed)
+    return Plan(
+        len(anchors), blocks, config.iterations, block.iterations, min(jobs, blocks), estimate(need).total, each,
+        (coarse, coarse * (1 + GROWTH) / 2),
+        (blocks * _seconds(block, timed), blocks * _seconds(block, timed) * GROWTH),
+    )  # fmt: skip
+
+
+def _seconds_a_step(state: TrainingState, stage: object) -> float:
+    """Mean time of the steps that are tried; the first is left out, which opens files and compiles nothing twice."""
+    began = [time.monotonic()]
+
+    def enough() -> bool:
+        stop_if_asked()
+        return len(began) > TIMED_STEPS and began[-1] - began[1] > TIMED_SECONDS
+
+    train(state, stage, stop=enough, after_step=lambda *_: began.append(time.monotonic()))  # type: ignore[arg-type]
+    return (began[-1] - began[1]) / (len(began) - 2) if len(began) > 2 else began[-1] - began[0]
+
+
+def _seconds(config: TrainConfig, timed: dict[int, float]) -> float:
+    """Of all steps of a stage, each at the size that the schedule gives it."""
+    ends = [begin for begin, _ in config.resolutions[1:]] + [1.0]
+    return sum(
+        config.iterations * max(0.0, end - begin) * timed[factor]
+        for (begin, factor), end in zip(config.resolutions, ends, strict=True)
+    )
+
+
+def _say(plan: Plan, method: MethodConfig, standing: RunStanding | None, console: Console) -> None:
+    def done(*names: str) -> str:
+        found = [stage for stage in standing.stages if stage.name in names] if standing is not None else []
+        whole = bool(found) and all(stage.state == "done" for stage in found)
+        return "; done already" if whole else ""
+
+    blocks = f"{plan.blocks} block{'' if plan.blocks == 1 else 's'}"
+    chosen = " by estimate: --blocks auto counts again when anchors have grown" if method.partition.blocks == "auto" \
+        and method.partition.blocking else ""  # fmt: skip
+    per_block = _times(plan.blocks_seconds)
+    names = [stage.name for stage in standing.blocks] if standing is not None else []
+    lines = [
+        f"coarse model: {plan.anchors:,} anchors at the start, {plan.coarse_iterations:,} iterations, at most "
+        f"{in_gb(plan.coarse_bytes)}, {_times(plan.coarse_seconds)}{done('coarse')}",
+        f"{blocks}{chosen}: about {plan.block_iterations:,} iterations each, {plan.jobs} at once, at most "
+        f"{in_gb(plan.block_bytes)} each beside photographs, {per_block}{done(*names)}",
+        f"memory that is free: {in_gb(available_bytes())}",
+        "Times are of training alone, from steps timed now on this machine; the larger one is with "
+        f"{GROWTH:g} times as many anchors. Nothing was written.",
+    ]
+    console.print("\n".join(lines), highlight=False)
+    if max(plan.coarse_bytes, plan.jobs * plan.block_bytes) > available_bytes():
+        console.print(
+            "[yellow]warning[/] it may run out of memory. What helps: --downscale 2, --growth.max-anchors, less --jobs",
+            highlight=False,
+        )
+
+
+def _times(seconds: Sequence[float]) -> str:
+    low, high = (_duration(each) for each in seconds)
+    return f"{low} to {high}" if low != high else f"about {low}"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{max(1, round(seconds))} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes / 60:.1f} h"

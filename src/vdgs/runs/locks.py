@@ -1,0 +1,55 @@
+"""Folders that processes hold, by a lock of the system on a file in them: it ends with the process, whatever ends it."""
+
+from __future__ import annotations
+
+import fcntl
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from vdgs.errors import RunError
+
+#: A lock that is taken is tried so often, with so many seconds between: one who only looks (`is_locked`) holds it too,
+#: for a moment.
+LOCK_ATTEMPTS, LOCK_SECONDS = 3, 0.02
+
+
+def is_locked(folder: Path) -> bool:
+    """Whether a process works on what is in a folder alone. Only looks: nothing is created."""
+    try:
+        handle = (folder / ".lock").open("rb")
+    except OSError:
+        return False
+    with handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
+@contextmanager
+def hold(folder: Path, shared: bool = False) -> Iterator[None]:
+    """Hold a folder for this process, alone or `shared`; it is made if it is not there.
+
+    RunError if another process stands in the way, or the folder cannot be written.
+    """
+    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = (folder / ".lock").open("w")
+    except OSError as error:
+        raise RunError(f"{folder}: cannot be written ({error.strerror}). Choose another --output.") from error
+    with handle:
+        for attempt in range(LOCK_ATTEMPTS):
+            try:
+                fcntl.flock(handle, kind | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if attempt + 1 == LOCK_ATTEMPTS:
+                    raise RunError(
+                        f"{folder}: another vdgs process works on this run. Wait for it or stop it."
+                    ) from error
+                time.sleep(LOCK_SECONDS)
+        yield
