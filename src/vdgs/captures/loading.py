@@ -16,6 +16,7 @@ from vdgs.captures.formats.source import SINGLE_FOCAL, Intrinsics, SourceCapture
 from vdgs.captures.formats.transforms import read_transforms
 from vdgs.captures.ground import find_ground_frame, transform_pose
 from vdgs.captures.photographs import Names, find_images, find_mask, read_header
+from vdgs.captures.sightings import Sightings
 from vdgs.captures.splits import choose_splits, nearest_to_middle
 from vdgs.captures.undistortion import ImageFile, undistort
 from vdgs.errors import CaptureError
@@ -275,4 +276,6 @@ def _view(photo: _FoundView, options: CaptureOptions, ground: GroundFrame) -> Vi
     camera = Camera(pose, fx, fy, cx, cy, width, height)
     if options.downscale != 1:
         camera = camera.resized(max(1, int(width / options.downscale)), max(1, int(height / options.downscale)))
-    return View(photo.view.name, camera, photo.file.path, photo.file.mask, "train")
+    seen = photo.view.sightings
+    sightings = None if seen is None else Sightings(ground.to_ground(seen.points), seen.rays)
+    return View(photo.view.name, camera, photo.file.path, photo.file.mask, "train", sightings)

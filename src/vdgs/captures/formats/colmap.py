@@ -11,6 +11,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,13 +23,17 @@ from vdgs.captures.formats.source import (
     check_intrinsics,
     duplicates,
     listing,
+    rays_of,
     rigid,
     safe_name,
 )
+from vdgs.captures.sightings import Sightings
 from vdgs.errors import CaptureError
 
 QUATERNION_TOLERANCE = 1e-3
 LONGEST_NAME = 4096
+#: So many of the points that a photograph shows are remembered: enough to see whether cameras and points agree.
+SIGHTINGS = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,12 +123,12 @@ def read_colmap(folder: Path) -> ColmapModel:
     try:
         cameras = (_cameras_binary if binary else _cameras_text)(cameras_file)
         records = list((_images_binary if binary else _images_text)(images_file))
-        points, colours = _no_points()
+        points = _no_points()
         if points_file.is_file():
-            points, colours = (_points_binary if binary else _points_text)(points_file)
+            points = (_points_binary if binary else _points_text)(points_file)
     except OSError as error:
         raise CaptureError(f"{error.filename or folder}: cannot be read ({error.strerror or error}).") from error
-    return ColmapModel(folder, _views(records, cameras, images_file), points, colours)
+    return ColmapModel(folder, _views(records, cameras, points, images_file), points.positions, points.colours)
 
 
 def count_images(folder: Path) -> int:
@@ -132,7 +137,7 @@ def count_images(folder: Path) -> int:
         if _format(folder) == ".bin":
             with (folder / "images.bin").open("rb") as stream:
                 return struct.unpack("<Q", stream.read(8))[0]
-        return sum(1 for _ in _images_text(folder / "images.txt"))
+        return sum(1 for _ in _images_text(folder / "images.txt", with_points=False))
     except (OSError, struct.error, CaptureError):
         return -1
 
@@ -144,19 +149,31 @@ def _format(folder: Path) -> str | None:
     return None
 
 
-def _no_points() -> tuple[np.ndarray, np.ndarray]:
-    return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+class _Points(NamedTuple):
+    """Points [n, 3] float64 and colours [n, 3] uint8 with the numbers [n] by which images name them."""
+
+    numbers: np.ndarray
+    positions: np.ndarray
+    colours: np.ndarray
 
 
-@dataclass(frozen=True)
+def _no_points() -> _Points:
+    return _Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+
+
+@dataclass(frozen=True, eq=False)
 class _ImageRecord:
     quaternion: tuple[float, ...]  # wxyz
     translation: tuple[float, ...]
     camera: int
     name: str
+    #: Some of the points that it shows: their numbers [m], and the pixels [m, 2] where.
+    shown: tuple[np.ndarray, np.ndarray]
 
 
-def _views(records: list[_ImageRecord], cameras: dict[int, Intrinsics], file: Path) -> tuple[SourceView, ...]:
+def _views(
+    records: list[_ImageRecord], cameras: dict[int, Intrinsics], points: _Points, file: Path
+) -> tuple[SourceView, ...]:
     """Posed views in name order; raises on silly poses, unknown cameras and names given twice."""
     orphans = [f"{record.name} (camera {record.camera})" for record in records if record.camera not in cameras]
     if orphans:
@@ -164,14 +181,37 @@ def _views(records: list[_ImageRecord], cameras: dict[int, Intrinsics], file: Pa
             f"{file}: these images name a camera that is not in the cameras file. "
             f"Both files must come from the same export.{listing(orphans)}"
         )
-    views = [
-        SourceView(safe_name(record.name, file), _pose(record, file), cameras[record.camera]) for record in records
-    ]
+    sorted_points = _Points(*(column[np.argsort(points.numbers, kind="stable")] for column in points))
+    views = []
+    for record in records:
+        intrinsics = cameras[record.camera]
+        sightings = _sightings(record, sorted_points, intrinsics)
+        name, pose = safe_name(record.name, file), _pose(record, file)
+        views.append(SourceView(name, pose, intrinsics, sightings=sightings))
     views.sort(key=lambda view: view.name)
     twice = duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{file}: the same image name occurs more than once.{listing(twice)}")
     return tuple(views)
+
+
+def _some(numbers: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """At most `SIGHTINGS` of an image's points that are points of the model, spread over all of them; copies."""
+    matched = np.flatnonzero((numbers >= 0) & np.isfinite(pixels).all(axis=1))
+    few = matched[np.unique(np.linspace(0, len(matched) - 1, min(SIGHTINGS, len(matched))).round().astype(int))]
+    return numbers[few], pixels[few]
+
+
+def _sightings(record: _ImageRecord, points: _Points, intrinsics: Intrinsics) -> Sightings | None:
+    """What an image says that it shows, of points sorted by number; None where it says nothing."""
+    numbers, pixels = record.shown
+    if not len(numbers) or not len(points.numbers):
+        return None
+    places = np.searchsorted(points.numbers, numbers).clip(max=len(points.numbers) - 1)
+    rays = rays_of(intrinsics, pixels)
+    known = (points.numbers[places] == numbers) & np.isfinite(rays).all(axis=1)
+    known &= np.isfinite(points.positions[places]).all(axis=1)
+    return Sightings(points.positions[places[known]], rays[known]) if known.any() else None
 
 
 def _pose(record: _ImageRecord, file: Path) -> np.ndarray:
@@ -229,16 +269,20 @@ def _images_binary(file: Path) -> Iterator[_ImageRecord]:
     for _ in range(cursor.count(4 + 7 * 8 + 4 + 1 + 8, "images")):
         _, *pose, camera = cursor.take("I7dI")
         name = cursor.name()
-        cursor.skip(24 * cursor.count(24, "image points"))
-        yield _ImageRecord(tuple(pose[:4]), tuple(pose[4:]), camera, name)
+        count = cursor.count(_IMAGE_POINT.itemsize, "image points")
+        shown = np.frombuffer(cursor.data, _IMAGE_POINT, count, cursor.offset)
+        cursor.skip(count * _IMAGE_POINT.itemsize)
+        yield _ImageRecord(tuple(pose[:4]), tuple(pose[4:]), camera, name, _some(shown["point"], shown["pixel"]))
     cursor.finish()
 
 
+#: A feature of an image: where, and the number of its point (-1: none).
+_IMAGE_POINT = np.dtype([("pixel", "<f8", 2), ("point", "<i8")])
 #: Fixed part of a point: id, xyz, rgb, error, track length.
 _POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 
 
-def _points_binary(file: Path) -> tuple[np.ndarray, np.ndarray]:
+def _points_binary(file: Path) -> _Points:
     cursor = _Cursor(file)
     size, data = _POINT.itemsize, cursor.data
     count = cursor.count(size, "points")
@@ -255,7 +299,7 @@ def _points_binary(file: Path) -> tuple[np.ndarray, np.ndarray]:
     cursor.offset = offset
     cursor.finish()
     records = np.frombuffer(buffer, _POINT)
-    return records["xyz"].astype(np.float64), records["rgb"].copy()
+    return _Points(records["id"].astype(np.int64), records["xyz"].astype(np.float64), records["rgb"].copy())
 
 
 # --------------------------------------------------------------------------------------------- text
@@ -298,7 +342,7 @@ def _cameras_text(file: Path) -> dict[int, Intrinsics]:
     return cameras
 
 
-def _images_text(file: Path) -> Iterator[_ImageRecord]:
+def _images_text(file: Path, with_points: bool = True) -> Iterator[_ImageRecord]:
     """Two lines an image: the pose, then its points (which may be an empty line)."""
     lines = _lines(file)
     for number, line in lines:
@@ -311,11 +355,21 @@ def _images_text(file: Path) -> Iterator[_ImageRecord]:
             name = words[9].strip()
         except (ValueError, IndexError):
             raise _bad_line(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
-        yield _ImageRecord(tuple(pose[:4]), tuple(pose[4:]), camera, name)
-        next(lines, None)
+        shown = next(lines, (number + 1, ""))
+        triples = _triples(file, *shown) if with_points else np.zeros((0, 3))
+        yield _ImageRecord(tuple(pose[:4]), tuple(pose[4:]), camera, name, _some(triples[:, 2], triples[:, :2]))
 
 
-def _points_text(file: Path) -> tuple[np.ndarray, np.ndarray]:
+def _triples(file: Path, number: int, line: str) -> np.ndarray:
+    """The features of an image, [m, 3]: x, y and the number of the point."""
+    try:
+        return np.array(line.split(), np.float64).reshape(-1, 3)
+    except ValueError:
+        raise _bad_line(file, number, "POINTS2D[] as (X, Y, POINT3D_ID)") from None
+
+
+def _points_text(file: Path) -> _Points:
+    numbers: list[float] = []
     positions: list[list[float]] = []
     colours: list[list[int]] = []
     for number, line in _lines(file):
@@ -323,15 +377,16 @@ def _points_text(file: Path) -> tuple[np.ndarray, np.ndarray]:
         if not words:
             continue
         try:
-            position = [float(word) for word in words[1:4]]
+            identifier, position = float(words[0]), [float(word) for word in words[1:4]]
             colour = [int(word) for word in words[4:7]]
             float(words[7])
         except (ValueError, IndexError):
             raise _bad_line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK[]") from None
         if not all(0 <= value <= 255 for value in colour):
             raise _bad_line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK[], colours from 0 to 255")
+        numbers.append(identifier)
         positions.append(position)
         colours.append(colour)
     if not positions:
         return _no_points()
-    return np.array(positions, np.float64), np.array(colours, np.uint8)
+    return _Points(np.array(numbers, np.float64), np.array(positions, np.float64), np.array(colours, np.uint8))
