@@ -15,7 +15,8 @@ from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.formats.source import SINGLE_FOCAL, Intrinsics, SourceCapture, SourceView, listing
 from vdgs.captures.formats.transforms import read_transforms
 from vdgs.captures.ground import find_ground_frame, transform_pose
-from vdgs.captures.photographs import Names, find_images, find_mask, read_header
+from vdgs.captures.masks import check_mask, find_masks
+from vdgs.captures.photographs import LEAST_SIDE_PX, Names, find_images, read_header, same_shape
 from vdgs.captures.sightings import Sightings
 from vdgs.captures.splits import choose_splits, nearest_to_middle
 from vdgs.captures.undistortion import ImageFile, undistort
@@ -24,6 +25,8 @@ from vdgs.settings.capture import CaptureOptions
 
 #: Points farther from the cameras than this many times their spread are strays of the matching.
 FAR_POINT = 100.0
+#: Photographs whose size differs from that of most by more than this share are mentioned; rounding differs by less.
+OTHER_FACTOR = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,23 +200,44 @@ def _find_photographs(
     if spare:
         shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
         warnings.append(f"{len(spare)} images have no camera and are not used ({shown}).")
-    return _fitted(root, source, paths, options)
+    return _fitted(root, source, paths, options, warnings)
 
 
-def _fitted(root: Path, source: SourceCapture, paths: list[Path], options: CaptureOptions) -> list[_FoundView]:
+def _fitted(
+    root: Path, source: SourceCapture, paths: list[Path], options: CaptureOptions, warnings: list[str]
+) -> list[_FoundView]:
     """The views with their images, masks and intrinsics at the images' sizes; collects what does not fit."""
-    photographs, problems = [], []
+    photographs, problems = list[_FoundView](), list[str]()
+    masks = find_masks(root, source.views, options, warnings)
     for view, path in zip(source.views, paths, strict=True):
-        mask = view.mask_path or find_mask(root / options.masks, view.name)
+        mask = masks[view.name]
         try:
-            photographs.append(_FoundView(view, ImageFile(view.name, path, mask, fit_to_image(view, path))))
+            intrinsics = fit_to_image(view, path)
+            if mask is not None:
+                check_mask(mask, path)
+            photographs.append(_FoundView(view, ImageFile(view.name, path, mask, intrinsics)))
         except CaptureError as error:
             problems.append(str(error))
     if len(problems) > 1:
         raise CaptureError(f"{root / source.images}: {len(problems)} images cannot be used.{listing(problems)}")
     if problems:
         raise CaptureError(problems[0])
+    warnings += _shrunk_otherwise(photographs)
     return photographs
+
+
+def _shrunk_otherwise(photographs: list[_FoundView]) -> list[str]:
+    """A warning where some photographs are shrunk by another factor than most: thumbnails among the photographs."""
+    factors = np.array([photo.file.intrinsics.width / photo.view.intrinsics.width for photo in photographs])
+    usual = float(np.median(factors))
+    others = np.flatnonzero(np.abs(factors / usual - 1) > OTHER_FACTOR)
+    if not len(others):
+        return []
+    names = ", ".join(photographs[index].view.name for index in others[:5]) + (", ..." if len(others) > 5 else "")
+    return [
+        f"{len(others)} photographs are {factors[others].min():.3g} to {factors[others].max():.3g} times the size of "
+        f"their cameras, the others {usual:.3g} times: they show less detail or more ({names})."
+    ]
 
 
 def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
@@ -224,9 +248,7 @@ def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
     header, intrinsics = read_header(path), view.intrinsics
     if (header.width, header.height) == (intrinsics.width, intrinsics.height):
         return intrinsics
-    low = max((header.width - 1) / intrinsics.width, (header.height - 1) / intrinsics.height)
-    high = min((header.width + 1) / intrinsics.width, (header.height + 1) / intrinsics.height)
-    if low > high:
+    if not same_shape((header.width, header.height), (intrinsics.width, intrinsics.height)):
         turned = (header.width > header.height) != (intrinsics.width > intrinsics.height)
         hint = "The image is turned by a quarter (EXIF orientation applied?). " if turned else ""
         raise CaptureError(
@@ -275,7 +297,13 @@ def _view(photo: _FoundView, options: CaptureOptions, ground: GroundFrame) -> Vi
     pose = transform_pose(photo.view.camera_from_world, ground)
     camera = Camera(pose, fx, fy, cx, cy, width, height)
     if options.downscale != 1:
-        camera = camera.resized(max(1, int(width / options.downscale)), max(1, int(height / options.downscale)))
+        width, height = int(width / options.downscale), int(height / options.downscale)
+        if min(width, height) < LEAST_SIDE_PX:
+            raise CaptureError(
+                f"--downscale {options.downscale:g}: leaves {width}x{height} pixels of {photo.file.path}, too few to "
+                "show anything."
+            )
+        camera = camera.resized(width, height)
     seen = photo.view.sightings
     sightings = None if seen is None else Sightings(ground.to_ground(seen.points), seen.rays)
     return View(photo.view.name, camera, photo.file.path, photo.file.mask, "train", sightings)
