@@ -17,6 +17,7 @@ from vdgs.captures.formats.transforms import read_transforms
 from vdgs.captures.ground import find_ground_frame, transform_pose
 from vdgs.captures.masks import check_mask, find_masks
 from vdgs.captures.photographs import LEAST_SIDE_PX, Names, find_images, read_header, same_shape
+from vdgs.captures.precision import rounding_of
 from vdgs.captures.sightings import Sightings
 from vdgs.captures.splits import choose_splits, nearest_to_middle
 from vdgs.captures.undistortion import ImageFile, undistort
@@ -165,6 +166,13 @@ def _without_bad_points(source: SourceCapture, warnings: list[str]) -> SourceCap
         warnings.append(
             f"{(~finite).sum()} points that are not finite and {(finite & ~keep).sum()} points farther than "
             f"{FAR_POINT:.0f}x the spread of the cameras were left out of {len(keep)}."
+        )
+    step = rounding_of(source.points[keep], float(np.median(distance[keep])))
+    if step:
+        warnings.append(
+            f"the sparse points are rounded to {step:.3g} of their world's units, {step / np.median(distance[keep]):.1%} of "
+            "their distance to the cameras: survey coordinates saved with too few digits (float32)? Subtract an "
+            "origin in the place before saving, or save double precision."
         )
     return replace(source, points=source.points[keep], colours=source.colours[keep])
 
