@@ -15,7 +15,8 @@ from captures_support import TinyScene, data_folder, render_plane, tiny_scene, w
 from vdgs.captures.checks import check_images
 from vdgs.captures.formats.source import Intrinsics, SourceView
 from vdgs.captures.images import load_picture
-from vdgs.captures.loading import fit_to_image, load_capture, scaled
+from vdgs.captures.loading import load_capture
+from vdgs.captures.matching import fit_to_image, scaled
 from vdgs.captures.photographs import decode_photograph
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
@@ -287,7 +288,9 @@ def test_truncated_images_are_found_before_training(folder, scene):
         file = folder / "images" / name
         file.write_bytes(file.read_bytes()[:-200])
     capture = load_capture(folder, UP)
-    with pytest.raises(CaptureError, match=f"2 of 12 photographs or their masks cannot be used(?s:.)*{names[4]}(?s:.)*{names[5]}"):
+    with pytest.raises(
+        CaptureError, match=f"2 of 12 photographs or their masks cannot be used(?s:.)*{names[4]}(?s:.)*{names[5]}"
+    ):
         check_images(capture)
 
 

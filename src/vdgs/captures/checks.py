@@ -45,8 +45,8 @@ def check_images(
     """Decode photographs and masks once.
 
     `which` is "all" or the number of views to check, spread evenly. `progress(done, total)` is called
-    after each view. Raises `CaptureError` that lists up to ten files that are truncated or damaged, or of which masks or
-    transparency leave nothing, and where no photograph shows more than one colour.
+    after each view. Raises `CaptureError` that lists up to ten files that are truncated or damaged, or of which masks
+    or transparency leave nothing, and where no photograph shows more than one colour.
     """
     views = capture.views
     if which != "all":
@@ -88,7 +88,7 @@ def _warnings(blank: list[str], masked: float) -> list[str]:
     found = []
     if blank:
         shown = ", ".join(blank[:5]) + (", ..." if len(blank) > 5 else "")
-        found.append(f"{len(blank)} photographs are of one colour only and teach nothing but that ({shown}).")
+        found.append(f"photographs of one colour only, which teach nothing but that: {len(blank)} ({shown}).")
     if masked > MUCH_MASKED:
         found.append(f"masks leave out {masked:.0%} of the photographs. White is kept: are they inverted?")
     return found

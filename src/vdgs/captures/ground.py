@@ -112,9 +112,9 @@ def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFram
     frame = GroundFrame(1.0, np.eye(3), np.zeros(3), True, how, origin)
     if np.linalg.norm(middle) > FARTHEST_ENU_M:
         warnings.append(
-            f"{file.name}: the cameras are {np.linalg.norm(middle) / 1000:,.0f} km away from the origin, where its east, "
-            "north and up do not hold. Are these projected coordinates (UTM) instead of ENU? Metres and up are kept, "
-            "latitude and longitude are not known."
+            f"{file.name}: the cameras are {np.linalg.norm(middle) / 1000:,.0f} km away from the origin, where its "
+            "east, north and up do not hold. Are these projected coordinates (UTM) instead of ENU? Metres and up "
+            "are kept, latitude and longitude are not known."
         )
         return replace(frame, translation=shift, origin_geo=None)
     return _shifted(frame, shift, how) if shift.any() else frame

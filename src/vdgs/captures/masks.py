@@ -31,8 +31,8 @@ def find_masks(
     if 0 < len(with_mask) < len(masks):
         without = next(name for name, mask in masks.items() if mask is None)
         warnings.append(
-            f"{len(with_mask)} of {len(masks)} photographs have a mask; the others count whole. Where that is not "
-            f"meant: the mask of {without} is {folder / (without + '.png')}."
+            f"{len(with_mask)} of {len(masks)} photographs have a mask; the others count whole. If that is not meant, "
+            f"put the missing masks there, such as {folder / mask_name(without)}."
         )
     return masks
 
@@ -41,7 +41,7 @@ def _compare(folder: Path, masks: dict[str, Path | None], asked_for: bool, warni
     """Hold the files of a folder of masks against the masks that were found."""
     used = {mask for mask in masks.values() if mask is not None}
     spare = [name for name, path in find_images(folder).items() if path not in used]
-    example = next(iter(masks)) + ".png"
+    example = mask_name(next(iter(masks)))
     if not used and spare:
         raise CaptureError(
             f"{folder}: holds {len(spare)} masks, none of them of a photograph. Name them like the photographs "
@@ -54,6 +54,11 @@ def _compare(folder: Path, masks: dict[str, Path | None], asked_for: bool, warni
     elif spare:
         shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
         warnings.append(f"{folder}: {len(spare)} masks belong to no photograph and are not used ({shown}).")
+
+
+def mask_name(name: str) -> str:
+    """What the mask of a photograph is called."""
+    return Path(name).with_suffix(".png").as_posix()
 
 
 def check_mask(mask: Path, photograph: Path) -> None:

@@ -215,10 +215,10 @@ def share_kept(photograph: Path, mask: Path | None, may_be_transparent: bool) ->
     if mask is not None:
         light = _lightness(mask)
         if not (light >= MASK_LEVEL).any():
-            hint = "Scale its values to 0 and 255" if light.any() else "If it is inverted, turn it round"
+            hint = "Scale its values to 0 and 255" if light.any() else "Turn it round if it is inverted"
             raise CaptureError(
-                f"{mask}: leaves nothing of its photograph. White is kept; its brightest value is {light.max()} of 255. "
-                f"{hint}, or remove the photograph from the model."
+                f"{mask}: leaves nothing of its photograph. White is kept, and the brightest value here is "
+                f"{light.max()} of 255. {hint}, or remove the photograph from the model."
             )
         keep = light >= MASK_LEVEL if opaque is None else decode_mask(mask, *opaque.shape[::-1]) & opaque
     if keep is not None and not keep.any():

@@ -118,7 +118,10 @@ def measure(
         share_seen=float((visibility > 0).mean()),
         problems=list(soundness.problems),
         warnings=[
-            *capture.warnings, *(checked.warnings if checked else ()), *soundness.warnings, *_findings(visibility),
+            *capture.warnings,
+            *(checked.warnings if checked else ()),
+            *soundness.warnings,
+            *_findings(visibility),
         ],
         figures=[],
     )

@@ -23,9 +23,11 @@ from vdgs.model.visibility import visibility_of
 MOST_POINTS = 20_000
 #: Choices. Shares of the points that no training camera sees: nothing could be trained; much is missing.
 UNSEEN_REFUSED, UNSEEN_DOUBTFUL = 0.95, 0.5
-#: Median reprojection errors, as a share of the longer side: chance; in pixels: fine detail is lost.
-REPROJECTION_REFUSED, REPROJECTION_DOUBTFUL_PX = 0.05, 2.0
-#: How far the cameras' places move the scene in their pictures, in pixels: no depth; as a share of the longer side: poor.
+#: Median reprojection errors in pixels: fine detail is lost; not what any adjustment leaves, nor this share of the longer
+#: side (structure-from-motion drops what is off by more than 4 pixels of the full size).
+REPROJECTION_DOUBTFUL_PX, REPROJECTION_REFUSED_PX, REPROJECTION_REFUSED = 1.5, 3.0, 0.005
+#: How far the cameras' places move the scene in their pictures, in pixels: no depth; as a share of the longer side:
+#: poor depth.
 PARALLAX_REFUSED_PX, PARALLAX_DOUBTFUL = 1.0, 0.02
 #: Fewer distinct points than this span no surface; fewer than the second are hardly a model of a place.
 FEW_REFUSED, FEW_DOUBTFUL = 4, 50
@@ -112,8 +114,8 @@ def _judge_places(capture: Capture, points: np.ndarray, findings: _Findings) -> 
     unit = capture.ground.unit
     if parallax < PARALLAX_REFUSED_PX:
         findings.problems.append(
-            f"All {len(views)} training cameras are at one place (within {spread:.2g} {unit}, {distance:.3g} {unit} from "
-            "the points): photographs that only turn about one place show no depth. Check the poses."
+            f"All {len(views)} training cameras are at one place (within {spread:.2g} {unit}, {distance:.3g} {unit} "
+            "from the points): photographs that only turn about one place show no depth. Check the poses."
         )
     elif parallax < PARALLAX_DOUBTFUL * _longest_side(views):
         findings.warnings.append(
@@ -128,25 +130,26 @@ def _judge_seen(capture: Capture, points: np.ndarray, share_seen: float, finding
     if unseen >= UNSEEN_REFUSED:
         behind = float(np.mean([(camera.project(points)[1] <= 0).mean() for camera in cameras]))
         findings.problems.append(
-            f"No training camera sees {unseen:.0%} of the sparse points (V = 0); of the points {behind:.0%} lie behind a "
-            "camera on average. Cameras and points are not of one world, or the cameras look away from it: poses "
-            "of another convention (OpenGL axes instead of OpenCV's, world-from-camera instead of camera-from-world)?"
+            f"No training camera sees {unseen:.0%} of the sparse points (V = 0); {behind:.0%} of the points lie behind "
+            "a camera, on average. Cameras and points are not of one world, or the cameras look away from it: poses "
+            "of another convention (OpenGL's axes instead of OpenCV's, world-from-camera instead of "
+            "camera-from-world)? Export the model again."
         )
         return
     if unseen >= UNSEEN_DOUBTFUL:
         findings.warnings.append(
-            f"no training camera sees {unseen:.0%} of the sparse points (V = 0). Points of other photographs, or a model "
-            "whose cameras and points do not belong together?"
+            f"no training camera sees {unseen:.0%} of the sparse points (V = 0). Points of other photographs, or a "
+            "model whose cameras and points do not belong together?"
         )
     blind = [view.name for view in capture.views if not view.camera.sees(points).any()]
     if blind:
-        findings.warnings.append(f"{len(blind)} photographs show none of the sparse points ({_some(blind)}).")
+        findings.warnings.append(
+            f"{len(blind)} of {len(capture.views)} photographs show none of the sparse points ({_some(blind)})."
+        )
 
 
-def _judge_reprojection(
-    capture: Capture, errors: dict[str, np.ndarray], median: float, findings: _Findings
-) -> None:
-    refused = REPROJECTION_REFUSED * _longest_side(capture.views)
+def _judge_reprojection(capture: Capture, errors: dict[str, np.ndarray], median: float, findings: _Findings) -> None:
+    refused = max(REPROJECTION_REFUSED_PX, REPROJECTION_REFUSED * _longest_side(capture.views))
     if median > refused:
         findings.problems.append(
             f"The sparse points do not fall where the photographs show them: the median reprojection error is "
@@ -156,20 +159,20 @@ def _judge_reprojection(
         return
     if median > REPROJECTION_DOUBTFUL_PX:
         findings.warnings.append(
-            f"the median reprojection error is {median:.1f} px; the scene will be blurred. Were poses or points rounded, "
-            "or the model not adjusted after it was changed?"
+            f"the median reprojection error is {median:.1f} px; the scene will be blurred. Were poses or points "
+            "rounded, or the model not adjusted after it was changed?"
         )
     wrong = [name for name, found in errors.items() if np.median(found) > refused]
     if wrong:
         findings.warnings.append(
-            f"{len(wrong)} photographs do not show their sparse points where the model says so, their poses are wrong "
-            f"({_some(wrong)}). Remove them from the model."
+            f"the poses of {len(wrong)} of {len(capture.views)} photographs are wrong: their sparse points do not fall "
+            f"where the model says that they show them ({_some(wrong)}). Remove them from the model."
         )
 
 
 def reprojection_words(median_px: float) -> str:
     """A median reprojection error for people."""
-    return f"{median_px:.2f} px" if np.isfinite(median_px) else "not even finite, for most points lie behind the cameras"
+    return f"{median_px:.2f} px" if np.isfinite(median_px) else "infinite: most points lie behind the cameras"
 
 
 def _longest_side(views: Sequence[View]) -> float:

@@ -32,8 +32,8 @@ def train_coarse(
 ) -> None:
     """Train, or continue, the coarse model of a run on a device; nothing if it is finished.
 
-    Raises CaptureError for a capture that cannot become a scene or damaged photographs, Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged (last
-    good state kept).
+    Raises CaptureError for a capture that cannot become a scene or damaged photographs, Stopped after Ctrl-C or SIGTERM
+    (state saved), TrainingDiverged (last good state kept).
     """
     options.check()
     with run.locked():

@@ -88,7 +88,8 @@ def train_gaussians(
     """Train, or continue, 3DGS on the training views of a capture; if it is finished, only read the model.
 
     Raises VdgsError for settings that do not work, RunError where `output` holds another run, CaptureError for a
-    capture that cannot become a scene or damaged photographs, Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged (last good state kept).
+    capture that cannot become a scene or damaged photographs, Stopped after Ctrl-C or SIGTERM (state saved),
+    TrainingDiverged (last good state kept).
     """
     options, folder = options or WatchOptions(), StageFolder(output)
     options.check()
