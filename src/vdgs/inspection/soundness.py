@@ -23,8 +23,8 @@ from vdgs.model.visibility import visibility_of
 MOST_POINTS = 20_000
 #: Choices. Shares of the points that no training camera sees: nothing could be trained; much is missing.
 UNSEEN_REFUSED, UNSEEN_DOUBTFUL = 0.95, 0.5
-#: Median reprojection errors in pixels: fine detail is lost; not what any adjustment leaves (structure-from-motion drops
-#: what is off by more than 4 pixels of the full size), where it also is this share of the longer side.
+#: Median reprojection errors in pixels: fine detail is lost; not what any adjustment leaves (structure-from-motion
+#: drops what is off by more than 4 pixels of the full size), where it also is this share of the longer side.
 REPROJECTION_DOUBTFUL_PX, REPROJECTION_REFUSED_PX, REPROJECTION_REFUSED = 1.5, 3.0, 0.005
 #: How far the cameras' places move the scene in their pictures, in pixels: no depth; as a share of the longer side:
 #: poor depth.
