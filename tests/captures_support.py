@@ -109,15 +109,28 @@ def write_images(folder: Path, scene: TinyScene, shown: TinyScene | None = None)
 def write_colmap(
     root: Path, scene: TinyScene, *, text: bool = False, model: str = "PINHOLE",
     extra: tuple[float, ...] = (), images: str | None = "images", sparse: str = "sparse/0",
-    shown: TinyScene | None = None,
+    shown: TinyScene | None = None, tracks: bool = False,
 ) -> Path:  # fmt: skip
-    """The scene as a COLMAP capture, one camera per image, `extra` its lens. Returns the model's folder."""
+    """The scene as a COLMAP capture, one camera per image, `extra` its lens. Returns the model's folder.
+
+    With `tracks`, images say which points they show: those that fall into the pictures of `shown` (or `scene`).
+    """
     folder = root / sparse
     folder.mkdir(parents=True, exist_ok=True)
-    (_write_text if text else _write_binary)(folder, scene, model, extra)
+    features = {
+        name: _features(camera, (shown or scene).points, tracks) for name, camera in (shown or scene).cameras.items()
+    }
+    (_write_text if text else _write_binary)(folder, scene, model, extra, features)
     if images is not None:
         write_images(root / images, scene, shown)
     return folder
+
+
+def _features(camera: Camera, points: np.ndarray, tracks: bool) -> list[tuple[float, float, int]]:
+    """x, y and the number of the point of what a picture shows; without tracks one feature of no point."""
+    unmatched = [(1.0, 2.0, -1)]
+    pixels, seen = camera.project(points)[0], camera.sees(points)
+    return unmatched + [(*pixels[index], int(index) + 1) for index in np.flatnonzero(seen)] if tracks else unmatched
 
 
 def _parameters(camera: Camera, model: str, extra: tuple[float, ...]) -> tuple[float, ...]:
@@ -142,7 +155,10 @@ def quaternion_of(rotation: np.ndarray) -> np.ndarray:
     return np.array([w, x, y, z])
 
 
-def _write_binary(folder: Path, scene: TinyScene, model: str, extra: tuple[float, ...]) -> None:
+Features = dict[str, list[tuple[float, float, int]]]
+
+
+def _write_binary(folder: Path, scene: TinyScene, model: str, extra: tuple[float, ...], features: Features) -> None:
     cameras, images = struct.pack("<Q", len(scene.cameras)), struct.pack("<Q", len(scene.cameras))
     for index, (name, camera) in enumerate(scene.cameras.items(), 1):
         values = _parameters(camera, model, extra)
@@ -150,7 +166,8 @@ def _write_binary(folder: Path, scene: TinyScene, model: str, extra: tuple[float
         cameras += struct.pack(f"<{len(values)}d", *values)
         pose = camera.camera_from_world
         images += struct.pack("<I7dI", index, *quaternion_of(pose[:3, :3]), *pose[:3, 3], index)
-        images += name.encode() + b"\0" + struct.pack("<Q", 1) + struct.pack("<ddq", 1.0, 2.0, -1)
+        images += name.encode() + b"\0" + struct.pack("<Q", len(features[name]))
+        images += b"".join(struct.pack("<ddq", *feature) for feature in features[name])
     points = struct.pack("<Q", len(scene.points))
     for index, (point, colour) in enumerate(zip(scene.points, scene.colours, strict=True), 1):
         points += struct.pack("<Q3d3Bd", index, *point, *colour, 0.5) + struct.pack("<Q", 0)
@@ -158,14 +175,15 @@ def _write_binary(folder: Path, scene: TinyScene, model: str, extra: tuple[float
         (folder / f"{stem}.bin").write_bytes(data)
 
 
-def _write_text(folder: Path, scene: TinyScene, model: str, extra: tuple[float, ...]) -> None:
+def _write_text(folder: Path, scene: TinyScene, model: str, extra: tuple[float, ...], features: Features) -> None:
     cameras, images, points = ["# cameras"], ["# images"], ["# points"]
     for index, (name, camera) in enumerate(scene.cameras.items(), 1):
         values = " ".join(repr(float(value)) for value in _parameters(camera, model, extra))
         cameras.append(f"{index} {model} {camera.width} {camera.height} {values}")
         pose = camera.camera_from_world
         numbers = " ".join(repr(float(value)) for value in (*quaternion_of(pose[:3, :3]), *pose[:3, 3]))
-        images += [f"{index} {numbers} {index} {name}", "1.0 2.0 -1"]
+        shown = " ".join(f"{float(x)!r} {float(y)!r} {point}" for x, y, point in features[name])
+        images += [f"{index} {numbers} {index} {name}", shown]
     for index, (point, colour) in enumerate(zip(scene.points, scene.colours, strict=True), 1):
         words = [*(repr(float(value)) for value in point), *(str(int(value)) for value in colour)]
         points.append(f"{index} {' '.join(words)} 0.5")

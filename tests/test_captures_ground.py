@@ -198,16 +198,19 @@ def test_a_georeference_that_contradicts_the_cameras_is_a_warning(tmp_path):
     assert any("90 degrees away" in warning for warning in warnings)
 
 
-def test_a_far_origin_is_moved_so_that_float32_is_safe(tmp_path):
+@pytest.mark.parametrize("near", [True, False])
+def test_a_far_origin_is_moved_so_that_float32_is_safe(tmp_path, near):
+    """Coordinates of UTM are no ENU about any origin: metres hold, a place on Earth would be made up."""
     georef(tmp_path / "georef.json")
-    shift = np.array([432_100.4, -5_187_300.7, 20.0])
+    shift = np.array([4_321.4, -5_187.7, 20.0]) if near else np.array([432_100.4, -5_187_300.7, 20.0])
     scene = moved(tiny_scene(), 1.0, np.eye(3), shift)
-    frame, _ = ground_of(scene, tmp_path)
+    frame, warnings = ground_of(scene, tmp_path)
     ground = frame.to_ground(scene.points)
     assert np.abs(ground).max() < 100
     np.testing.assert_allclose(ground.astype(np.float32), ground, atol=1e-5)
     np.testing.assert_allclose(to_source(frame, ground), scene.points, rtol=1e-15)
-    assert frame.origin_geo is not None
+    assert (frame.origin_geo is not None) == near
+    assert any("projected coordinates (UTM)" in warning for warning in warnings) == (not near)
 
 
 @pytest.mark.parametrize(

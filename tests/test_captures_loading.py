@@ -15,7 +15,8 @@ from captures_support import TinyScene, data_folder, render_plane, tiny_scene, w
 from vdgs.captures.checks import check_images
 from vdgs.captures.formats.source import Intrinsics, SourceView
 from vdgs.captures.images import load_picture
-from vdgs.captures.loading import fit_to_image, load_capture, scaled
+from vdgs.captures.loading import load_capture
+from vdgs.captures.matching import fit_to_image, scaled
 from vdgs.captures.photographs import decode_photograph
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
@@ -51,7 +52,7 @@ def test_a_capture_is_complete(folder, scene):
     assert [view.name for view in capture.views] == sorted(scene.cameras)
     assert capture.points.dtype == np.float64
     assert capture.warnings == ()
-    assert check_images(capture) == 12
+    assert check_images(capture).files == 12
 
 
 def test_pixels_cameras_and_points_agree(folder, scene):
@@ -287,7 +288,9 @@ def test_truncated_images_are_found_before_training(folder, scene):
         file = folder / "images" / name
         file.write_bytes(file.read_bytes()[:-200])
     capture = load_capture(folder, UP)
-    with pytest.raises(CaptureError, match=f"2 of 12 images cannot be decoded(?s:.)*{names[4]}(?s:.)*{names[5]}"):
+    with pytest.raises(
+        CaptureError, match=f"2 of 12 photographs or their masks cannot be used(?s:.)*{names[4]}(?s:.)*{names[5]}"
+    ):
         check_images(capture)
 
 
@@ -363,4 +366,4 @@ def test_real_captures_load_whole(name, test, train, points):
     assert (len(capture.test_views), len(capture.train_views), len(capture.points)) == (test, train, points)
     assert capture.warnings == ()
     assert capture.ground.metric
-    assert check_images(capture, 5) == 5
+    assert check_images(capture, 5).files == 5

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from vdgs.cameras import Camera
+from vdgs.captures.sightings import Sightings
 
 Split = Literal["train", "test"]
 
@@ -49,6 +50,8 @@ class View:
     image_path: Path
     mask_path: Path | None
     split: Split
+    #: Some of the points that the capture says this photograph shows, where it says so (ground frame).
+    sightings: Sightings | None = None
 
 
 @dataclass(frozen=True, eq=False)

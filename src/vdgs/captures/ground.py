@@ -34,6 +34,8 @@ from vdgs.settings.capture import CaptureOptions
 CAMERA_HEIGHT = 10.0
 #: Georeferenced worlds farther than this from their origin are shifted, so that float32 stays below 0.1 mm.
 FAR_FROM_ORIGIN_M = 1000.0
+#: Cameras farther than this from the origin of an ENU world are not in it: they have turned by half a degree.
+FARTHEST_ENU_M = 50_000.0
 #: Below this cosine between up and the mean view the sign of up is taken from the heights instead.
 LEVEL_VIEW = 0.1
 #: A told up axis farther than this from the estimated one is worth a warning.
@@ -75,7 +77,7 @@ def find_ground_frame(source: SourceCapture, root: Path, options: CaptureOptions
     if georef and options.georef is None and options.gps is not None:
         georef = None  # what was asked for wins over what lies about
     if georef:
-        frame = _georeferenced(scene, read_georef(georef), f"world is ENU metres ({georef.name})")
+        frame = _georeferenced(scene, georef, warnings)
         _compare_up(scene, frame, warnings)
         return frame, warnings
     if options.gps:
@@ -100,14 +102,22 @@ def _scene(source: SourceCapture) -> _Scene:
 # ----------------------------------------------------------------------------------------- georeference
 
 
-def _georeferenced(scene: _Scene, origin: tuple[float, float, float], how: str) -> GroundFrame:
+def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame:
     """Identity rotation in metres; the origin moves (by whole metres) only where float32 needs it."""
+    origin, how = read_georef(file), f"world is ENU metres ({file.name})"
     middle = np.median(scene.centres, axis=0)
     shift = np.where(np.abs(middle) > FAR_FROM_ORIGIN_M, -np.round(middle), 0.0)
+    if shift.any():
+        how = f"{how}, origin moved by {np.abs(shift).max():.0f} m"
     frame = GroundFrame(1.0, np.eye(3), np.zeros(3), True, how, origin)
-    if not shift.any():
-        return frame
-    return _shifted(frame, shift, f"{how}, origin moved by {np.abs(shift).max():.0f} m")
+    if np.linalg.norm(middle) > FARTHEST_ENU_M:
+        warnings.append(
+            f"{file.name}: the cameras are {np.linalg.norm(middle) / 1000:,.0f} km away from the origin, where its "
+            "east, north and up do not hold. Are these projected coordinates (UTM) instead of ENU? Metres and up "
+            "are kept, latitude and longitude are not known."
+        )
+        return replace(frame, translation=shift, origin_geo=None)
+    return _shifted(frame, shift, how) if shift.any() else frame
 
 
 def _shifted(frame: GroundFrame, shift: np.ndarray, how: str) -> GroundFrame:

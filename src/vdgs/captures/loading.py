@@ -2,35 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
-from vdgs.captures.formats.colmap import count_images, find_models, read_colmap
+from vdgs.captures.formats.colmap import count_images, find_models, partial_model, read_colmap
 from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
 from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
-from vdgs.captures.formats.source import SINGLE_FOCAL, Intrinsics, SourceCapture, SourceView, listing
+from vdgs.captures.formats.source import SourceCapture, listing
 from vdgs.captures.formats.transforms import read_transforms
 from vdgs.captures.ground import find_ground_frame, transform_pose
-from vdgs.captures.photographs import Names, find_images, find_mask, read_header
+from vdgs.captures.matching import FoundView, find_photographs
+from vdgs.captures.photographs import LEAST_SIDE_PX
+from vdgs.captures.precision import rounding_of
+from vdgs.captures.sightings import Sightings
 from vdgs.captures.splits import choose_splits, nearest_to_middle
-from vdgs.captures.undistortion import ImageFile, undistort
+from vdgs.captures.undistortion import undistort
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
 
 #: Points farther from the cameras than this many times their spread are strays of the matching.
 FAR_POINT = 100.0
-
-
-@dataclass(frozen=True, eq=False)
-class _FoundView:
-    """A view whose image was found."""
-
-    view: SourceView
-    file: ImageFile
 
 
 def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
@@ -47,7 +42,7 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     source = _read(root, options)
     warnings = list(source.warnings)
     source = _without_bad_points(source, warnings)
-    photographs = _find_photographs(root, source, options, warnings)
+    photographs = find_photographs(root, source, options, warnings)
     photographs = _undistorted(root, photographs, options, warnings)
     ground, ground_warnings = find_ground_frame(source, root, options)
     views = [_view(photo, options, ground) for photo in photographs]
@@ -98,8 +93,8 @@ def _read(root: Path, options: CaptureOptions) -> SourceCapture:
     if (root / "transforms.json").is_file():
         return read_transforms(root, options)
     raise CaptureError(
-        f"{root}: not a capture. Looked for a COLMAP model (sparse/0/cameras.bin and images.bin, or .txt), "
-        "transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json "
+        f"{root}: not a capture. {partial_model(root)}Looked for a COLMAP model (sparse/0/cameras.bin and "
+        "images.bin, or .txt), transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json "
         "(MatrixCity). For photographs alone, run COLMAP first (for example: colmap automatic_reconstructor)."
     )
 
@@ -162,94 +157,23 @@ def _without_bad_points(source: SourceCapture, warnings: list[str]) -> SourceCap
             f"{(~finite).sum()} points that are not finite and {(finite & ~keep).sum()} points farther than "
             f"{FAR_POINT:.0f}x the spread of the cameras were left out of {len(keep)}."
         )
+    far = float(np.median(distance[keep]))
+    step = rounding_of(source.points[keep], far)
+    if step:
+        warnings.append(
+            f"the sparse points are rounded to {step:.3g} of their world's units, {step / far:.1%} of their distance "
+            "to the cameras: survey coordinates saved with too few digits (float32)? Subtract an origin in the place "
+            "before saving, or save double precision."
+        )
     return replace(source, points=source.points[keep], colours=source.colours[keep])
 
 
 # --------------------------------------------------------------------------------------- photographs
 
 
-def _find_photographs(
-    root: Path, source: SourceCapture, options: CaptureOptions, warnings: list[str]
-) -> list[_FoundView]:
-    """Every view with its image file; images without a camera become a warning, the reverse an error."""
-    folder = root / source.images
-    available = Names(find_images(folder)) if folder.is_dir() else Names({})
-    paths: list[Path] = []
-    missing: list[str] = []
-    for view in source.views:
-        path = view.image_path or folder / (available.find(view.name) or view.name)
-        paths.append(path)
-        if not path.is_file():
-            missing.append(str(path))
-    if missing:
-        raise CaptureError(
-            f"{folder}: {len(missing)} of {len(source.views)} images that have a camera are missing. Copy "
-            f"them there, or choose another folder with --images.{listing(missing)}"
-        )
-    used = {path.resolve() for path in paths}
-    spare = [
-        name
-        for spare_folder in source.image_folders
-        for name, path in find_images(spare_folder).items()
-        if path.resolve() not in used
-    ]
-    if spare:
-        shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
-        warnings.append(f"{len(spare)} images have no camera and are not used ({shown}).")
-    return _fitted(root, source, paths, options)
-
-
-def _fitted(root: Path, source: SourceCapture, paths: list[Path], options: CaptureOptions) -> list[_FoundView]:
-    """The views with their images, masks and intrinsics at the images' sizes; collects what does not fit."""
-    photographs, problems = [], []
-    for view, path in zip(source.views, paths, strict=True):
-        mask = view.mask_path or find_mask(root / options.masks, view.name)
-        try:
-            photographs.append(_FoundView(view, ImageFile(view.name, path, mask, fit_to_image(view, path))))
-        except CaptureError as error:
-            problems.append(str(error))
-    if len(problems) > 1:
-        raise CaptureError(f"{root / source.images}: {len(problems)} images cannot be used.{listing(problems)}")
-    if problems:
-        raise CaptureError(problems[0])
-    return photographs
-
-
-def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
-    """The view's intrinsics at the actual size of its image.
-
-    Shrunk folders hold sizes rounded up or down by at most one pixel; anything else contradicts the model.
-    """
-    header, intrinsics = read_header(path), view.intrinsics
-    if (header.width, header.height) == (intrinsics.width, intrinsics.height):
-        return intrinsics
-    low = max((header.width - 1) / intrinsics.width, (header.height - 1) / intrinsics.height)
-    high = min((header.width + 1) / intrinsics.width, (header.height + 1) / intrinsics.height)
-    if low > high:
-        turned = (header.width > header.height) != (intrinsics.width > intrinsics.height)
-        hint = "The image is turned by a quarter (EXIF orientation applied?). " if turned else ""
-        raise CaptureError(
-            f"{path}: is {header.width}x{header.height}, but its camera is "
-            f"{intrinsics.width}x{intrinsics.height}: another shape, so the two do not belong together. "
-            f"{hint}Use the images that the model was made from, or shrink them evenly."
-        )
-    return scaled(intrinsics, header.width, header.height)
-
-
-def scaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
-    """Intrinsics for the same picture at another size; lens distortion parameters do not depend on it."""
-    sx, sy = width / intrinsics.width, height / intrinsics.height
-    (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.principal_point
-    if not intrinsics.distorted:
-        return Intrinsics("PINHOLE", (fx * sx, fy * sy, cx * sx, cy * sy), width, height)
-    head = (fx * (sx + sy) / 2,) if intrinsics.model in SINGLE_FOCAL else (fx * sx, fy * sy)
-    tail = intrinsics.params[len(head) + 2 :]
-    return Intrinsics(intrinsics.model, (*head, cx * sx, cy * sy, *tail), width, height)
-
-
 def _undistorted(
-    root: Path, photographs: list[_FoundView], options: CaptureOptions, warnings: list[str]
-) -> list[_FoundView]:
+    root: Path, photographs: list[FoundView], options: CaptureOptions, warnings: list[str]
+) -> list[FoundView]:
     """Pinhole photographs only: undistorts on request, else refuses lens distortion."""
     bent = [photo for photo in photographs if photo.file.intrinsics.distorted]
     if not bent:
@@ -264,15 +188,23 @@ def _undistorted(
     folder = options.undistorted_folder or root / "undistorted" / (options.images or "images")
     straight = undistort(folder, [photo.file for photo in photographs])
     warnings.append(f"{len(bent)} photographs were undistorted into {folder}.")
-    return [_FoundView(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
+    return [FoundView(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
 
 
-def _view(photo: _FoundView, options: CaptureOptions, ground: GroundFrame) -> View:
+def _view(photo: FoundView, options: CaptureOptions, ground: GroundFrame) -> View:
     intrinsics = photo.file.intrinsics
     (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.principal_point
     width, height = intrinsics.width, intrinsics.height
     pose = transform_pose(photo.view.camera_from_world, ground)
     camera = Camera(pose, fx, fy, cx, cy, width, height)
     if options.downscale != 1:
-        camera = camera.resized(max(1, int(width / options.downscale)), max(1, int(height / options.downscale)))
-    return View(photo.view.name, camera, photo.file.path, photo.file.mask, "train")
+        width, height = int(width / options.downscale), int(height / options.downscale)
+        if min(width, height) < LEAST_SIDE_PX:
+            raise CaptureError(
+                f"--downscale {options.downscale:g}: leaves {width}x{height} pixels of {photo.file.path}, too few to "
+                "show anything."
+            )
+        camera = camera.resized(width, height)
+    seen = photo.view.sightings
+    sightings = None if seen is None else Sightings(ground.to_ground(seen.points), seen.rays)
+    return View(photo.view.name, camera, photo.file.path, photo.file.mask, "train", sightings)

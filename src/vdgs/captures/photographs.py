@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,6 +22,12 @@ from vdgs.memory.process import is_out_of_memory
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
 #: Headers that announce more pixels than this are refused rather than decoded.
 LARGEST_IMAGE_PX = 1_000_000_000
+#: A photograph or mask with a shorter side than this shows nothing: a thumbnail, or what is left of a file (choice).
+LEAST_SIDE_PX = 8
+#: Two sizes are of one shape if one is the other shrunk evenly, each side rounded by less than this (pixels).
+ROUNDING_PX = 1.0
+#: A mask keeps what is at least so bright, of 255; an alpha channel what is at least so opaque (choice).
+MASK_LEVEL = 128
 #: Pillow's modes that we know how to bring to 8-bit RGB.
 KNOWN_MODES = {"RGB", "RGBA", "L", "LA", "P", "1", "I;16", "I;16B", "I;16L", "I"}
 
@@ -51,7 +58,7 @@ def pillow_quietly() -> Iterator[None]:
 
 
 def read_header(path: Path) -> Header:
-    """Size and mode without decoding. Raises `CaptureError` for unreadable, huge or CMYK images."""
+    """Size and mode without decoding. Raises `CaptureError` for unreadable, huge, tiny or CMYK images."""
     try:
         with pillow_quietly(), Image.open(path) as image:
             header = Header(image.width, image.height, image.mode)
@@ -61,9 +68,20 @@ def read_header(path: Path) -> Header:
         raise CaptureError(f"{path}: not an image that can be read ({error}). Copy it again.") from None
     if header.width * header.height > LARGEST_IMAGE_PX:
         raise CaptureError(f"{path}: announces {header.width}x{header.height} pixels; the file is damaged.")
+    if min(header.width, header.height) < LEAST_SIDE_PX:
+        raise CaptureError(
+            f"{path}: is {header.width}x{header.height} pixels, too small to show anything. Copy the image again."
+        )
     if header.mode not in KNOWN_MODES:
         raise CaptureError(f"{path}: has the colour mode {header.mode}; convert it to 8-bit RGB.")
     return header
+
+
+def same_shape(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes (width, height) can be of one picture, shrunk evenly and rounded in any way."""
+    (width, height), (wide, high) = sorted((one, other))
+    low = max((width - ROUNDING_PX) / wide, (height - ROUNDING_PX) / high)
+    return low <= min((width + ROUNDING_PX) / wide, (height + ROUNDING_PX) / high)
 
 
 def find_images(folder: Path) -> dict[str, Path]:
@@ -122,16 +140,21 @@ def decode_photograph(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         return cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGB), None
     if pixels.shape[2] == 3:
         return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), None
-    opaque = pixels[:, :, 3] >= 128
+    opaque = pixels[:, :, 3] >= MASK_LEVEL
     return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGB), None if opaque.all() else opaque
 
 
 def decode_mask(path: Path, width: int, height: int) -> np.ndarray:
     """What a mask keeps (white), [height, width] bool; a mask of another size is resampled to the image's."""
-    keep = decode_photograph(path)[0].max(axis=2) >= 128
+    keep = _lightness(path) >= MASK_LEVEL
     if keep.shape == (height, width):
         return keep
     return cv2.resize(keep.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _lightness(mask: Path) -> np.ndarray:
+    """The brightest channel of a mask at its own size, [h, w] uint8."""
+    return decode_photograph(mask)[0].max(axis=2)
 
 
 def _decode(path: Path) -> np.ndarray:
@@ -157,8 +180,15 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: cannot be decoded ({error}). Copy it again or remove it.") from None
 
 
-def verify(path: Path) -> str | None:
-    """What is wrong with an image file, or None. Decodes every byte of it once.
+class Verified(NamedTuple):
+    """What decoding an image told: whether it shows more than one colour, and whether it may be transparent."""
+
+    shows: bool
+    may_be_transparent: bool
+
+
+def verify(path: Path) -> Verified:
+    """Decode every byte of an image file once. Raises `CaptureError` naming a file that is truncated or damaged.
 
     OpenCV fills the missing part of a truncated file with grey and says nothing; Pillow is strict. JPEGs are
     decoded at 1/8 size, which still reads the whole stream, several times faster.
@@ -168,6 +198,32 @@ def verify(path: Path) -> str | None:
             if image.format == "JPEG":
                 image.draft(image.mode, (max(1, image.width // 8), max(1, image.height // 8)))
             image.load()
+            ranges = [image.getchannel(band).getextrema() for band in image.getbands() if band != "A"]
+            transparent = "A" in image.getbands() or "transparency" in image.info
     except Exception as error:  # any complaint of a decoder is what we came for
-        return f"{path}: {error}"
-    return None
+        raise CaptureError(f"{path}: {error}") from None
+    return Verified(any(high != low for low, high in ranges), transparent)
+
+
+def share_kept(photograph: Path, mask: Path | None, may_be_transparent: bool) -> float:
+    """The share of a photograph that its mask and its transparency keep; 1 without either.
+
+    Raises `CaptureError` where they keep nothing.
+    """
+    opaque = decode_photograph(photograph)[1] if may_be_transparent else None
+    keep = opaque
+    if mask is not None:
+        light = _lightness(mask)
+        if not (light >= MASK_LEVEL).any():
+            hint = "Scale its values to 0 and 255" if light.any() else "Turn it round if it is inverted"
+            raise CaptureError(
+                f"{mask}: leaves nothing of its photograph. White is kept, and the brightest value here is "
+                f"{light.max()} of 255. {hint}, or remove the photograph from the model."
+            )
+        keep = light >= MASK_LEVEL if opaque is None else decode_mask(mask, *opaque.shape[::-1]) & opaque
+    if keep is not None and not keep.any():
+        raise CaptureError(
+            f"{photograph}: is transparent everywhere that it is not masked; nothing of it is left. Remove its "
+            "alpha channel, or the photograph from the model."
+        )
+    return 1.0 if keep is None else float(keep.mean())

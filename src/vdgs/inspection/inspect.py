@@ -9,15 +9,18 @@ from pathlib import Path
 import numpy as np
 import torch
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
+from vdgs.captures.checks import CheckedImages
 from vdgs.figures.sampling import sample_points
 from vdgs.inspection.figures import draw_map, draw_visibility
 from vdgs.inspection.measure import CaptureReport, length, measure
+from vdgs.inspection.soundness import judge, reprojection_words
 from vdgs.model.visibility import visibility_of
-from vdgs.storage.files import write_json
+from vdgs.storage.files import jsonable, write_json
 
 #: Points looked at when there are more, and fewer where there are many cameras.
 MOST_POINTS = 200_000
@@ -25,18 +28,21 @@ LEAST_POINTS = 20_000
 MOST_PROJECTIONS = 2e8
 
 
-def inspect_capture(capture: Capture, output: Path) -> CaptureReport:
-    """Measure the capture; write report.json and two figures into the folder `output` (made if absent)."""
+def inspect_capture(capture: Capture, output: Path, checked: CheckedImages | None = None) -> CaptureReport:
+    """Measure the capture; write report.json and two figures into the folder `output` (made if absent).
+
+    `checked` is what decoding its photographs told, where they were decoded.
+    """
     output.mkdir(parents=True, exist_ok=True)
     few_enough = int(np.clip(MOST_PROJECTIONS / len(capture.train_views), LEAST_POINTS, MOST_POINTS))
     points = sample_points(capture.points, few_enough)
     visibility = _visibility(points, [view.camera for view in capture.train_views])
-    report = measure(capture, points, visibility)
+    report = measure(capture, points, visibility, judge(capture), checked)
     figures = [output / "visibility_map.png", output / "visibility.png"]
     draw_map(capture, report, points, visibility, figures[0])
     draw_visibility(report, visibility, figures[1])
     report = replace(report, figures=[file.name for file in figures])
-    write_json(output / "report.json", asdict(report))
+    write_json(output / "report.json", jsonable(asdict(report)))
     return report
 
 
@@ -52,10 +58,12 @@ def print_report(report: CaptureReport, console: Console | None = None) -> None:
     table.add_column(style="bold", no_wrap=True)
     table.add_column()
     for label, value in _rows(report):
-        table.add_row(label, value)
+        table.add_row(label, escape(value))
     console.print(table)
     for warning in report.warnings:
-        console.print(f"[yellow]Warning:[/] {warning}", highlight=False)
+        console.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False)
+    for problem in report.problems:
+        console.print(f"[red]Problem:[/] {escape(problem)}", highlight=False)
 
 
 def _rows(report: CaptureReport) -> list[tuple[str, str]]:
@@ -79,9 +87,29 @@ def _rows(report: CaptureReport) -> list[tuple[str, str]]:
         ("Ground sample distance", f"{length(report.ground_sample_distance, unit)} per pixel"),
         ("Cameras per point V", quantiles),
         ("Poorly seen points", f"{below} cameras; Gini {report.visibility_gini:.2f}"),
+        ("Masks", _masks(report)),
+        ("Cameras and points", _agreement(report)),
         ("Images in memory", f"{report.image_bytes / 2**20:.0f} MiB"),
     ]
     if report.origin_geo is not None:
         latitude, longitude, altitude = report.origin_geo
         rows.insert(5, ("Origin", f"{latitude:.7f}, {longitude:.7f}, {altitude:.1f} m"))
     return rows
+
+
+def _masks(report: CaptureReport) -> str:
+    """How much of the photographs is left out."""
+    left_out = "photographs not decoded" if report.masked_share is None else f"{report.masked_share:.1%} masked out"
+    if not report.masks and not report.masked_share:
+        return "none"
+    transparent = "" if report.masks else ", by transparency"
+    return f"of {report.masks} of {report.photographs} photographs; {left_out}{transparent}"
+
+
+def _agreement(report: CaptureReport) -> str:
+    """Whether the points lie where the photographs show them, and by what that was judged."""
+    seen = f"{report.share_seen:.1%} of the points lie in front of and inside a training camera"
+    if not report.sightings:
+        return f"{seen} (the capture has no tracks to reproject)"
+    error = reprojection_words(float("inf") if report.reprojection_px is None else report.reprojection_px)
+    return f"median reprojection error {error} ({report.sightings} sightings of the model's tracks); {seen}"

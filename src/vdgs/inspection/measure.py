@@ -13,7 +13,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from vdgs.captures.capture import Capture
+from vdgs.captures.checks import CheckedImages
 from vdgs.figures.sampling import sample_points
+from vdgs.inspection.soundness import Soundness
 from vdgs.model.visibility import LIMITS, imbalance
 
 
@@ -54,12 +56,25 @@ class CaptureReport:
     share_below: dict[int, float]
     #: Bytes that all images take in memory, as uint8.
     image_bytes: int
+    #: Photographs with a mask, and the share of all pixels that masks and transparency leave out; None: not decoded.
+    masks: int
+    masked_share: float | None
+    #: Median reprojection error in pixels as used, on so many sightings; None where the capture has no tracks, or where
+    #: most of their points lie behind the cameras.
+    reprojection_px: float | None
+    sightings: int
+    #: Share of the points that at least one training camera sees.
+    share_seen: float
+    #: What makes training pointless, and what a person should know but need not mend.
+    problems: list[str]
     warnings: list[str]
     figures: list[str]
 
 
-def measure(capture: Capture, points: np.ndarray, visibility: np.ndarray) -> CaptureReport:
-    """The report on a capture, given (a sample of) its points and their V."""
+def measure(
+    capture: Capture, points: np.ndarray, visibility: np.ndarray, soundness: Soundness, checked: CheckedImages | None
+) -> CaptureReport:
+    """The report on a capture, given (a sample of) its points and their V; `checked` None: nothing was decoded."""
     cameras = [view.camera for view in capture.views]
     ground_height = float(np.median(points[:, 2]))
     heights = np.array([camera.position[2] for camera in cameras]) - ground_height
@@ -96,7 +111,18 @@ def measure(capture: Capture, points: np.ndarray, visibility: np.ndarray) -> Cap
         visibility_gini=seen.gini,
         share_below=seen.share_below,
         image_bytes=sum(3 * camera.width * camera.height for camera in cameras) + masked,
-        warnings=[*capture.warnings, *_findings(visibility)],
+        masks=sum(view.mask_path is not None for view in capture.views),
+        masked_share=None if checked is None else checked.masked_share,
+        reprojection_px=soundness.reprojection_px,
+        sightings=soundness.sightings,
+        share_seen=float((visibility > 0).mean()),
+        problems=list(soundness.problems),
+        warnings=[
+            *capture.warnings,
+            *(checked.warnings if checked else ()),
+            *soundness.warnings,
+            *_findings(visibility),
+        ],
         figures=[],
     )
 

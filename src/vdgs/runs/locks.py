@@ -1,4 +1,4 @@
-"""Folders that processes hold, by a lock of the system on a file in them: it ends with the process, whatever ends it."""
+"""Folders that processes hold, by a lock of the system on a file in them, which ends with the process."""
 
 from __future__ import annotations
 

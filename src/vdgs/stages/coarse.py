@@ -7,10 +7,10 @@ from rich.console import Console
 
 from vdgs import __version__
 from vdgs.captures.capture import Capture
-from vdgs.captures.checks import check_images
 from vdgs.captures.facts import capture_facts
 from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
+from vdgs.inspection.starting import refuse_unworkable
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
@@ -32,8 +32,8 @@ def train_coarse(
 ) -> None:
     """Train, or continue, the coarse model of a run on a device; nothing if it is finished.
 
-    Raises CaptureError for damaged photographs, Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged (last
-    good state kept).
+    Raises CaptureError for a capture that cannot become a scene or damaged photographs, Stopped after Ctrl-C or SIGTERM
+    (state saved), TrainingDiverged (last good state kept).
     """
     options.check()
     with run.locked():
@@ -41,9 +41,7 @@ def train_coarse(
         if folder.is_done(key):
             console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
             return
-        for warning in capture.warnings:
-            console.print(f"[yellow]note[/] {warning}")
-        check_images(capture)
+        refuse_unworkable(capture, console)
         config = run.method().training
         note_without_growth(config, console)
         write_json(run.capture_file, capture_facts(capture))

@@ -16,7 +16,8 @@ from vdgs.verbs.shared import open_console
 
 @dataclass(frozen=True)
 class InspectArguments:
-    """Say what a capture holds and how well its photographs cover the place, in a table and figures."""
+    """Say what a capture holds, whether it can become a scene, and how well its photographs cover the place, in a table
+    and figures. Fails where training would be pointless."""
 
     capture: Positional[Path]
     """Folder of the capture."""
@@ -31,12 +32,15 @@ def inspect(arguments: list[str]) -> None:
     asked = tyro.cli(InspectArguments, args=arguments, prog="vdgs inspect")
     from vdgs.captures.checks import check_images
     from vdgs.captures.loading import load_capture
+    from vdgs.errors import CaptureError
     from vdgs.inspection.inspect import inspect_capture, print_report
 
     capture = load_capture(asked.capture, asked.options)
-    if asked.check:
-        check_images(capture)
-    print_report(inspect_capture(capture, asked.output))
+    checked = check_images(capture) if asked.check else None
+    report = inspect_capture(capture, asked.output, checked)
+    print_report(report)
+    if report.problems:
+        raise CaptureError(f"{capture.root}: cannot become a scene; see the problems above.")
 
 
 @dataclass(frozen=True)

@@ -8,27 +8,27 @@ neither crash the process nor exhaust memory. Layout: https://colmap.github.io/f
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from vdgs.captures.formats.colmap_binary import cameras_binary, images_binary, points_binary
+from vdgs.captures.formats.colmap_records import ImageRecord, Points, no_points
+from vdgs.captures.formats.colmap_text import cameras_text, images_text, points_text
 from vdgs.captures.formats.source import (
-    CAMERA_MODELS,
-    MODEL_PARAMETERS,
     Intrinsics,
     SourceView,
-    check_intrinsics,
     duplicates,
     listing,
+    rays_of,
     rigid,
     safe_name,
 )
+from vdgs.captures.sightings import Sightings
 from vdgs.errors import CaptureError
 
 QUATERNION_TOLERANCE = 1e-3
-LONGEST_NAME = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,67 +41,19 @@ class ColmapModel:
     colours: np.ndarray
 
 
-class _Cursor:
-    """Reads little-endian records from a whole file, never past its end."""
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self.data = file.read_bytes()
-        self.offset = 0
-
-    @property
-    def left(self) -> int:
-        return len(self.data) - self.offset
-
-    def fail(self, what: str) -> CaptureError:
-        return CaptureError(
-            f"{self.file}: {what} at byte {self.offset} of {len(self.data)}. "
-            "The file is truncated or damaged; copy or export the COLMAP model again."
-        )
-
-    def take(self, layout: str) -> tuple:
-        size = struct.calcsize("<" + layout)
-        if self.left < size:
-            raise self.fail("the file ends in the middle of a record")
-        values = struct.unpack_from("<" + layout, self.data, self.offset)
-        self.offset += size
-        return values
-
-    def count(self, smallest_record: int, what: str) -> int:
-        (count,) = self.take("Q")
-        if count * smallest_record > self.left:
-            raise self.fail(f"{count} {what} are announced, more than the file can hold,")
-        return count
-
-    def skip(self, size: int) -> None:
-        if size > self.left:
-            raise self.fail("the file ends in the middle of a record")
-        self.offset += size
-
-    def name(self) -> str:
-        end = self.data.find(b"\0", self.offset, self.offset + LONGEST_NAME)
-        if end < 0:
-            raise self.fail("an image name does not end")
-        raw, self.offset = self.data[self.offset : end], end + 1
-        try:
-            return raw.decode("utf-8")
-        except UnicodeDecodeError:
-            raise self.fail(f"an image name is not UTF-8 text ({raw[:40]!r})") from None
-
-    def finish(self) -> None:
-        if self.left:
-            raise self.fail(f"{self.left} bytes are left over after the last record")
-
-
 def find_models(root: Path) -> list[Path]:
     """Folders that hold a sparse model: `root`/sparse/N, sparse, colmap/sparse/N, N, or `root` itself."""
+    return [folder for folder in _candidates(root) if _format(folder) is not None]
+
+
+def _candidates(root: Path) -> list[Path]:
     parents = [root / "sparse", root / "colmap" / "sparse", root]
     candidates: list[Path] = []
     for parent in parents:
         if parent.is_dir():
             numbered = [entry for entry in parent.iterdir() if entry.is_dir() and entry.name.isdigit()]
             candidates += [*sorted(numbered, key=lambda entry: int(entry.name)), parent]
-    return [folder for folder in candidates if _format(folder) is not None]
+    return candidates
 
 
 def read_colmap(folder: Path) -> ColmapModel:
@@ -116,14 +68,14 @@ def read_colmap(folder: Path) -> ColmapModel:
     cameras_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
     points_file = folder / f"points3D{suffix}"
     try:
-        cameras = (_cameras_binary if binary else _cameras_text)(cameras_file)
-        records = list((_images_binary if binary else _images_text)(images_file))
-        points, colours = _no_points()
+        cameras = (cameras_binary if binary else cameras_text)(cameras_file)
+        records = list((images_binary if binary else images_text)(images_file))
+        points = no_points()
         if points_file.is_file():
-            points, colours = (_points_binary if binary else _points_text)(points_file)
+            points = (points_binary if binary else points_text)(points_file)
     except OSError as error:
         raise CaptureError(f"{error.filename or folder}: cannot be read ({error.strerror or error}).") from error
-    return ColmapModel(folder, _views(records, cameras, images_file), points, colours)
+    return ColmapModel(folder, _views(records, cameras, points, images_file), points.positions, points.colours)
 
 
 def count_images(folder: Path) -> int:
@@ -132,9 +84,21 @@ def count_images(folder: Path) -> int:
         if _format(folder) == ".bin":
             with (folder / "images.bin").open("rb") as stream:
                 return struct.unpack("<Q", stream.read(8))[0]
-        return sum(1 for _ in _images_text(folder / "images.txt"))
+        return sum(1 for _ in images_text(folder / "images.txt", with_points=False))
     except (OSError, struct.error, CaptureError):
         return -1
+
+
+def partial_model(root: Path) -> str:
+    """A sentence about a folder that holds part of a sparse model; empty where there is none."""
+    for folder in _candidates(root):
+        for suffix in (".bin", ".txt"):
+            files = {stem: folder / (stem + suffix) for stem in ("cameras", "images")}
+            missing = [file.name for file in files.values() if not file.is_file()]
+            if len(missing) == 1:
+                present = next(file.name for file in files.values() if file.is_file())
+                return f"{folder} holds {present} but no {missing[0]} that can be read: copy the whole model. "
+    return ""
 
 
 def _format(folder: Path) -> str | None:
@@ -144,19 +108,9 @@ def _format(folder: Path) -> str | None:
     return None
 
 
-def _no_points() -> tuple[np.ndarray, np.ndarray]:
-    return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-
-
-@dataclass(frozen=True)
-class _ImageRecord:
-    quaternion: tuple[float, ...]  # wxyz
-    translation: tuple[float, ...]
-    camera: int
-    name: str
-
-
-def _views(records: list[_ImageRecord], cameras: dict[int, Intrinsics], file: Path) -> tuple[SourceView, ...]:
+def _views(
+    records: list[ImageRecord], cameras: dict[int, Intrinsics], points: Points, file: Path
+) -> tuple[SourceView, ...]:
     """Posed views in name order; raises on silly poses, unknown cameras and names given twice."""
     orphans = [f"{record.name} (camera {record.camera})" for record in records if record.camera not in cameras]
     if orphans:
@@ -164,9 +118,13 @@ def _views(records: list[_ImageRecord], cameras: dict[int, Intrinsics], file: Pa
             f"{file}: these images name a camera that is not in the cameras file. "
             f"Both files must come from the same export.{listing(orphans)}"
         )
-    views = [
-        SourceView(safe_name(record.name, file), _pose(record, file), cameras[record.camera]) for record in records
-    ]
+    sorted_points = Points(*(column[np.argsort(points.numbers, kind="stable")] for column in points))
+    views = []
+    for record in records:
+        intrinsics = cameras[record.camera]
+        sightings = _sightings(record, sorted_points, intrinsics)
+        name, pose = safe_name(record.name, file), _pose(record, file)
+        views.append(SourceView(name, pose, intrinsics, sightings=sightings))
     views.sort(key=lambda view: view.name)
     twice = duplicates(view.name for view in views)
     if twice:
@@ -174,7 +132,19 @@ def _views(records: list[_ImageRecord], cameras: dict[int, Intrinsics], file: Pa
     return tuple(views)
 
 
-def _pose(record: _ImageRecord, file: Path) -> np.ndarray:
+def _sightings(record: ImageRecord, points: Points, intrinsics: Intrinsics) -> Sightings | None:
+    """What an image says that it shows, of points sorted by number; None where it says nothing."""
+    numbers, pixels = record.shown
+    if not len(numbers) or not len(points.numbers):
+        return None
+    places = np.searchsorted(points.numbers, numbers).clip(max=len(points.numbers) - 1)
+    rays = rays_of(intrinsics, pixels)
+    known = (points.numbers[places] == numbers) & np.isfinite(rays).all(axis=1)
+    known &= np.isfinite(points.positions[places]).all(axis=1)
+    return Sightings(points.positions[places[known]], rays[known]) if known.any() else None
+
+
+def _pose(record: ImageRecord, file: Path) -> np.ndarray:
     label = f"image {record.name!r}"
     quaternion = np.array(record.quaternion)
     near = np.isfinite(quaternion).all() and np.abs(quaternion).max() < 2  # before squares overflow
@@ -199,139 +169,3 @@ def rotation_from_quaternion(quaternion: np.ndarray) -> np.ndarray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-
-
-# ------------------------------------------------------------------------------------------- binary
-
-
-def _cameras_binary(file: Path) -> dict[int, Intrinsics]:
-    cursor = _Cursor(file)
-    cameras: dict[int, Intrinsics] = {}
-    for _ in range(cursor.count(24 + 3 * 8, "cameras")):
-        identifier, model, width, height = cursor.take("IiQQ")
-        if model not in CAMERA_MODELS:
-            raise cursor.fail(f"camera {identifier} has the unknown or unsupported model number {model}")
-        name, parameters = CAMERA_MODELS[model]
-        intrinsics = Intrinsics(name, cursor.take(f"{parameters}d"), width, height)
-        _add_camera(cameras, identifier, intrinsics, file)
-    cursor.finish()
-    return cameras
-
-
-def _add_camera(cameras: dict[int, Intrinsics], identifier: int, intrinsics: Intrinsics, file: Path) -> None:
-    if identifier in cameras:
-        raise CaptureError(f"{file}: camera {identifier} occurs twice. Export the COLMAP model again.")
-    cameras[identifier] = check_intrinsics(intrinsics, file, f"camera {identifier}")
-
-
-def _images_binary(file: Path) -> Iterator[_ImageRecord]:
-    cursor = _Cursor(file)
-    for _ in range(cursor.count(4 + 7 * 8 + 4 + 1 + 8, "images")):
-        _, *pose, camera = cursor.take("I7dI")
-        name = cursor.name()
-        cursor.skip(24 * cursor.count(24, "image points"))
-        yield _ImageRecord(tuple(pose[:4]), tuple(pose[4:]), camera, name)
-    cursor.finish()
-
-
-#: Fixed part of a point: id, xyz, rgb, error, track length.
-_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
-
-
-def _points_binary(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    cursor = _Cursor(file)
-    size, data = _POINT.itemsize, cursor.data
-    count = cursor.count(size, "points")
-    buffer = bytearray(count * size)
-    offset, end = cursor.offset, len(data)
-    for index in range(count):
-        after = offset + size
-        track_end = after + 8 * int.from_bytes(data[after - 8 : after], "little")
-        if after > end or track_end > end:
-            cursor.offset = offset
-            raise cursor.fail(f"point {index} of {count} runs past the end of the file")
-        buffer[index * size : (index + 1) * size] = data[offset:after]
-        offset = track_end
-    cursor.offset = offset
-    cursor.finish()
-    records = np.frombuffer(buffer, _POINT)
-    return records["xyz"].astype(np.float64), records["rgb"].copy()
-
-
-# --------------------------------------------------------------------------------------------- text
-
-
-def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines without the leading comments."""
-    try:
-        with file.open(encoding="utf-8") as stream:
-            for number, line in enumerate(stream, 1):
-                if not line.startswith("#"):
-                    yield number, line.rstrip("\r\n")
-    except UnicodeDecodeError as error:
-        raise CaptureError(f"{file}: is not UTF-8 text ({error}). Export the COLMAP model again.") from None
-
-
-def _bad_line(file: Path, number: int, expected: str) -> CaptureError:
-    return CaptureError(f"{file}: line {number} should read '{expected}'. The file is damaged; export it again.")
-
-
-def _cameras_text(file: Path) -> dict[int, Intrinsics]:
-    expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
-    cameras: dict[int, Intrinsics] = {}
-    for number, line in _lines(file):
-        words = line.split()
-        if not words:
-            continue
-        try:
-            identifier, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
-            params = tuple(float(word) for word in words[4:])
-        except (ValueError, IndexError):
-            raise _bad_line(file, number, expected) from None
-        if MODEL_PARAMETERS.get(model) != len(params):
-            raise CaptureError(
-                f"{file}: line {number}: {model!r} with {len(params)} parameters is no camera model that is "
-                "supported. "
-                f"Supported: {', '.join(MODEL_PARAMETERS)}."
-            )
-        _add_camera(cameras, identifier, Intrinsics(model, params, width, height), file)
-    return cameras
-
-
-def _images_text(file: Path) -> Iterator[_ImageRecord]:
-    """Two lines an image: the pose, then its points (which may be an empty line)."""
-    lines = _lines(file)
-    for number, line in lines:
-        if not line.strip():
-            continue
-        words = line.split(maxsplit=9)
-        try:
-            _, camera = int(words[0]), int(words[8])
-            pose = [float(word) for word in words[1:8]]
-            name = words[9].strip()
-        except (ValueError, IndexError):
-            raise _bad_line(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
-        yield _ImageRecord(tuple(pose[:4]), tuple(pose[4:]), camera, name)
-        next(lines, None)
-
-
-def _points_text(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    positions: list[list[float]] = []
-    colours: list[list[int]] = []
-    for number, line in _lines(file):
-        words = line.split(maxsplit=8)
-        if not words:
-            continue
-        try:
-            position = [float(word) for word in words[1:4]]
-            colour = [int(word) for word in words[4:7]]
-            float(words[7])
-        except (ValueError, IndexError):
-            raise _bad_line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK[]") from None
-        if not all(0 <= value <= 255 for value in colour):
-            raise _bad_line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK[], colours from 0 to 255")
-        positions.append(position)
-        colours.append(colour)
-    if not positions:
-        return _no_points()
-    return np.array(positions, np.float64), np.array(colours, np.uint8)

@@ -12,8 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
+import pycolmap
 
 from vdgs.captures.capture import Split
+from vdgs.captures.sightings import Sightings
 from vdgs.errors import CaptureError
 
 #: COLMAP's camera models: identifier -> (name, number of parameters).
@@ -78,6 +80,7 @@ class SourceView:
     #: Where image and mask are, if the format says so itself; else they are looked up by name.
     image_path: Path | None = None
     mask_path: Path | None = None
+    sightings: Sightings | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +154,15 @@ def check_intrinsics(intrinsics: Intrinsics, file: Path, label: str) -> Intrinsi
     if problem:
         raise CaptureError(f"{file}: {label} has {problem}. The file is damaged; copy or export it again.")
     return intrinsics
+
+
+def rays_of(intrinsics: Intrinsics, pixels: np.ndarray) -> np.ndarray:
+    """x/z and y/z [n, 2] of the rays through pixels [n, 2] of a camera, its lens undone; NaN where it has no ray."""
+    if not intrinsics.distorted:
+        return (pixels - intrinsics.principal_point) / intrinsics.focal
+    width, height, params = intrinsics.width, intrinsics.height, list(intrinsics.params)
+    camera = pycolmap.Camera(model=intrinsics.model, width=width, height=height, params=params)
+    return np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)
 
 
 def rigid(matrix: np.ndarray, file: Path, label: str, tolerance: float = 5e-3) -> np.ndarray:

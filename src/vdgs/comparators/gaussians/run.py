@@ -28,7 +28,6 @@ from rich.console import Console
 from vdgs import __version__
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
-from vdgs.captures.checks import check_images
 from vdgs.captures.facts import capture_facts, refuse_another_capture
 from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
@@ -40,6 +39,7 @@ from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFac
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.of_run import cached_photographs, true_depth
 from vdgs.evaluation.seen import seen_map
+from vdgs.inspection.starting import refuse_unworkable
 from vdgs.kernels.types import Raster
 from vdgs.model.spherical_harmonics import MAX_DEGREE
 from vdgs.runs.folder import RunFolder, StageFolder
@@ -89,8 +89,9 @@ def train_gaussians(
 ) -> GaussiansModel:
     """Train, or continue, 3DGS on the training views of a capture; if it is finished, only read the model.
 
-    Raises VdgsError for settings that do not work, RunError where `output` holds another run, CaptureError for damaged
-    photographs, Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged (last good state kept).
+    Raises VdgsError for settings that do not work, RunError where `output` holds another run, CaptureError for a
+    capture that cannot become a scene or damaged photographs, Stopped after Ctrl-C or SIGTERM (state saved),
+    TrainingDiverged (last good state kept).
     """
     options, folder = options or WatchOptions(), StageFolder(output)
     options.check()
@@ -100,7 +101,7 @@ def train_gaussians(
         if folder.is_done():
             console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
             return GaussiansModel.load(folder.model)
-        check_images(capture)
+        refuse_unworkable(capture, console)
         views = capture.train_views
         factors = tuple(sorted({factor for _, factor in config.resolutions}))
         with ImageCache(views, image_budget(options), downscales=factors) as images:

@@ -1,0 +1,50 @@
+"""What both forms of a COLMAP model hold: cameras by number, images, points by number."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from vdgs.captures.formats.source import Intrinsics, check_intrinsics
+from vdgs.errors import CaptureError
+
+#: So many of the points that a photograph shows are remembered: enough to see whether cameras and points agree.
+SIGHTINGS = 200
+
+
+class Points(NamedTuple):
+    """Points [n, 3] float64 and colours [n, 3] uint8 with the numbers [n] by which images name them."""
+
+    numbers: np.ndarray
+    positions: np.ndarray
+    colours: np.ndarray
+
+
+def no_points() -> Points:
+    return Points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+
+
+@dataclass(frozen=True, eq=False)
+class ImageRecord:
+    quaternion: tuple[float, ...]  # wxyz
+    translation: tuple[float, ...]
+    camera: int
+    name: str
+    #: Some of the points that it shows: their numbers [m], and the pixels [m, 2] where.
+    shown: tuple[np.ndarray, np.ndarray]
+
+
+def some_of(numbers: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """At most `SIGHTINGS` of an image's points that are points of the model, spread over all of them; copies."""
+    matched = np.flatnonzero((numbers >= 0) & np.isfinite(pixels).all(axis=1))
+    few = matched[np.unique(np.linspace(0, len(matched) - 1, min(SIGHTINGS, len(matched))).round().astype(int))]
+    return numbers[few], pixels[few]
+
+
+def add_camera(cameras: dict[int, Intrinsics], identifier: int, intrinsics: Intrinsics, file: Path) -> None:
+    if identifier in cameras:
+        raise CaptureError(f"{file}: camera {identifier} occurs twice. Export the COLMAP model again.")
+    cameras[identifier] = check_intrinsics(intrinsics, file, f"camera {identifier}")

@@ -1,0 +1,99 @@
+"""COLMAP's text files: one record a line, two for an image."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from vdgs.captures.formats.colmap_records import ImageRecord, Points, add_camera, no_points, some_of
+from vdgs.captures.formats.source import MODEL_PARAMETERS, Intrinsics
+from vdgs.errors import CaptureError
+
+
+def _lines(file: Path) -> Iterator[tuple[int, str]]:
+    """Numbered lines without the leading comments."""
+    try:
+        with file.open(encoding="utf-8") as stream:
+            for number, line in enumerate(stream, 1):
+                if not line.startswith("#"):
+                    yield number, line.rstrip("\r\n")
+    except UnicodeDecodeError as error:
+        raise CaptureError(f"{file}: is not UTF-8 text ({error}). Export the COLMAP model again.") from None
+
+
+def _bad_line(file: Path, number: int, expected: str) -> CaptureError:
+    return CaptureError(f"{file}: line {number} should read '{expected}'. The file is damaged; export it again.")
+
+
+def cameras_text(file: Path) -> dict[int, Intrinsics]:
+    expected = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
+    cameras: dict[int, Intrinsics] = {}
+    for number, line in _lines(file):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            identifier, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+            params = tuple(float(word) for word in words[4:])
+        except (ValueError, IndexError):
+            raise _bad_line(file, number, expected) from None
+        if MODEL_PARAMETERS.get(model) != len(params):
+            raise CaptureError(
+                f"{file}: line {number}: {model!r} with {len(params)} parameters is no camera model that is "
+                "supported. "
+                f"Supported: {', '.join(MODEL_PARAMETERS)}."
+            )
+        add_camera(cameras, identifier, Intrinsics(model, params, width, height), file)
+    return cameras
+
+
+def images_text(file: Path, with_points: bool = True) -> Iterator[ImageRecord]:
+    """Two lines an image: the pose, then its points (which may be an empty line)."""
+    lines = _lines(file)
+    for number, line in lines:
+        if not line.strip():
+            continue
+        words = line.split(maxsplit=9)
+        try:
+            _, camera = int(words[0]), int(words[8])
+            pose = [float(word) for word in words[1:8]]
+            name = words[9].strip()
+        except (ValueError, IndexError):
+            raise _bad_line(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from None
+        shown = next(lines, (number + 1, ""))
+        triples = _triples(file, *shown) if with_points else np.zeros((0, 3))
+        yield ImageRecord(tuple(pose[:4]), tuple(pose[4:]), camera, name, some_of(triples[:, 2], triples[:, :2]))
+
+
+def _triples(file: Path, number: int, line: str) -> np.ndarray:
+    """The features of an image, [m, 3]: x, y and the number of the point."""
+    try:
+        return np.array(line.split(), np.float64).reshape(-1, 3)
+    except ValueError:
+        raise _bad_line(file, number, "POINTS2D[] as (X, Y, POINT3D_ID)") from None
+
+
+def points_text(file: Path) -> Points:
+    numbers: list[float] = []
+    positions: list[list[float]] = []
+    colours: list[list[int]] = []
+    for number, line in _lines(file):
+        words = line.split(maxsplit=8)
+        if not words:
+            continue
+        try:
+            identifier, position = float(words[0]), [float(word) for word in words[1:4]]
+            colour = [int(word) for word in words[4:7]]
+            float(words[7])
+        except (ValueError, IndexError):
+            raise _bad_line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK[]") from None
+        if not all(0 <= value <= 255 for value in colour):
+            raise _bad_line(file, number, "POINT3D_ID X Y Z R G B ERROR TRACK[], colours from 0 to 255")
+        numbers.append(identifier)
+        positions.append(position)
+        colours.append(colour)
+    if not positions:
+        return no_points()
+    return Points(np.array(numbers, np.float64), np.array(positions, np.float64), np.array(colours, np.uint8))
