@@ -15,6 +15,7 @@ from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.formats.source import SINGLE_FOCAL, Intrinsics, SourceCapture, SourceView, listing
 from vdgs.captures.formats.transforms import read_transforms
 from vdgs.captures.ground import find_ground_frame, transform_pose
+from vdgs.captures.outputs import refuse_among_files
 from vdgs.captures.photographs import Names, find_images, find_mask, read_header
 from vdgs.captures.splits import choose_splits, nearest_to_middle
 from vdgs.captures.undistortion import ImageFile, undistort
@@ -262,7 +263,9 @@ def _undistorted(
             f"{listing(photo.view.name for photo in bent)}"
         )
     folder = options.undistorted_folder or root / "undistorted" / (options.images or "images")
-    straight = undistort(folder, [photo.file for photo in photographs])
+    files = [photo.file for photo in photographs]
+    refuse_among_files(folder, root, [path for file in files for path in (file.path, file.mask) if path is not None])
+    straight = undistort(folder, files)
     warnings.append(f"{len(bent)} photographs were undistorted into {folder}.")
     return [_FoundView(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
 

@@ -31,9 +31,12 @@ def inspect(arguments: list[str]) -> None:
     asked = tyro.cli(InspectArguments, args=arguments, prog="vdgs inspect")
     from vdgs.captures.checks import check_images
     from vdgs.captures.loading import load_capture
+    from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
     from vdgs.inspection.inspect import inspect_capture, print_report
 
+    refuse_in_a_capture(asked.output)
     capture = load_capture(asked.capture, asked.options)
+    refuse_among_inputs(asked.output, capture)
     if asked.check:
         check_images(capture)
     print_report(inspect_capture(capture, asked.output))
