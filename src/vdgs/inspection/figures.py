@@ -19,14 +19,13 @@ from vdgs.model.visibility import LIMITS
 def draw_map(capture: Capture, report: CaptureReport, points: np.ndarray, visibility: np.ndarray, file: Path) -> None:
     """Cameras and points from above, points coloured by V; beside it the histogram of V."""
     low, high = _frame(capture, points)
-    east, north = ("east", "north") if capture.ground.origin_geo else ("x", "y")
     marks = (
         CameraMarks("training camera", [view.camera for view in capture.train_views], INK, "white"),
         CameraMarks("test camera", [view.camera for view in capture.test_views], "white", INK),
     )
     seen = SeenMap(
         points, visibility, low, high, float(np.median(capture.points[:, 2])), marks,
-        f"{east} ({report.unit})", f"{north} ({report.unit})", "a point", _titles(capture, report),
+        *capture.ground.axis_names, "a point", _titles(capture, report),
     )  # fmt: skip
     draw_seen_map(file, seen)
 
