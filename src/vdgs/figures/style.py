@@ -18,6 +18,8 @@ DPI = 120
 
 #: Type in points: what is smaller cannot be read where a figure of a page's width is shown at a screen's.
 TEXT, NOTE = 11.0, 10.0
+#: What a title that is too long shrinks to at most.
+SMALLEST = 4.0
 
 
 def titles(figure: Figure, name: str, facts: str, note: str) -> None:
@@ -27,9 +29,9 @@ def titles(figure: Figure, name: str, facts: str, note: str) -> None:
     for text, down, size, colour in lines:
         weight = "bold" if colour == INK else "normal"
         line = figure.text(0.85 / width, 1 - down / height, text, fontsize=size, fontweight=weight, color=colour)
-        room, needed = (width - 0.85 - 0.15) * figure.dpi, line.get_window_extent().width
-        if needed > room:
-            line.set_fontsize(0.97 * size * room / needed)  # small type is a little wider
+        while line.get_window_extent().x1 > (width - 0.15) * figure.dpi and size > SMALLEST:
+            size *= 0.95  # hinted type does not shrink evenly
+            line.set_fontsize(size)
 
 
 def placer(figure: Figure) -> Callable[[float, float, float, float], Axes]:
