@@ -41,7 +41,7 @@ INSIDE = ("images_4", "images_4/run", "images_4/film.mp4", "masks", "masks/new/r
 
 @pytest.mark.parametrize("inside", INSIDE)
 def test_inputs_of_any_capture_are_known_without_reading_it(root: Path, inside: str) -> None:
-    with pytest.raises(VdgsError, match="holds inputs of the capture"):
+    with pytest.raises(VdgsError, match="is for inputs of the capture"):
         refuse_in_a_capture(root / inside)
 
 
@@ -66,7 +66,7 @@ def test_photographs_elsewhere_and_under_other_names_are_known(root: Path, tmp_p
     (root / "photos").symlink_to(store)
     capture = load_capture(root, CaptureOptions(images="photos"))
     for output in (store, store / "run", root / "photos" / "run"):
-        with pytest.raises(VdgsError, match="holds inputs"):
+        with pytest.raises(VdgsError, match="is for inputs"):
             refuse_among_inputs(output, capture)
     refuse_among_inputs(tmp_path / "card" / "run", capture)
 
@@ -86,14 +86,14 @@ def test_photographs_in_the_root_leave_folders_beside_them_free(tmp_path: Path) 
         shutil.move(photograph, tmp_path / "flat")
     capture = load_capture(tmp_path / "flat", CaptureOptions(images="."))
     refuse_among_inputs(tmp_path / "flat" / "run", capture)
-    with pytest.raises(VdgsError, match="holds inputs"):
+    with pytest.raises(VdgsError, match="is for inputs"):
         refuse_among_inputs(tmp_path / "flat", capture)
 
 
 def test_the_layout_of_mega_nerf_is_known(tmp_path: Path) -> None:
     write_mega_nerf(tmp_path / "mill", tiny_scene())
     for inside in ("train/rgbs", "val/rgbs/run", "train/metadata"):
-        with pytest.raises(VdgsError, match="holds inputs"):
+        with pytest.raises(VdgsError, match="is for inputs"):
             refuse_in_a_capture(tmp_path / "mill" / inside)
 
 
@@ -126,7 +126,7 @@ def test_photographs_are_not_undistorted_onto_themselves(tmp_path: Path) -> None
     write_colmap(tmp_path / "bent", tiny_scene(), model="SIMPLE_RADIAL", extra=(0.1,))
     before = contents(tmp_path)
     options = CaptureOptions(undistort=True, undistorted_folder=tmp_path / "bent" / "images")
-    with pytest.raises(VdgsError, match="holds inputs"):
+    with pytest.raises(VdgsError, match="is for inputs"):
         load_capture(tmp_path / "bent", options)
     assert contents(tmp_path) == before
 

@@ -86,6 +86,6 @@ def _is_capture(root: Path) -> bool:
 
 def _error(output: Path, folder: Path, root: Path) -> VdgsError:
     return VdgsError(
-        f"{output}: lies in {folder}, which holds inputs of the capture {root}: they would be overwritten, or mixed "
+        f"{output}: lies in {folder}, which is for inputs of the capture {root}: they would be overwritten, or mixed "
         "with results. Nothing was written. Choose a folder outside of it."
     )

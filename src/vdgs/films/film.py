@@ -50,11 +50,10 @@ def render_run(asked: RenderRequest, console: Console) -> None:
     named, fps = _cameras(asked, run)
     if asked.width:
         named = [(name, camera.resized(asked.width, _height(camera, asked.width))) for name, camera in named]
-    drawn = None if asked.kind == "image" else map_of(asked.kind, run, [camera for _, camera in named])
     if asked.output.suffix:
-        _write_film(asked, run, named, drawn, fps, console)
+        _write_film(asked, run, named, fps, console)
     else:
-        _write_pictures(asked, run, named, drawn, console)
+        _write_pictures(asked, run, named, console)
 
 
 def _check(asked: RenderRequest) -> None:
@@ -67,15 +66,17 @@ def _check(asked: RenderRequest) -> None:
 
 
 def _write_film(
-    asked: RenderRequest, run: TrainedRun, named: list[tuple[str, Camera]], drawn: Map | None, fps: float,
-    console: Console,
-) -> None:  # fmt: skip
+    asked: RenderRequest, run: TrainedRun, named: list[tuple[str, Camera]], fps: float, console: Console
+) -> None:
+    if asked.output.is_dir():
+        raise VdgsError(f"{asked.output}: is a folder. Give another name for the film.")
     sizes = {(camera.width, camera.height) for _, camera in named}
     if len(sizes) > 1:
         raise VdgsError(
             f"{asked.output}: a film needs frames of one size, and these views have {len(sizes)}. Give a folder."
         )
     with VideoWriter(asked.output, fps) as film:
+        drawn = _map(asked, run, named)
         for frame in _frames(asked, run, named, drawn, console):
             film.write(frame.picture)
     (width, height), strip = sizes.pop(), ""
@@ -86,12 +87,11 @@ def _write_film(
     console.print(f"{len(named)} frames of {size}: {asked.output}", highlight=False)
 
 
-def _write_pictures(
-    asked: RenderRequest, run: TrainedRun, named: list[tuple[str, Camera]], drawn: Map | None, console: Console
-) -> None:
+def _write_pictures(asked: RenderRequest, run: TrainedRun, named: list[tuple[str, Camera]], console: Console) -> None:
     kinds = (".png", ".npy") if asked.raw else (".png",)
     names = [name + kind for name, _ in named for kind in kinds]
     earlier = folder.begin(asked.output, names)
+    drawn = _map(asked, run, named)
     for frame in _frames(asked, run, named, drawn, console):
         write_png(asked.output / f"{frame.name}.png", frame.picture)
         if asked.raw and frame.values is not None:
@@ -101,6 +101,11 @@ def _write_pictures(
     if earlier:
         said += f" in place of {len(earlier)} files of an earlier render"
     console.print(f"{said}: {asked.output}", highlight=False)
+
+
+def _map(asked: RenderRequest, run: TrainedRun, named: list[tuple[str, Camera]]) -> Map | None:
+    """The map that all views are drawn as; None for plain pictures."""
+    return None if asked.kind == "image" else map_of(asked.kind, run, [camera for _, camera in named])
 
 
 def _facts(asked: RenderRequest, run: TrainedRun, drawn: Map | None) -> dict[str, object]:
