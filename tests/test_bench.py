@@ -15,6 +15,7 @@ from rich.console import Console
 from cli_support import begun, is_free, wait_until
 from vdgs.bench import bench
 from vdgs.bench.bench import BenchSettings, run_bench
+from vdgs.bench.grids import bounds_of
 from vdgs.bench.plan import Choices
 from vdgs.bench.seen import seen_truly
 from vdgs.cameras import Camera
@@ -103,7 +104,7 @@ def test_generated_scenes_are_grouped_by_the_true_visibility(benched):
     for group in groups:
         assert ((counted >= group["lower"]) & (counted <= group["upper"])).sum() == group["pixels"]
     assert "truly see the surface" in (benched / "toy" / "table.md").read_text()
-    assert f"(V {groups[0]['lower']:g} to {groups[0]['upper']:g})" in (benched / "toy" / "verdict.txt").read_text()
+    assert f"(V {bounds_of(groups[0])})" in (benched / "toy" / "verdict.txt").read_text()
 
 
 def test_the_truth_is_that_of_the_views_that_are_used(benched):

@@ -10,6 +10,7 @@ from pathlib import Path
 from subprocess import CompletedProcess
 
 import cv2
+import numpy as np
 import pytest
 import torch
 
@@ -261,10 +262,21 @@ def test_evaluation_and_renders_of_a_run(unbroken, tmp_path):
     assert training["psnr"] > metrics["psnr"]
     assert {path: path.read_bytes() for path in test_files} == test_files
     for kind in ("image", "depth", "visibility"):
-        assert vdgs("render", run, "--output", tmp_path / kind, "--kind", kind).returncode == 0
+        assert vdgs("render", run, "--output", tmp_path / kind, "--kind", kind, "--no-legend").returncode == 0
         pictures = [cv2.imread(str(path)) for path in sorted((tmp_path / kind).glob("*.png"))]
         assert [picture.shape for picture in pictures] == [(48, 64, 3)] * 2
         assert min(float(picture.std()) for picture in pictures) > 3
+    again = vdgs("render", run, "--output", tmp_path / "depth", "--kind", "depth", "--raw", "--views", "train")
+    assert again.returncode == 0, again.stderr
+    assert "10 views, each with its numbers as .npy in place of 2 files of an earlier render" in again.stdout
+    assert len(list((tmp_path / "depth").glob("*.png"))) == len(list((tmp_path / "depth").glob("*.npy"))) == 10
+    for numbers in (np.load(file) for file in (tmp_path / "depth").glob("*.npy")):
+        assert (numbers.dtype, numbers.shape) == (np.float32, (48, 64))
+        assert 7 < np.nanmedian(numbers) < 13  # the flight is 10 above the ground
+    assert vdgs("render", run, "--output", tmp_path / "alpha", "--kind", "alpha").returncode == 0
+    tall = cv2.imread(str(next((tmp_path / "alpha").glob("*.png"))))
+    assert tall.shape[0] > 48
+    assert tall[:48].mean() > 180
     film = ("render", run, "--output", tmp_path / "f.mp4", "--views", "orbit", "--seconds", "0.5")
     assert vdgs(*film).returncode == 0
     assert (tmp_path / "f.mp4").stat().st_size > 1000

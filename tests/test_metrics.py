@@ -12,7 +12,7 @@ from scipy.signal import convolve2d
 
 from evaluation_support import noisy, photograph, psnr, real_photographs, ssim
 from vdgs.evaluation import metrics
-from vdgs.evaluation.by_visibility import VisibilityHistogram, quantile_groups, view_bins
+from vdgs.evaluation.by_visibility import VisibilityHistogram, bounds_of, quantile_groups, view_bins
 
 
 def direct_ssim_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -120,13 +120,30 @@ def test_quantile_bins_partition_the_pixels(visibility: list[int], n_bins: int):
 
 def test_bins_of_many_different_values_are_equal_shares():
     rng = np.random.default_rng(4)
-    visibility = rng.gamma(2.0, 30.0, (200, 300)).astype(np.float32)
+    visibility = rng.gamma(2.0, 300.0, (200, 300)).astype(np.float32)
     histogram = VisibilityHistogram(["ssim"])
     histogram.add(visibility, {"ssim": np.ones_like(visibility)})
     bins = histogram.bins(5)
     assert [each["pixels"] / visibility.size for each in bins] == pytest.approx([0.2] * 5, abs=2e-3)
     edges = np.quantile(visibility, [0.2, 0.4, 0.6, 0.8])
-    assert [each["upper"] for each in bins[:-1]] == pytest.approx(edges, rel=2e-3)
+    assert [each["upper"] for each in bins[:-1]] == pytest.approx(edges, rel=5e-3)
+
+
+def test_bins_are_of_whole_cameras():
+    rng = np.random.default_rng(1)
+    visibility = rng.uniform(0.4, 9.3, (60, 80)).astype(np.float32)
+    histogram = VisibilityHistogram(["ssim"])
+    histogram.add(visibility, {"ssim": visibility.astype(np.float64)})
+    bins = histogram.bins(4)
+    ends = [each[end] for each in bins for end in ("lower", "upper")]
+    assert ends == sorted(round(end) for end in ends)
+    assert all(low == high + 1 for high, low in zip(ends[1:-1:2], ends[2::2], strict=True))
+    for each in bins:
+        inside = (np.rint(visibility) >= each["lower"]) & (np.rint(visibility) <= each["upper"])
+        assert inside.sum() == each["pixels"]
+    assert [bounds_of(*ends) for ends in ((3.0, 5.0), (4.0, 4.0), (0.511, 2.0), (9.0, 12345.0))] == [
+        "3 to 5", "4", "0.511 to 2", "9 to 12,345",
+    ]  # fmt: skip
 
 
 def test_pixels_that_show_nothing_have_their_own_bin():

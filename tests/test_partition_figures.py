@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import shapely
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from matplotlib.image import imread
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from vdgs.cameras import Camera
+from vdgs.captures.capture import GroundFrame
+from vdgs.figures.seen_map import without_speckles
+from vdgs.figures.style import DPI, titles
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.figures import maps as figures
 from vdgs.partition.figures.facts import block_facts
@@ -19,6 +26,9 @@ from vdgs.partition.figures.scores import order_of_cameras
 from vdgs.partition.figures.words import PALETTE, block_colour
 from vdgs.settings.method import PartitionConfig
 from vdgs.stages.partition import how_cut
+
+#: Names of x and y.
+METRES = ("east (m)", "north (m)")
 
 
 def grid(count: int, side: float = 100.0) -> Blocks:
@@ -74,13 +84,13 @@ def test_all_figures_of_all_scenes(tmp_path: Path, name: str) -> None:
     compare = grid(blocks + 1) if blocks > 1 else None
     file = tmp_path / "figure.png"
     cuts = [("λ_vis = 1", cut)] + ([] if compare is None else [(figures.BY_PLACE, compare)])
-    figures.draw_blocks(file, positions, views, cameras, assigned, cuts, "m")
+    figures.draw_blocks(file, positions, views, cameras, assigned, cuts, METRES)
     check(file)
     figures.draw_block_facts(file, positions, views, cut, assigned, "m", compare)
     check(file)
     figures.draw_scores(file, scores, assigned)
     check(file)
-    figures.draw_visibility_map(file, positions, views, cameras, "units")
+    figures.draw_visibility_map(file, positions, views, cameras, ("x (units)", "y (units)"))
     check(file)
 
 
@@ -88,11 +98,11 @@ def test_the_comparison_stands_beside_or_below(tmp_path: Path) -> None:
     positions, views, cameras, scores = scene(300, 5, 2)
     alone, both, wide = (tmp_path / f"{name}.png" for name in ("alone", "both", "wide"))
     cut, assigned = grid(2), scores > 0.5
-    figures.draw_blocks(alone, positions, views, cameras, assigned, [("not cut", cut)], "m")
+    figures.draw_blocks(alone, positions, views, cameras, assigned, [("not cut", cut)], METRES)
     compared = [("λ_vis = 1", cut), (figures.BY_PLACE, grid(2))]
-    figures.draw_blocks(both, positions, views, cameras, assigned, compared, "m")
+    figures.draw_blocks(both, positions, views, cameras, assigned, compared, METRES)
     stretched = positions * np.float32([10, 1, 1])
-    figures.draw_blocks(wide, stretched, views, cameras, assigned, compared, "m")
+    figures.draw_blocks(wide, stretched, views, cameras, assigned, compared, METRES)
     one, two, three = (check(file).shape for file in (alone, both, wide))
     assert two[1] > 1.5 * one[1]
     assert two[0] == one[0]
@@ -152,8 +162,58 @@ def test_many_anchors_are_thinned_and_the_heading_counts_cameras_beyond_the_map(
     far[0, 3] = -500.0
     cameras.append(Camera(far, 400, 400, 200, 150, 400, 300))
     assigned = np.ones((4, 1), bool)
-    figures.draw_blocks(tmp_path / "blocks.png", positions, views, cameras, assigned, [("not cut", grid(1))], "m")
+    figures.draw_blocks(tmp_path / "blocks.png", positions, views, cameras, assigned, [("not cut", grid(1))], METRES)
     assert headings[0][1] == "60,001 anchors (60,000 drawn)  ·  4 training cameras (1 beyond the map)"
+
+
+def test_a_map_of_blocks_holds_all_outlines_unless_they_lead_far_away() -> None:
+    inner = np.array([[0.0, 0.0], [100.0, 60.0]])
+    low, high, whole = figures._frame_of_blocks(inner, [grid(2), widened(40.0)])
+    assert whole
+    assert (low < [-40, -40]).all()
+    assert (high > [140, 140]).all()
+    low, high, whole = figures._frame_of_blocks(inner, [widened(5000.0)])
+    assert not whole
+    assert ((high - low) < 300).all()
+
+
+def widened(by: float) -> Blocks:
+    core = shapely.box(0, 0, 100, 100)
+    return Blocks((Block(core, core.buffer(by)),))
+
+
+def test_the_border_of_coverage_has_no_speckles() -> None:
+    covered = np.zeros((200, 200), bool)
+    covered[40:160, :120] = True
+    speckled = covered.copy()
+    speckled[60:62, 60] = speckled[100, 20:90] = speckled[41:120, 80:82] = False  # a hole, a slit, a longer one
+    speckled[10:15, 150:155] = speckled[180, 180] = True  # islands
+    differs = without_speckles(speckled) ^ covered
+    assert not differs[without_edges(covered)].any()
+    speckled[80:120, 30:70] = False  # a hole worth showing
+    assert not without_speckles(speckled)[90:110, 40:60].any()
+    for kind in (np.zeros, np.ones):
+        np.testing.assert_array_equal(without_speckles(kind((50, 60), bool)), kind((50, 60), bool))
+
+
+def without_edges(covered: np.ndarray) -> np.ndarray:
+    """Where a cell and its neighbours are alike."""
+    return (maximum_filter(covered, 5) == minimum_filter(covered, 5)) & np.ones_like(covered)
+
+
+@pytest.mark.parametrize("width", [5.0, 12.0])
+def test_titles_stay_on_the_figure(width: float) -> None:
+    figure = Figure(figsize=(width, 4.0), dpi=DPI)
+    FigureCanvasAgg(figure)
+    titles(figure, "a name", "facts of all kinds, " * 6, "a note")
+    assert all(line.get_window_extent().x1 <= figure.bbox.x1 for line in figure.texts)
+
+
+def test_axes_are_east_and_north_only_where_the_place_is_known() -> None:
+    frame = GroundFrame(1.0, np.eye(3), np.zeros(3), metric=True, how="")
+    assert frame.axis_names == ("x (m)", "y (m)")
+    assert replace(frame, origin_geo=(50.8, -0.1, 60.0)).axis_names == METRES
+    assert replace(frame, metric=False).axis_names == ("x (units)", "y (units)")
 
 
 def test_a_cut_is_called_by_its_strategy() -> None:

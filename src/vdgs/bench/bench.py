@@ -34,6 +34,7 @@ from vdgs.bench.verdict import verdict
 from vdgs.bench.worker import RECORD, Job
 from vdgs.bench.writing import latex, markdown, tidy_csv
 from vdgs.captures.loading import load_capture
+from vdgs.captures.outputs import refuse_among_files, refuse_in_a_capture
 from vdgs.errors import Stopped, VdgsError
 from vdgs.executors.executor import Outcome, Task
 from vdgs.executors.lines import Lines
@@ -69,7 +70,7 @@ def run_bench(settings: BenchSettings, console: Console) -> list[Result]:
     """
     if settings.jobs < 1 or settings.bins < 1:
         raise VdgsError("--jobs and --bins must be at least 1")
-    plan = make_plan(settings.table, settings.choices)
+    _refuse_among_inputs(settings.output, plan := make_plan(settings.table, settings.choices))
     began = time.monotonic()
     with _locked(settings.output):
         captures, lost = _captures(plan, settings, console)
@@ -87,6 +88,15 @@ def run_bench(settings: BenchSettings, console: Console) -> list[Result]:
             + "\n  ".join(f"{each.name}: {each.why}" for each in failed)
         )
     return results
+
+
+def _refuse_among_inputs(output: Path, plan: Plan) -> None:
+    """Raise VdgsError before anything is written where the output lies among photographs or masks of a scene."""
+    refuse_in_a_capture(output)
+    for scene in plan.scenes:
+        if scene.folder is not None:
+            names = [scene.options.get("images"), scene.options.get("masks")]
+            refuse_among_files(output, scene.folder, [scene.folder / name / "any" for name in names if name])
 
 
 def _captures(plan: Plan, settings: BenchSettings, console: Console) -> tuple[dict[str, Path], dict[str, Outcome]]:

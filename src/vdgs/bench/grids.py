@@ -12,6 +12,7 @@ from vdgs.bench.plan import Plan
 from vdgs.bench.quoted import COLUMNS, QUOTED
 from vdgs.bench.results import Result
 from vdgs.bench.statistics import Mark, Summary, marks, summarise
+from vdgs.evaluation.by_visibility import bounds_of as named_bounds
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ def all_bounds_of(result: Result) -> str:
 
 def bounds_of(group: Mapping[str, Any]) -> str:
     """Least and greatest V of a group."""
-    return f"{group['lower']:.3g} to {group['upper']:.3g}"
+    return named_bounds(group["lower"], group["upper"])
 
 
 def _measured(

@@ -42,7 +42,7 @@ def measure_groups(seen: Seen, runs: Mapping[Path, str], bins: int, tell: Callab
 
     `runs`: folder -> key. The test views are read once for all. Raises VdgsError where a picture is missing.
     """
-    of = {"seen_by": seen.by, "seen": seen.identity, "bins": bins}
+    of = {"seen_by": seen.by, "seen": seen.identity, "bins": bins, "whole_cameras": True}
     wanted = {folder: of | {"run": key} for folder, key in runs.items()}
     left = [folder for folder, record in wanted.items() if not _is_measured(folder, record)]
     if not left:

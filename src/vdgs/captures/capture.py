@@ -36,6 +36,12 @@ class GroundFrame:
         """What one unit of the ground frame is called."""
         return "m" if self.metric else "units"
 
+    @property
+    def axis_names(self) -> tuple[str, str]:
+        """What x and y are called in figures, with their unit: east and north where the frame is georeferenced."""
+        east, north = ("east", "north") if self.origin_geo else ("x", "y")
+        return f"{east} ({self.unit})", f"{north} ({self.unit})"
+
     def to_ground(self, points: np.ndarray) -> np.ndarray:
         """Source points [n, 3] to the ground frame."""
         return self.scale * points @ self.rotation.T + self.translation

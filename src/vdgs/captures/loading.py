@@ -16,6 +16,7 @@ from vdgs.captures.formats.source import SourceCapture, listing
 from vdgs.captures.formats.transforms import read_transforms
 from vdgs.captures.ground import find_ground_frame, transform_pose
 from vdgs.captures.matching import FoundView, find_photographs
+from vdgs.captures.outputs import refuse_among_files
 from vdgs.captures.photographs import LEAST_SIDE_PX
 from vdgs.captures.precision import rounding_of
 from vdgs.captures.sightings import Sightings
@@ -186,7 +187,9 @@ def _undistorted(
             f"{listing(photo.view.name for photo in bent)}"
         )
     folder = options.undistorted_folder or root / "undistorted" / (options.images or "images")
-    straight = undistort(folder, [photo.file for photo in photographs])
+    files = [photo.file for photo in photographs]
+    refuse_among_files(folder, root, [path for file in files for path in (file.path, file.mask) if path is not None])
+    straight = undistort(folder, files)
     warnings.append(f"{len(bent)} photographs were undistorted into {folder}.")
     return [FoundView(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
 

@@ -1,8 +1,9 @@
 """Quality by visibility: the claim is about poorly seen places, so it is measured there.
 
 V is the number of training cameras that see a place (section IV-B); rendered per pixel it is a map
-[h, w], NaN where the model shows nothing. Pixels of all test views are pooled and cut into quantiles
-of V. Nothing is kept but a histogram: one pass, memory bounded whatever the number of test views.
+[h, w], NaN where the model shows nothing, and is rounded to whole cameras. Pixels of all test views are
+pooled and cut into quantiles of V. Nothing is kept but a histogram: one pass, memory bounded whatever
+the number of test views.
 """
 
 from __future__ import annotations
@@ -42,11 +43,14 @@ class VisibilityHistogram:
         values: Mapping[str, Float[np.ndarray, "h w"]],
         mask: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
-        """Count one view: V >= 0 or NaN, and a value per pixel under each name. O(pixels)."""
+        """Count one view: V >= 0 or NaN, and a value per pixel under each name. O(pixels).
+
+        V counts cameras: a mean over the anchors that a pixel shows is rounded to whole ones, halves to the even one.
+        """
         kept = np.ones(visibility.shape, bool) if mask is None else mask
         empty = kept & np.isnan(visibility)
         seen = kept & ~empty
-        keys = key_of(visibility[seen])
+        keys = key_of(np.rint(visibility[seen]))
         self._counts += np.bincount(keys, minlength=KEYS)
         self._empty_count += int(empty.sum())
         for name, total in self._sums.items():
@@ -54,7 +58,7 @@ class VisibilityHistogram:
             self._empty_sums[name] += float(values[name][empty].sum())
 
     def bins(self, n_bins: int = QUANTILE_BINS) -> list[Bin]:
-        """Quantile bins, least visible first: lower and upper V (inclusive), pixels, a figure per name.
+        """Quantile bins, least visible first: lower and upper V (whole, inclusive), pixels, a figure per name.
 
         Equal values of V are never split, so bins may differ in size and fewer than `n_bins` may come
         back. Pixels where the model shows nothing, if any, lead as a bin without bounds (both None).
@@ -106,6 +110,12 @@ def view_bins(
             entry[name] = mean_or_none([figures[i][name] for i in members])
         result.append(entry)
     return result
+
+
+def bounds_of(lower: float, upper: float) -> str:
+    """The least and the greatest V of a bin for people: `3 to 5`, or `4`. Earlier versions measured fractions too."""
+    ends = [f"{end:,.0f}" if end == round(end) else f"{end:.3g}" for end in (lower, upper)]
+    return " to ".join(dict.fromkeys(ends))
 
 
 def mean_or_none(values: Sequence[float | None]) -> float | None:

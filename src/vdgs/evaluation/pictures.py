@@ -21,6 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 ERROR_LIMIT = 0.2
 #: Perceptually uniform: equal steps of error look equal.
 ERROR_COLOURS = "inferno"
+ERROR_LABEL = "absolute error (0 to 1)"
 INK, FAINT, PAPER = (28, 30, 34), (120, 124, 130), (255, 255, 255)
 #: Panels are shown between these widths; the renders themselves are saved untouched.
 PANEL_MIN_PX, PANEL_MAX_PX = 320, 960
@@ -80,7 +81,7 @@ def comparison(
         error = np.where(mask, error, np.nan)
     size = panel_size(reference.shape[1], reference.shape[0], PANEL_MIN_PX, PANEL_MAX_PX)
     photograph, render, errors = (resize(picture, size) for picture in (reference, image, colourise(error, limit)))
-    row = [Panel(photograph, "photograph"), Panel(render, "render", figures), Panel(errors, "absolute error")]
+    row = [Panel(photograph, "photograph"), Panel(render, "render", figures), Panel(errors, ERROR_LABEL)]
     return row_of_panels(row, title, limit)
 
 
@@ -89,7 +90,7 @@ def row_of_panels(panels: Sequence[Panel], title: str, limit: float) -> Image.Im
     width, height = panels[0].picture.size
     count, unit = len(panels), max(12, width // 34)
     margin, gap, head = unit * 3 // 2, unit, unit * 9 // 2
-    bar_width, ticks_width = unit, unit * 3
+    bar_width, ticks_width = unit, unit * 4
     canvas = Image.new(
         "RGB", (2 * margin + count * (width + gap) + bar_width + ticks_width, head + height + margin), PAPER
     )
@@ -168,10 +169,10 @@ def _colour_bar(canvas: Image.Image, box: tuple[int, int, int, int], limit: floa
     for tick in range(5):
         value = limit * tick / 4
         y = top + round((height - 1) * (1.0 - tick / 4))
-        draw.line([(left + width, y), (left + width + unit // 3, y)], FAINT)
+        draw.line([(left + width, y), (left + width + unit // 3, y)], INK)
         anchor = {0: "ls", 4: "lt"}.get(tick, "lm")
         label = f"{value:.2f}" if tick < 4 else f"≥{value:.2f}"
-        draw.text((left + width + unit // 2, y), label, FAINT, font(max(10, unit * 4 // 5)), anchor=anchor)
+        draw.text((left + width + unit // 2, y), label, INK, font(unit), anchor=anchor)
 
 
 def _fitted(text: str, face: ImageFont.FreeTypeFont, room_px: float) -> str:

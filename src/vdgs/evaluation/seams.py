@@ -185,7 +185,7 @@ def seam_picture(view: SeamView) -> Image.Image:
         pictures.Panel(pictures.resize(view.merged, size), "merged", _caption(view.merged, view)),
         pictures.Panel(with_borders(view.merged, view.labels, size), "borders of blocks"),
         pictures.Panel(
-            pictures.resize(pictures.colourise(error, pictures.ERROR_LIMIT), size), "absolute error of merged"
+            pictures.resize(pictures.colourise(error, pictures.ERROR_LIMIT), size), f"merged: {pictures.ERROR_LABEL}"
         ),
     ]
     return pictures.row_of_panels(panels, view.name, pictures.ERROR_LIMIT)

@@ -10,6 +10,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from vdgs.evaluation.by_visibility import bounds_of
+
 #: key in metrics.json, what people call it, format
 FIGURES = (
     ("psnr", "PSNR (dB) ↑", "{:.2f}"),
@@ -59,7 +61,7 @@ def _visibility_table(bins: list[Mapping[str, Any]]) -> Table:
     for column in ("V", "pixels", "PSNR (dB)", "SSIM", "PSNR cc"):
         table.add_column(column, justify="right")
     for each in bins:
-        bounds = "nothing drawn" if each["lower"] is None else f"{each['lower']:.3g} to {each['upper']:.3g}"
+        bounds = "nothing drawn" if each["lower"] is None else bounds_of(each["lower"], each["upper"])
         table.add_row(
             bounds, f"{each['pixels']:,}", shown(each["psnr"], "{:.2f}"), shown(each["ssim"], "{:.4f}"),
             shown(each.get("psnr_cc"), "{:.2f}"),

@@ -8,18 +8,24 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import BoundaryNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, PercentFormatter
+from scipy.ndimage import binary_closing, binary_opening, gaussian_filter, label
 
 from vdgs.cameras import Camera
-from vdgs.figures.style import ACCENT, DPI, INK, SEEN, placer, plain, titles
+from vdgs.figures.style import ACCENT, DPI, INK, NOTE, SEEN, TEXT, placer, plain, titles
 from vdgs.model.visibility import LIMITS, visibility_of
 
 FIELD_CELLS = 240
+#: Islands and holes of a smaller share of the map have no border.
+LEAST_PATCH = 0.001
+#: Width in points of the border.
+LINE = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +64,12 @@ class SeenMap:
 def draw_seen_map(file: Path, seen: SeenMap) -> None:
     """Points and cameras from above, points coloured by V; beside it the histogram of V. Writes a PNG."""
     width, height = map_size(seen.low, seen.high)
-    figure = Figure(figsize=(width + 4.7, height + 1.75), dpi=DPI)
+    figure = Figure(figsize=(width + 4.7, height + 2.05), dpi=DPI)
     canvas = FigureCanvasAgg(figure)
     place = placer(figure)
     axes = place(0.85, 0.65, width, height)
     top, norm = steps(seen.visibility)
-    _ground(axes, seen, norm)
+    lined = _ground(axes, seen, norm)
     order = np.argsort(-seen.visibility, kind="stable")  # the poorly seen on top, so that none is hidden
     size = float(np.clip(6e4 / max(len(seen.points), 1), 0.5, 7.0))
     axes.scatter(
@@ -76,6 +82,7 @@ def draw_seen_map(file: Path, seen: SeenMap) -> None:
         linewidths=0,
     )
     _cameras(axes, seen.marks)
+    _legend(figure, axes, lined)
     axes.set(xlim=(seen.low[0], seen.high[0]), ylim=(seen.low[1], seen.high[1]), aspect="equal")
     axes.set(xlabel=seen.x_label, ylabel=seen.y_label)
     start = 0.85 + width + 0.75
@@ -86,8 +93,9 @@ def draw_seen_map(file: Path, seen: SeenMap) -> None:
     canvas.print_png(file)  # type: ignore[arg-type]
 
 
-def _ground(axes: Axes, seen: SeenMap, norm: Normalize) -> None:
-    """V on the level ground pale, and its line V = 3: also where there are no points."""
+def _ground(axes: Axes, seen: SeenMap, norm: Normalize) -> bool:
+    """V on the level ground pale, and the border of where it is at least 3: also where there are no points. Returns
+    whether there is such a border."""
     low, high, cameras = seen.low, seen.high, seen.marks[0].cameras
     x = np.linspace(low[0], high[0], FIELD_CELLS)
     y = np.linspace(low[1], high[1], FIELD_CELLS)
@@ -103,9 +111,26 @@ def _ground(axes: Axes, seen: SeenMap, norm: Normalize) -> None:
         interpolation="nearest",
         zorder=0,
     )
-    if field.min() < LIMITS[0] <= field.max():
-        lines = axes.contour(x, y, field, levels=[LIMITS[0] - 0.5], colors=INK, linewidths=0.7, zorder=1)
-        axes.clabel(lines, fmt=lambda _: f"V = {LIMITS[0]}", fontsize=8, inline=True)
+    covered = without_speckles(field >= LIMITS[0])
+    if covered.all() or not covered.any():
+        return False
+    smooth = gaussian_filter(covered.astype(np.float64), 1.0, mode="nearest")
+    axes.contour(x, y, smooth, levels=[0.5], colors=INK, linewidths=LINE, zorder=1)
+    return True
+
+
+def without_speckles(covered: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """A map without slits and tongues narrower than three cells, and without islands and holes of less than
+    `LEAST_PATCH` of it: a border around each would be ink and no news."""
+    around = np.ones((3, 3), bool)
+    wide = np.pad(covered, 4, mode="edge")  # beyond the map is what its edge shows
+    wide = binary_opening(binary_closing(wide, around), around)[4:-4, 4:-4]
+    for kind in (True, False):
+        patches, _ = label(wide == kind)
+        small = np.bincount(patches.ravel()) < LEAST_PATCH * wide.size
+        small[0] = False  # what is of the other kind
+        wide = wide ^ small[patches]
+    return wide
 
 
 def _cameras(axes: Axes, marks: Sequence[CameraMarks]) -> None:
@@ -122,16 +147,18 @@ def _cameras(axes: Axes, marks: Sequence[CameraMarks]) -> None:
             facecolors=mark.face,
             edgecolors=mark.edge,
         )
-    axes.legend(
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
-        ncols=2,
-        fontsize=9,
-        frameon=False,
-        handletextpad=0.2,
-        columnspacing=1.2,
-        borderaxespad=0.1,
-    )
+
+
+def _legend(figure: Figure, axes: Axes, lined: bool) -> None:
+    """One line between the titles and the map."""
+    handles, _ = axes.get_legend_handles_labels()
+    border = Line2D([], [], color=INK, linewidth=LINE, label=f"border of V ≥ {LIMITS[0]} on level ground")
+    width, height = figure.get_size_inches()
+    figure.legend(
+        handles=[*handles, border] if lined else handles, loc="upper left", ncols=3, fontsize=NOTE, frameon=False,
+        bbox_to_anchor=(0.85 / width, 1 - 1.13 / height), handletextpad=0.4, columnspacing=1.2, borderaxespad=0,
+        borderpad=0.1,
+    )  # fmt: skip
 
 
 def mark_edge(size: float) -> float:
@@ -151,20 +178,21 @@ def _histogram(bar: Axes, axes: Axes, visibility: np.ndarray, top: int, norm: No
     bar.set_xticks([])
     step = max(1, round(top / 10))
     ticks = [level for level in levels[::step] if level < top - step / 2] + [top]
-    bar.set_yticks(ticks, [str(level) for level in ticks[:-1]] + [f"≥ {top}"])
+    last = f"≥ {top}" if visibility.max() > top else str(top)
+    bar.set_yticks(ticks, [*map(str, ticks[:-1]), last])
     bar.set_ylabel(f"training cameras that see {noun}, V", labelpad=2)
     shares = np.bincount(np.minimum(visibility, top), minlength=top + 1) / len(visibility)
     axes.barh(levels, shares, height=0.86, color=SEEN(norm(levels)))
     median = min(float(np.median(visibility)), top)
     axes.plot([0, 1.12 * shares.max()], [median, median], color=INK, linewidth=0.8, linestyle=(0, (4, 3)))
-    axes.text(1.12 * shares.max(), median, " median", va="center", fontsize=9, color=INK)
+    axes.text(1.12 * shares.max(), median, " median", va="center", fontsize=NOTE, color=INK)
     below = float((visibility < LIMITS[0]).mean())
     note = axes.text(
         shares[: LIMITS[0]].max() + 0.03 * shares.max(),
         1,
         f" {below:.1%} below {LIMITS[0]}",
         va="center",
-        fontsize=10,
+        fontsize=TEXT,
         fontweight="bold",
         color=ACCENT,
     )
@@ -190,8 +218,8 @@ def steps(visibility: np.ndarray) -> tuple[int, Normalize]:
     return top, BoundaryNorm(np.arange(-0.5, top + 1), SEEN.N) if top < SEEN.N else Normalize(0, top)
 
 
-def map_size(low: np.ndarray, high: np.ndarray) -> tuple[float, float]:
-    """Width and height of the map in inches: true to scale, within a page."""
+def map_size(low: np.ndarray, high: np.ndarray, widest: float = 8.0) -> tuple[float, float]:
+    """Width and height of the map in inches: true to scale, within a page or a part of it that is so wide."""
     across, along = high - low
-    scale = min(8.0 / across, 8.5 / along)
+    scale = min(widest / across, 8.5 / along)
     return float(max(across * scale, 2.5)), float(max(along * scale, 2.5))

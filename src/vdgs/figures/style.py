@@ -16,12 +16,22 @@ SEEN = LinearSegmentedColormap.from_list(
 DPI = 120
 
 
+#: Type in points: what is smaller cannot be read where a figure of a page's width is shown at a screen's.
+TEXT, NOTE = 11.0, 10.0
+#: What a title that is too long shrinks to at most.
+SMALLEST = 4.0
+
+
 def titles(figure: Figure, name: str, facts: str, note: str) -> None:
-    """Three lines in the upper left corner, above 1.1 inches of free space."""
+    """Three lines in the upper left corner, above 1.1 inches of free space; smaller where the figure is too narrow."""
     width, height = figure.get_size_inches()
-    figure.text(0.85 / width, 1 - 0.38 / height, name, fontsize=14, fontweight="bold", color=INK)
-    figure.text(0.85 / width, 1 - 0.68 / height, facts, fontsize=10, color=FAINT)
-    figure.text(0.85 / width, 1 - 1.0 / height, note, fontsize=9, color=FAINT)
+    lines = ((name, 0.38, 15.0, INK), (facts, 0.69, TEXT, FAINT), (note, 1.0, NOTE, FAINT))
+    for text, down, size, colour in lines:
+        weight = "bold" if colour == INK else "normal"
+        line = figure.text(0.85 / width, 1 - down / height, text, fontsize=size, fontweight=weight, color=colour)
+        while line.get_window_extent().x1 > (width - 0.15) * figure.dpi and size > SMALLEST:
+            size *= 0.95  # hinted type does not shrink evenly
+            line.set_fontsize(size)
 
 
 def placer(figure: Figure) -> Callable[[float, float, float, float], Axes]:
@@ -40,6 +50,6 @@ def plain(axes: Axes) -> None:
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
         axes.spines[side].set_color(FAINT)
-    axes.tick_params(colors=FAINT, labelcolor=INK, labelsize=9)
-    axes.xaxis.label.set_color(INK)
-    axes.yaxis.label.set_color(INK)
+    axes.tick_params(colors=FAINT, labelcolor=INK, labelsize=NOTE)
+    for label in (axes.xaxis.label, axes.yaxis.label):
+        label.set(color=INK, fontsize=TEXT)

@@ -4,65 +4,134 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 
-import matplotlib
 import numpy as np
+from jaxtyping import Float, UInt8
 from rich.console import Console
 from rich.progress import track
 
 from vdgs.cameras import Camera
+from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
 from vdgs.errors import VdgsError
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.evaluation.saving import file_stems, write_png
-from vdgs.films import paths as render_paths
+from vdgs.films import folder, paths
+from vdgs.films.legend import legend, with_legend
+from vdgs.films.maps import Map, map_of
 from vdgs.films.video import VideoWriter
-from vdgs.model.render import render, render_values
+from vdgs.model.render import render
 from vdgs.runs.opening import TrainedRun, open_run
-from vdgs.runs.visibility import visibility_of_run
 from vdgs.settings.requests import RenderRequest
+from vdgs.storage.files import write_array
 from vdgs.watching.interrupts import stop_if_asked
 
 #: Pace of a film of separate views.
 SLIDES_PER_SECOND = 2.0
 
 
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """One picture with its name, and the numbers that it shows."""
+
+    name: str
+    picture: UInt8[np.ndarray, "h w 3"]
+    values: Float[np.ndarray, "h w"] | None
+
+
 def render_run(asked: RenderRequest, console: Console) -> None:
     """Render what was asked for, on a device that is chosen already (`vdgs.kernels.devices`).
 
-    Raises VdgsError for an unusable path, codec or output.
+    Raises VdgsError for options that do not go together, an unusable path, codec or output, and for an output among the
+    capture's inputs or in a folder that holds anything but an earlier render.
     """
-    if min(asked.width, asked.fps, asked.seconds) < 0:
-        raise VdgsError("--width, --fps and --seconds must not be negative")
     began = time.monotonic()
+    _check(asked)
+    refuse_in_a_capture(asked.output)
     run = open_run(asked.run, asked.model, asked.device)
+    refuse_among_inputs(asked.output, run.capture)
     if run.caution:
         console.print(f"[yellow]warning[/] {run.caution}", highlight=False)
     named, fps = _cameras(asked, run)
     if asked.width:
         named = [(name, camera.resized(asked.width, _height(camera, asked.width))) for name, camera in named]
-    frames = _frames(asked.kind, run, named, console)
     if asked.output.suffix:
-        sizes = {(camera.width, camera.height) for _, camera in named}
-        if len(sizes) > 1:
-            raise VdgsError(
-                f"{asked.output}: a film needs frames of one size, and these views have {len(sizes)}. Give a folder."
-            )
-        with VideoWriter(asked.output, fps) as film:
-            for _, frame in frames:
-                film.write(frame)
+        said = _write_film(asked, run, named, fps, console)
     else:
-        for name, frame in frames:
-            write_png(asked.output / f"{name}.png", frame)
-    extent, seconds = _extent(named, fps if asked.output.suffix else None), time.monotonic() - began
-    console.print(f"{run.line}: {extent}, drawn in {seconds:.1f} s: {asked.output}", highlight=False)
+        said = _write_pictures(asked, run, named, console)
+    console.print(f"{run.line}: {said}, drawn in {time.monotonic() - began:.1f} s: {asked.output}", highlight=False)
 
 
-def _extent(named: list[tuple[str, Camera]], fps: float | None) -> str:
-    """How many frames of which sizes; of a film also how long it is."""
-    sizes = list(dict.fromkeys(f"{camera.width}x{camera.height}" for _, camera in named))
-    shown = sizes[0] if len(sizes) == 1 else f"{len(sizes)} sizes"
-    frames = f"{len(named):,} frame{'' if len(named) == 1 else 's'} of {shown}"
-    return frames if fps is None else f"{frames}, a film of {len(named) / fps:.1f} s at {fps:g} frames a second"
+def _check(asked: RenderRequest) -> None:
+    if min(asked.width, asked.fps, asked.seconds) < 0:
+        raise VdgsError("--width, --fps and --seconds must not be negative")
+    if asked.raw and asked.kind == "image":
+        raise VdgsError("--raw writes the numbers of a map: it needs --kind depth, visibility or alpha.")
+    if asked.raw and asked.output.suffix:
+        raise VdgsError(f"{asked.output}: a film holds no numbers. Give a folder for --output, or leave out --raw.")
+
+
+def _write_film(
+    asked: RenderRequest, run: TrainedRun, named: list[tuple[str, Camera]], fps: float, console: Console
+) -> str:
+    """Draw the frames of a film; returns what to say of it."""
+    if asked.output.is_dir():
+        raise VdgsError(f"{asked.output}: is a folder. Give another name for the film.")
+    sizes = {(camera.width, camera.height) for _, camera in named}
+    if len(sizes) > 1:
+        raise VdgsError(
+            f"{asked.output}: a film needs frames of one size, and these views have {len(sizes)}. Give a folder."
+        )
+    with VideoWriter(asked.output, fps) as film:
+        drawn = _map(asked, run, named)
+        for frame in _frames(asked, run, named, drawn, console):
+            film.write(frame.picture)
+    (width, height), strip = sizes.pop(), ""
+    if drawn is not None and asked.legend:
+        rows = len(legend(drawn.scale, width, height))
+        height, strip = height + rows, f", the lowest {rows} rows of them the legend"
+    return (
+        f"{_frames_of(len(named))} of {width // 2 * 2}x{height // 2 * 2} px{strip}, a film of {len(named) / fps:.1f} s "
+        f"at {fps:g} frames a second"
+    )
+
+
+def _write_pictures(asked: RenderRequest, run: TrainedRun, named: list[tuple[str, Camera]], console: Console) -> str:
+    """Draw pictures into a folder; returns what to say of them."""
+    kinds = (".png", ".npy") if asked.raw else (".png",)
+    names = [name + kind for name, _ in named for kind in kinds]
+    earlier = folder.begin(asked.output, names)
+    drawn = _map(asked, run, named)
+    for frame in _frames(asked, run, named, drawn, console):
+        write_png(asked.output / f"{frame.name}.png", frame.picture)
+        if asked.raw and frame.values is not None:
+            write_array(asked.output / f"{frame.name}.npy", frame.values)
+    folder.finish(asked.output, earlier, names, _facts(asked, run, drawn))
+    sizes = list(dict.fromkeys(f"{camera.width}x{camera.height} px" for _, camera in named))
+    said = f"{_frames_of(len(named))} of {sizes[0] if len(sizes) == 1 else f'{len(sizes)} sizes'}"
+    said += ", each with its numbers as .npy" if asked.raw else ""
+    return said + (f", in place of {len(earlier)} files of an earlier render" if earlier else "")
+
+
+def _frames_of(count: int) -> str:
+    return f"{count:,} frame{'' if count == 1 else 's'}"
+
+
+def _map(asked: RenderRequest, run: TrainedRun, named: list[tuple[str, Camera]]) -> Map | None:
+    """The map that all views are drawn as; None for plain pictures."""
+    return None if asked.kind == "image" else map_of(asked.kind, run, [camera for _, camera in named])
+
+
+def _facts(asked: RenderRequest, run: TrainedRun, drawn: Map | None) -> dict[str, object]:
+    """What render.json says of the pictures beside it."""
+    facts: dict[str, object] = {
+        "run": str(asked.run.resolve()), "model": run.name, "kind": asked.kind,
+        "views": str(asked.path) if asked.path is not None else asked.views,
+    }  # fmt: skip
+    if drawn is not None:
+        facts |= {"numbers": drawn.meaning, "colours_between": [drawn.scale.low, drawn.scale.high],
+                  "legend_below": asked.legend}  # fmt: skip
+    return facts
 
 
 def _cameras(asked: RenderRequest, run: TrainedRun) -> tuple[list[tuple[str, Camera]], float]:
@@ -74,13 +143,13 @@ def _cameras(asked: RenderRequest, run: TrainedRun) -> tuple[list[tuple[str, Cam
         cameras, fps = [view.camera for view in views], asked.fps or SLIDES_PER_SECOND
         return list(zip(stems, cameras, strict=True)), fps
     flown, template = [view.camera for view in capture.train_views], capture.train_views[0].camera
-    length, rate = asked.seconds or render_paths.SECONDS, asked.fps or render_paths.FPS
+    length, rate = asked.seconds or paths.SECONDS, asked.fps or paths.FPS
     if asked.path is not None:
-        path = render_paths.load_path(asked.path, template, capture.ground, asked.seconds or None, asked.fps or None)
+        path = paths.load_path(asked.path, template, capture.ground, asked.seconds or None, asked.fps or None)
     elif asked.views == "orbit":
-        path = render_paths.orbit(capture.points, flown, template, length, rate)
+        path = paths.orbit(capture.points, flown, template, length, rate)
     else:
-        path = render_paths.flyover(flown, template, length, rate)
+        path = paths.flyover(flown, template, length, rate)
     return [(f"{i:05d}", camera) for i, camera in enumerate(path.cameras)], path.fps
 
 
@@ -89,35 +158,14 @@ def _height(camera: Camera, width: int) -> int:
 
 
 def _frames(
-    kind: str, run: TrainedRun, named: list[tuple[str, Camera]], console: Console
-) -> Iterator[tuple[str, np.ndarray]]:
-    """One uint8 RGB picture per camera, in order."""
-    counts = visibility_of_run(run).float() if kind == "visibility" else None
-    span: tuple[float, float] | None = None if counts is None else (0.0, float(counts.max()))
+    asked: RenderRequest, run: TrainedRun, named: list[tuple[str, Camera]], drawn: Map | None, console: Console
+) -> Iterator[_Frame]:
+    """One picture per camera, in order."""
     for name, camera in track(named, "rendering", console=console, disable=not console.is_terminal):
         stop_if_asked()
-        if kind == "image":
-            yield name, to_8bit(render(run.model, camera).image.cpu().numpy())
+        if drawn is None:
+            yield _Frame(name, to_8bit(render(run.model, camera).image.cpu().numpy()), None)
             continue
-        if counts is not None:
-            values = render_values(run.model, counts, camera).cpu().numpy()
-        else:
-            raster = render(run.model, camera, depth=True)
-            assert raster.median_depth is not None
-            values = np.where(raster.alpha.cpu().numpy() > 0.5, raster.median_depth.cpu().numpy(), np.nan)
-            span = span or _span(values)
-        yield name, coloured(values, span or (0.0, 1.0))
-
-
-def _span(values: np.ndarray) -> tuple[float, float]:
-    """The 1 to 99 % range of the first frame, used for all, so that colours do not flicker."""
-    seen = values[np.isfinite(values)]
-    return (float(np.quantile(seen, 0.01)), float(np.quantile(seen, 0.99))) if seen.size else (0.0, 1.0)
-
-
-def coloured(values: np.ndarray, span: tuple[float, float]) -> np.ndarray:
-    """A map [h, w] in viridis, black where it is NaN."""
-    scaled = (values - span[0]) / max(span[1] - span[0], 1e-9)
-    picture = matplotlib.colormaps["viridis"](np.nan_to_num(scaled).clip(0, 1))[..., :3]
-    picture[~np.isfinite(values)] = 0.0
-    return (picture * 255 + 0.5).astype(np.uint8)
+        values = drawn.values(camera)
+        picture = drawn.scale.coloured(values)
+        yield _Frame(name, with_legend(picture, drawn.scale) if asked.legend else picture, values)

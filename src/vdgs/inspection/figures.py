@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from vdgs.captures.capture import Capture
 from vdgs.figures.seen_map import CameraMarks, SeenMap, draw_seen_map, steps
-from vdgs.figures.style import DPI, INK, SEEN, plain
+from vdgs.figures.style import DPI, INK, NOTE, SEEN, TEXT, plain
 from vdgs.inspection.measure import CaptureReport, length
 from vdgs.model.visibility import LIMITS
 
@@ -19,14 +19,13 @@ from vdgs.model.visibility import LIMITS
 def draw_map(capture: Capture, report: CaptureReport, points: np.ndarray, visibility: np.ndarray, file: Path) -> None:
     """Cameras and points from above, points coloured by V; beside it the histogram of V."""
     low, high = _frame(capture, points)
-    east, north = ("east", "north") if capture.ground.origin_geo else ("x", "y")
     marks = (
         CameraMarks("training camera", [view.camera for view in capture.train_views], INK, "white"),
         CameraMarks("test camera", [view.camera for view in capture.test_views], "white", INK),
     )
     seen = SeenMap(
         points, visibility, low, high, float(np.median(capture.points[:, 2])), marks,
-        f"{east} ({report.unit})", f"{north} ({report.unit})", "a point", _titles(capture, report),
+        *capture.ground.axis_names, "a point", _titles(capture, report),
     )  # fmt: skip
     draw_seen_map(file, seen)
 
@@ -34,6 +33,7 @@ def draw_map(capture: Capture, report: CaptureReport, points: np.ndarray, visibi
 def draw_visibility(report: CaptureReport, visibility: np.ndarray, file: Path) -> None:
     """How many points are seen at least so often, and the share that fewer than 3, 5, 10 cameras see."""
     figure = Figure(figsize=(10.5, 4.3), dpi=DPI, layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # type: ignore[union-attr, call-arg]
     canvas = FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=[1.7, 1])
     top, norm = steps(visibility)
@@ -51,14 +51,14 @@ def draw_visibility(report: CaptureReport, visibility: np.ndarray, file: Path) -
                 (limit, share),
                 (9, 7),
                 textcoords="offset points",
-                fontsize=9,
+                fontsize=NOTE,
                 color=INK,
             )
     left.set(xlim=(-0.6, counts[-1]), ylim=(0, 1.08), xlabel="training cameras that see a point, V")
     left.set_title(
         "Share of the points seen by exactly V cameras (bars) and by at least V (line)",
         loc="left",
-        fontsize=11,
+        fontsize=TEXT,
         color=INK,
     )
     shares = [report.share_below[limit] for limit in LIMITS]
@@ -73,11 +73,11 @@ def draw_visibility(report: CaptureReport, visibility: np.ndarray, file: Path) -
             f"{share:.1%}",
             va="center",
             ha="right" if inside else "left",
-            fontsize=10,
+            fontsize=NOTE,
             color="white" if inside else INK,
         )
     right.set(xlim=(0, min(1.0, max(0.3, 1.25 * max(shares)))), xlabel="share of the points")
-    right.set_title("Poorly seen", loc="left", fontsize=11, color=INK)
+    right.set_title("Poorly seen", loc="left", fontsize=TEXT, color=INK)
     for axes in (left, right):
         plain(axes)
     left.xaxis.set_major_locator(MaxNLocator(integer=True))

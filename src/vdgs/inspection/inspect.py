@@ -15,6 +15,7 @@ from rich.table import Table
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
 from vdgs.captures.checks import CheckedImages
+from vdgs.captures.outputs import refuse_among_inputs
 from vdgs.figures.sampling import sample_points
 from vdgs.inspection.figures import draw_map, draw_visibility
 from vdgs.inspection.measure import CaptureReport, length, measure
@@ -31,8 +32,10 @@ MOST_PROJECTIONS = 2e8
 def inspect_capture(capture: Capture, output: Path, checked: CheckedImages | None = None) -> CaptureReport:
     """Measure the capture; write report.json and two figures into the folder `output` (made if absent).
 
-    `checked` is what decoding its photographs told, where they were decoded.
+    `checked` is what decoding its photographs told, where they were decoded. Raises VdgsError for an output among the
+    capture's inputs.
     """
+    refuse_among_inputs(output, capture)
     output.mkdir(parents=True, exist_ok=True)
     few_enough = int(np.clip(MOST_PROJECTIONS / len(capture.train_views), LEAST_POINTS, MOST_POINTS))
     points = sample_points(capture.points, few_enough)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import PurePosixPath
 
+from vdgs.evaluation.by_visibility import bounds_of
 from vdgs.evaluation.saving import file_stems
 from vdgs.report.charts import draw_gains, draw_pairs
 from vdgs.report.page import Html, details, figure, gallery, paragraph, section, table
@@ -181,7 +182,7 @@ def by_visibility_section(shown: Shown) -> Html:
 
 def _bounds(row: Record) -> str:
     lower, upper = row.number("lower"), row.number("upper")
-    return "nothing drawn" if lower is None or upper is None else f"{lower:.3g} to {upper:.3g}"
+    return "nothing drawn" if lower is None or upper is None else bounds_of(lower, upper)
 
 
 def _bins_table(bins: list[Record], pairs: list[tuple[Record, Record]]) -> Html:

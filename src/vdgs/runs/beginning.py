@@ -9,6 +9,7 @@ from typing import Any
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import refuse_another_capture
 from vdgs.captures.loading import load_capture
+from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
 from vdgs.errors import VdgsError
 from vdgs.runs.folder import RunFolder
 from vdgs.settings.capture import CaptureOptions
@@ -30,14 +31,16 @@ def begin_run(
     """Open the capture and a new run of it, or the run that is there if it was started with the same settings.
 
     `redo` None compares the settings of the coarse stage only and refuses others; True or False is about changing
-    them (`RunFolder.change_settings`). `command` is the one that asks, kept in the run. Raises
-    CaptureError for a capture that cannot be used, RunError for other settings than the run's, VdgsError for settings
-    that do not work.
+    them (`RunFolder.change_settings`). `command` is the one that asks, kept in the run. Raises CaptureError for a
+    capture that cannot be used, RunError for other settings than the run's, VdgsError for settings that do not work and
+    for an output among inputs.
     """
     problems = validate(method)
     if problems:
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
+    refuse_in_a_capture(output)
     capture = load_capture(capture_path, capture_options)
+    refuse_among_inputs(output, capture)
     method = replace(method, training=with_iterations(method.training, len(capture.train_views)))
     run = RunFolder(output)
     with run.locked():

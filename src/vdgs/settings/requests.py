@@ -59,7 +59,8 @@ class RenderRequest:
     run: Path
     """Run folder."""
     output: Path
-    """Folder for PNG files, or a file that ends in .mp4."""
+    """Folder for PNG files: new, empty, or filled by an earlier render, which is replaced. Or a file that ends in
+    .mp4."""
     views: Literal["test", "train", "orbit", "flyover"] = "test"
     """Which cameras; `orbit` and `flyover` are paths made from the capture."""
     path: Path | None = None
@@ -70,9 +71,14 @@ class RenderRequest:
     """Frames per second of a camera path and of the video; 0: what its file says, or 30 (2 for separate views)."""
     width: int = 0
     """Image width; 0 takes that of the training views."""
-    kind: Literal["image", "depth", "visibility"] = "image"
-    """What to draw: the picture; the median depth, at which a pixel becomes half opaque (black where it never does); or
-    the number of cameras that see each place."""
+    kind: Literal["image", "depth", "visibility", "alpha"] = "image"
+    """What to draw: the picture; the median depth, at which a pixel becomes half opaque (grey where it never does); the
+    number of training cameras that see each place, V; or alpha, how opaque the scene is."""
+    legend: bool = True
+    """Put a strip with the scale of the colours below each map; without it a map is as large as the image."""
+    raw: bool = False
+    """Also write the numbers of a map, NAME.npy beside NAME.png: float32 [height, width]. Depth is z along the view in
+    units of the ground frame (metres where known); depth and V are NaN where nothing is drawn."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
     threads: int = 0

@@ -210,7 +210,7 @@ def _draw(
     cuts = [(how_cut(config), blocks)] + ([] if compare is None else [(figures.BY_PLACE, compare)])
     figures.draw_blocks(
         folder / "blocks.png", scene.positions, scene.visibility, scene.cameras, assignment.cameras, cuts,
-        scene.opened.capture.ground.unit,
+        scene.opened.capture.ground.axis_names,
     )  # fmt: skip
     figures.draw_block_facts(
         folder / "block_facts.png", scene.positions, scene.visibility, blocks, assignment.cameras,

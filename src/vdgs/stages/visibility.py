@@ -30,7 +30,7 @@ def measure_visibility(run: RunFolder, console: Console) -> None:
         facts = asdict(imbalance(visibility))
         figures.draw_visibility_map(
             run.visibility / "map.png", opened.model.anchors.positions.numpy(), visibility, cameras,
-            opened.capture.ground.unit,
+            opened.capture.ground.axis_names,
         )  # fmt: skip
         write_json(file, {"key": key, "anchors": len(visibility), "training_views": len(cameras), **facts})
     quantiles = ", ".join(f"{share} %: {value:g}" for share, value in facts["quantiles"].items())

@@ -8,11 +8,14 @@ import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from safetensors import SafetensorError
 
 from vdgs.errors import VdgsError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
@@ -46,6 +49,17 @@ def write_bytes(path: Path, content: bytes) -> None:
 
     def write(temporary: Path) -> None:
         temporary.write_bytes(content)
+
+    write_atomically(path, write)
+
+
+def write_array(path: Path, values: np.ndarray) -> None:
+    """Write a numpy array (.npy) atomically."""
+    import numpy as np  # when there is one to write: files of text do without
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as handle:
+            np.save(handle, values, allow_pickle=False)
 
     write_atomically(path, write)
 

@@ -14,6 +14,7 @@ from PIL import Image
 
 from vdgs import __version__
 from vdgs.cameras import Camera
+from vdgs.captures.outputs import refuse_in_a_capture
 from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST
 from vdgs.errors import VdgsError
 from vdgs.storage.files import write_text
@@ -68,6 +69,7 @@ class _PlannedViews:
 def generate(output: Path, options: SynthOptions, progress: Progress | None = None) -> FlightImbalance:
     """See `vdgs.synth.generate`."""
     chosen, tell = options.resolved(), progress or _silent
+    refuse_in_a_capture(output)
     require_embree()
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
         raise VdgsError(f"{output} already exists and is not empty: name another folder, or remove it first.")

@@ -32,10 +32,13 @@ def inspect(arguments: list[str]) -> None:
     asked = tyro.cli(InspectArguments, args=arguments, prog="vdgs inspect")
     from vdgs.captures.checks import check_images
     from vdgs.captures.loading import load_capture
+    from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
     from vdgs.errors import CaptureError
     from vdgs.inspection.inspect import inspect_capture, print_report
 
+    refuse_in_a_capture(asked.output)
     capture = load_capture(asked.capture, asked.options)
+    refuse_among_inputs(asked.output, capture)
     checked = check_images(capture) if asked.check else None
     report = inspect_capture(capture, asked.output, checked)
     print_report(report)

@@ -19,7 +19,7 @@ from matplotlib.path import Path as Outline
 from vdgs.cameras import Camera
 from vdgs.figures.sampling import sample_points
 from vdgs.figures.seen_map import CameraMarks, SeenMap, draw_seen_map, map_size, mark_edge
-from vdgs.figures.style import DPI, FAINT, INK, placer, plain, titles
+from vdgs.figures.style import DPI, FAINT, INK, NOTE, TEXT, placer, plain, titles
 from vdgs.partition.blocks import Blocks
 from vdgs.partition.figures.facts import block_facts, draw_block_facts, spread_note
 from vdgs.partition.figures.scores import draw_scores
@@ -33,6 +33,10 @@ MOST_DRAWN = 60_000
 BY_PLACE = "λ_vis = 0: cut by place alone (numbers of its own)"
 #: The narrower side of a map is at least this share of the wider one: corridors stay legible.
 NARROWEST = 0.3
+#: Outlines widen a map of blocks by at most this share of its longer side, to each side.
+OUTLINES = 0.75
+#: Width of a map of blocks: two stand beside each other on a page.
+MAP_INCHES = 6.2
 
 
 def draw_visibility_map(
@@ -40,15 +44,16 @@ def draw_visibility_map(
     positions: Float[np.ndarray, "n 3"],
     visibility: Int[np.ndarray, " n"],
     cameras: Sequence[Camera],
-    unit: str,
+    axes: tuple[str, str],
 ) -> None:
-    """Anchors from above coloured by V_i, cameras, and the histogram of V. Writes a PNG; `unit` is that of places."""
+    """Anchors from above coloured by V_i, cameras, and the histogram of V. Writes a PNG; `axes` are the names of x
+    and y with their unit (`GroundFrame.axis_names`)."""
     low, high = _frame(np.concatenate([_inner(positions[:, :2]), _places(cameras)]))
     marks = CameraMarks("training camera", cameras, INK, "white", _mark_size(len(cameras)))
     facts = f"an anchor is seen by {np.median(visibility):g} training cameras (median)"
     heading = (f"{count_of(len(visibility), 'anchor')} and {count_of(len(cameras), 'training camera')}", facts)
     seen = SeenMap(
-        positions, visibility, low, high, float(np.median(positions[:, 2])), (marks,), f"x ({unit})", f"y ({unit})",
+        positions, visibility, low, high, float(np.median(positions[:, 2])), (marks,), *axes,
         "an anchor", (*heading, "anchors coloured by V; pale: V on level ground"),
     )  # fmt: skip
     draw_seen_map(file, seen)
@@ -61,15 +66,16 @@ def draw_blocks(
     cameras: Sequence[Camera],
     assigned: Bool[np.ndarray, "c b"],
     cuts: Sequence[tuple[str, Blocks]],
-    unit: str,
+    names: tuple[str, str],
 ) -> None:
     """Anchors from above coloured by block, with outlines and cameras, for each of the `cuts` with its name.
 
     The first cut is the scene's own, to which cameras are assigned; another is there to compare with. The map shows
-    99 % of the anchors in x and in y. Writes a PNG; `unit` is that of places.
+    99 % of the anchors in x and in y and all outlines, if these do not lead far away. Writes a PNG; `names` are those
+    of x and y with their unit (`GroundFrame.axis_names`).
     """
-    low, high = _frame(_inner(positions[:, :2]))
-    width, height = map_size(low, high)
+    low, high, whole = _frame_of_blocks(_inner(positions[:, :2]), [cut for _, cut in cuts])
+    width, height = map_size(low, high, MAP_INCHES)
     (_, blocks), count = cuts[0], len(cuts)
     columns, rows = (count, 1) if width < 1.7 * height else (1, count)
     figure = Figure(figsize=(max(0.85 + columns * (width + 0.75), 7.5), 1.15 + rows * (height + 1.1)), dpi=DPI)
@@ -83,9 +89,9 @@ def draw_blocks(
         used = np.asarray(assigned.any(axis=1)) if cut is blocks else np.ones(len(cameras), bool)
         _cameras(axes, _places(cameras), used)
         spread = block_facts(positions, visibility, cut).spread
-        axes.set_title(f"{name}\n{spread_note(spread)}", loc="left", fontsize=10, color=INK)
-        axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
-    _heading(figure, blocks, (len(positions), len(shown)), _places(cameras), (low, high))
+        axes.set_title(f"{name}\n{spread_note(spread)}", loc="left", fontsize=TEXT, color=INK)
+        axes.set(xlabel=names[0], ylabel=names[1])
+    _heading(figure, blocks, (len(positions), len(shown)), _places(cameras), (low, high), whole)
     _legend(figure, bool(assigned.any(axis=1).all()))
     canvas.print_png(file)  # type: ignore[arg-type]
 
@@ -104,12 +110,25 @@ def _inner(places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2 2"]:
     return np.quantile(np.asarray(places, np.float64), (0.005, 0.995), axis=0)
 
 
-def _frame(corners: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, np.ndarray]:
+def _frame(corners: Float[np.ndarray, "n 2"], margin: float = 0.08) -> tuple[np.ndarray, np.ndarray]:
     """Lower left and upper right corner of a map that holds `corners`, with a margin; neither a point nor a strip."""
     low, high = corners.min(axis=0), corners.max(axis=0)
     longest = float((high - low).max()) or 1.0
-    grow = np.maximum(0.08 * longest, (NARROWEST * longest - (high - low)) / 2)
+    grow = np.maximum(margin * longest, (NARROWEST * longest - (high - low)) / 2)
     return low - grow, high + grow
+
+
+def _frame_of_blocks(
+    inner: Float[np.ndarray, "2 2"], cuts: Sequence[Blocks]
+) -> tuple[np.ndarray, np.ndarray, bool]:  # fmt: skip
+    """The corners of a map of blocks, and whether it holds all outlines. It holds them unless they reach farther beyond
+    the anchors than `OUTLINES` of the longer side: one stray block must not make a stamp of the map."""
+    bounds = np.array([block.expanded.bounds for cut in cuts for block in cut.items]).reshape(-1, 2, 2)
+    outlines = np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
+    reach = OUTLINES * float(np.ptp(inner, axis=0).max())
+    held = np.clip(outlines, inner[0] - reach, inner[1] + reach)
+    low, high = _frame(np.concatenate([inner, held]), margin=0.03)
+    return low, high, bool(((outlines >= low) & (outlines <= high)).all())
 
 
 def _cut(axes: Axes, blocks: Blocks, shown: Float[np.ndarray, "n 2"], low: np.ndarray, high: np.ndarray) -> None:
@@ -126,7 +145,7 @@ def _cut(axes: Axes, blocks: Blocks, shown: Float[np.ndarray, "n 2"], low: np.nd
         place = _room(block.core, window)
         if place is not None:
             axes.text(
-                *place, str(index), ha="center", va="center", fontsize=10 if len(blocks) <= 40 else 7,
+                *place, str(index), ha="center", va="center", fontsize=12 if len(blocks) <= 40 else 8,
                 fontweight="bold", color=dark, zorder=5,
                 bbox={"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": dark, "linewidth": 0.8},
             )  # fmt: skip
@@ -163,14 +182,16 @@ def _cameras(axes: Axes, places: Float[np.ndarray, "c 2"], used: Bool[np.ndarray
 
 def _heading(
     figure: Figure, blocks: Blocks, anchors: tuple[int, int], cameras: Float[np.ndarray, "c 2"],
-    frame: tuple[np.ndarray, np.ndarray],
+    frame: tuple[np.ndarray, np.ndarray], whole: bool,
 ) -> None:  # fmt: skip
-    """What is shown, and what is not: `anchors` are (all, drawn), cameras may lie beyond the frame."""
+    """What is shown, and what is not: `anchors` are (all, drawn), cameras and, if not `whole`, outlines may lie beyond
+    the frame."""
     total, drawn = anchors
     outside = int((~((cameras >= frame[0]) & (cameras <= frame[1])).all(axis=1)).sum())
     facts = count_of(total, "anchor") + (f" ({drawn:,} drawn)" if drawn < total else "")
     seen = count_of(len(cameras), "training camera") + (f" ({outside:,} beyond the map)" if outside else "")
-    titles(figure, count_of(len(blocks), "block"), f"{facts}  ·  {seen}", "")
+    beyond = "" if whole else "  ·  outlines run on beyond the map"
+    titles(figure, count_of(len(blocks), "block"), f"{facts}  ·  {seen}{beyond}", "")
 
 
 def _legend(figure: Figure, all_used: bool) -> None:
@@ -184,5 +205,5 @@ def _legend(figure: Figure, all_used: bool) -> None:
     width, height = figure.get_size_inches()
     figure.legend(
         handles=lines[:3] if all_used else lines, loc="upper left", bbox_to_anchor=(0.85 / width, 1 - 0.84 / height),
-        ncols=4, fontsize=8.5, frameon=False, handletextpad=0.5, columnspacing=1.2, borderaxespad=0, borderpad=0,
+        ncols=4, fontsize=NOTE, frameon=False, handletextpad=0.5, columnspacing=1.2, borderaxespad=0, borderpad=0,
     )  # fmt: skip

@@ -12,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 
-from vdgs.figures.style import ACCENT, DPI, FAINT, INK, placer, plain, titles
+from vdgs.figures.style import ACCENT, DPI, FAINT, INK, NOTE, TEXT, placer, plain, titles
 from vdgs.partition.figures.words import count_of
 
 #: From no score to the highest; nothing in it resembles the mark of an assigned camera.
@@ -32,9 +32,9 @@ def draw_scores(file: Path, scores: Float[np.ndarray, "c b"], assigned: Bool[np.
     order, best = order_of_cameras(scores)
     width = float(np.clip(0.55 * blocks, 4.5, 14.0))
     height = float(np.clip(0.2 * cameras, 2.0, 9.0))
-    figure = Figure(figsize=(1.6 + width + 1.3, height + 1.9), dpi=DPI)
+    figure = Figure(figsize=(1.75 + width + 1.3, height + 1.9), dpi=DPI)
     canvas, place = FigureCanvasAgg(figure), placer(figure)
-    axes = place(1.6, 0.65, width, height)
+    axes = place(1.75, 0.65, width, height)
     norm = Normalize(min(0.0, float(scores.min(initial=0))), max(float(scores.max(initial=0)), 1e-6))
     if cameras:
         extent = (-0.5, blocks - 0.5, cameras - 0.5, -0.5)
@@ -42,10 +42,10 @@ def draw_scores(file: Path, scores: Float[np.ndarray, "c b"], assigned: Bool[np.
         # Sharp where every camera has a row of pixels, else averaged so that none is dropped.
         smooth = "nearest" if cameras <= height * DPI else "antialiased"
         axes.imshow(picture, aspect="auto", extent=extent, interpolation=smooth)
-        bar = figure.colorbar(ScalarMappable(norm, SCORE), cax=place(1.6 + width + 0.3, 0.65, 0.18, height))
-        bar.set_label("score", color=INK, fontsize=9)
+        bar = figure.colorbar(ScalarMappable(norm, SCORE), cax=place(1.75 + width + 0.3, 0.65, 0.18, height))
+        bar.set_label("score", color=INK, fontsize=TEXT)
         bar.outline.set_visible(False)  # type: ignore[operator]
-        bar.ax.tick_params(colors=FAINT, labelcolor=INK, labelsize=9)
+        bar.ax.tick_params(colors=FAINT, labelcolor=INK, labelsize=NOTE)
     else:
         axes.text(0.5, 0.5, "no cameras", ha="center", va="center", transform=axes.transAxes, color=FAINT)
         axes.set_xlim(-0.5, blocks - 0.5)
@@ -101,5 +101,5 @@ def _groups(axes: Axes, best: Int[np.ndarray, " c"], height: float) -> None:
         name = f"best: block {block}" if block < most else "no score"
         axes.annotate(
             f"{name} ({size:,})", (0, middle), (-8, 0), xycoords=axes.get_yaxis_transform(), textcoords="offset points",
-            ha="right", va="center", fontsize=9, color=INK,
+            ha="right", va="center", fontsize=NOTE, color=INK,
         )  # fmt: skip
