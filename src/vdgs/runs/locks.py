@@ -1,4 +1,5 @@
-"""Folders that processes hold, by a lock of the system on a file in them: it ends with the process, whatever ends it."""
+"""Folders that processes hold, by a lock of the system on a file in them: it ends with its process, however that
+ends."""
 
 from __future__ import annotations
 
