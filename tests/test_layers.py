@@ -29,7 +29,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("runs",),
     ("watching",),
     ("executors", "evaluation"),
-    ("stages", "films", "report", "comparators"),
+    ("stages", "films", "report", "comparators", "export"),
     ("pipeline", "doctor", "bench"),
     ("verbs",),
     ("cli",),
