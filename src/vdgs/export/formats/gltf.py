@@ -1,0 +1,177 @@
+"""glTF: one GLB of points that viewers with KHR_gaussian_splatting draw as Gaussians, and others as coloured points.
+
+Every number is kept as float32. glTF's y is up: positions, rotations and spherical harmonics are turned there. The
+second kind, `packed_tile`, holds an SPZ in their place (KHR_gaussian_splatting_compression_spz_2): what 3D Tiles need.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from vdgs.errors import VdgsError
+from vdgs.export.formats.scene import Y_UP, Facts, Scene, bytes_of, colours, opacities, sizes
+from vdgs.model.gaussians import Gaussians
+from vdgs.storage.files import write_atomically
+
+EXTENSION = "KHR_gaussian_splatting"
+PACKED = "KHR_gaussian_splatting_compression_spz_2"
+FLOAT, BYTE = 5126, 5121
+#: Lengths in a GLB are of 32 bits.
+LARGEST = 2**32 - 1
+#: What the JSON grows by at most once the bounds of the positions are known.
+ROOM = 256
+
+
+@dataclass(frozen=True)
+class Column:
+    """One attribute of all Gaussians, in one piece."""
+
+    name: str
+    kind: str
+    component: int
+    width: int
+
+    @property
+    def bytes_each(self) -> int:
+        return self.width * (4 if self.component == FLOAT else 1)
+
+    def accessor(self, count: int) -> dict[str, Any]:
+        normalised = {"normalized": True} if self.component == BYTE else {}
+        return {"componentType": self.component, "count": count, "type": self.kind, **normalised}
+
+
+def attributes(degree: int) -> list[Column]:
+    """The columns of the uncompressed kind."""
+    bands = [(band, index) for band in range(degree + 1) for index in range(2 * band + 1)]
+    return [
+        Column("POSITION", "VEC3", FLOAT, 3), Column("COLOR_0", "VEC4", BYTE, 4),
+        Column(f"{EXTENSION}:ROTATION", "VEC4", FLOAT, 4), Column(f"{EXTENSION}:SCALE", "VEC3", FLOAT, 3),
+        Column(f"{EXTENSION}:OPACITY", "SCALAR", FLOAT, 1),
+        *(Column(f"{EXTENSION}:SH_DEGREE_{band}_COEF_{index}", "VEC3", FLOAT, 3) for band, index in bands),
+    ]  # fmt: skip
+
+
+def size_of(scene: Scene) -> int:
+    """Bytes of the Gaussians in a GLB."""
+    return scene.count * sum(column.bytes_each for column in attributes(scene.degree))
+
+
+def refuse_too_large(path: Path, scene: Scene) -> None:
+    """Raise VdgsError where a GLB cannot hold so many Gaussians."""
+    if size_of(scene) + (1 << 16) > LARGEST:
+        raise VdgsError(
+            f"{path}: {scene.count} Gaussians take {size_of(scene) / 2**30:.1f} GiB as glTF, and a GLB holds 4 GiB. "
+            "Write 3D Tiles (a file named tileset.json) or .spz, or fewer Gaussians."
+        )
+
+
+def write_glb(path: Path, scene: Scene) -> tuple[str, ...]:
+    """Write the scene, atomically; loses nothing. Raises VdgsError."""
+    refuse_too_large(path, scene)
+    wanted = attributes(scene.degree)
+    starts = np.cumsum([0, *(column.bytes_each * scene.count for column in wanted)]).tolist()
+
+    def write(temporary: Path) -> None:
+        low, high = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
+        room = len(_json(_document(wanted, scene, starts, np.zeros(3), np.zeros(3)))) + ROOM
+        data, done = 12 + 8 + (room + 3) // 4 * 4 + 8, 0
+        with temporary.open("wb") as file:
+            for piece in scene.pieces(Y_UP):
+                low, high = np.minimum(low, piece.means.numpy().min(0)), np.maximum(high, piece.means.numpy().max(0))
+                for column, start, values in zip(wanted, starts[:-1], _values(piece), strict=True):
+                    file.seek(data + start + done * column.bytes_each)
+                    values.tofile(file)
+                done += len(piece)
+            file.seek(0)
+            described = _json(_document(wanted, scene, starts, low, high)).ljust((room + 3) // 4 * 4)
+            _frame(file, described, starts[-1])
+
+    write_atomically(path, write)
+    return ()
+
+
+def _values(piece: Gaussians) -> Iterator[np.ndarray]:
+    """The numbers of the columns, in their order."""
+    yield piece.means.numpy()
+    yield bytes_of(np.concatenate([colours(piece), opacities(piece)[:, None]], 1))
+    yield piece.quaternions.numpy()[:, [1, 2, 3, 0]]
+    yield sizes(piece)
+    yield opacities(piece)
+    yield piece.dc.numpy()
+    for index in range(piece.rest.shape[1]):
+        yield np.ascontiguousarray(piece.rest[:, index].numpy())
+
+
+def _document(
+    wanted: list[Column], scene: Scene, starts: list[int], low: np.ndarray, high: np.ndarray
+) -> dict[str, Any]:
+    accessors = [{"bufferView": index, **column.accessor(scene.count)} for index, column in enumerate(wanted)]
+    accessors[0] |= {"min": [float(x) for x in low], "max": [float(x) for x in high]}
+    views = [
+        {"buffer": 0, "byteOffset": start, "byteLength": column.bytes_each * scene.count, "target": 34962}
+        for column, start in zip(wanted, starts[:-1], strict=True)
+    ]
+    splatting = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective",
+                 "sortingMethod": "cameraDistance"}  # fmt: skip
+    names = {column.name: index for index, column in enumerate(wanted)}
+    return {
+        "asset": asset(scene.facts), "extensionsUsed": [EXTENSION],
+        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"mode": 0, "attributes": names, "extensions": {EXTENSION: splatting}}]}],
+        "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}],
+    }  # fmt: skip
+
+
+def asset(facts: Facts) -> dict[str, Any]:
+    """glTF's and 3D Tiles' word on where a file comes from."""
+    return {"version": "2.0", "generator": facts.program, "extras": {**facts.known(), "axes": "x east, y up, z south"}}
+
+
+def packed_tile(gaussians: Gaussians, spz: bytes, translation: np.ndarray, facts: Facts) -> bytes:
+    """A GLB around an SPZ of the same Gaussians (y up), moved by `translation` [3] (y up) to their place.
+
+    The attributes name what the SPZ yields, without data of their own. Degree 0 and opacity are not among them: they
+    are COLOR_0, and CesiumJS tells the degree by the number of attributes.
+    """
+    count = len(gaussians)
+    columns = [Column("POSITION", "VEC3", FLOAT, 3), Column("COLOR_0", "VEC4", BYTE, 4),
+               Column(f"{EXTENSION}:SCALE", "VEC3", FLOAT, 3), Column(f"{EXTENSION}:ROTATION", "VEC4", FLOAT, 4),
+               *attributes(gaussians.degree)[6:]]  # fmt: skip
+    accessors = [column.accessor(count) for column in columns]
+    means = gaussians.means.numpy()
+    accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
+    splatting = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "extensions": {PACKED: {"bufferView": 0}}}
+    names = {column.name: index for index, column in enumerate(columns)}
+    described = _json({
+        "asset": {"version": "2.0", "generator": facts.program},
+        "extensionsUsed": [EXTENSION, PACKED], "extensionsRequired": [EXTENSION, PACKED],
+        "scene": 0, "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "translation": [float(x) for x in translation]}],
+        "meshes": [{"primitives": [{"mode": 0, "attributes": names, "extensions": {EXTENSION: splatting}}]}],
+        "accessors": accessors, "bufferViews": [{"buffer": 0, "byteOffset": 0, "byteLength": len(spz)}],
+        "buffers": [{"byteLength": len(spz)}],
+    })  # fmt: skip
+    text, data = described.ljust(-(-len(described) // 4) * 4), spz.ljust(-(-len(spz) // 4) * 4, b"\0")
+    return _heads(len(text), len(data))[0] + text + _heads(len(text), len(data))[1] + data
+
+
+def _json(document: dict[str, Any]) -> bytes:
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
+
+
+def _frame(file: IO[bytes], described: bytes, size: int) -> None:
+    """The two heads and the JSON of a GLB whose data are of a size that four divides."""
+    first, second = _heads(len(described), size)
+    file.write(first + described + second)
+
+
+def _heads(text: int, data: int) -> tuple[bytes, bytes]:
+    whole = 12 + 8 + text + 8 + data
+    return struct.pack("<4sIIII", b"glTF", 2, whole, text, 0x4E4F534A), struct.pack("<II", data, 0x004E4942)

@@ -1,0 +1,91 @@
+"""Formats by the endings of their files: who writes and reads them, what they keep, and what opens them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from vdgs.errors import VdgsError
+from vdgs.export.formats.gltf import refuse_too_large, write_glb
+from vdgs.export.formats.ply import read_ply, write_ply
+from vdgs.export.formats.points import refuse_without_laspy, write_laz, write_points
+from vdgs.export.formats.scene import Scene, beside
+from vdgs.export.formats.sog import write_sog
+from vdgs.export.formats.splat import read_splat, write_splat
+from vdgs.export.formats.spz import read_spz, refuse_too_far, write_spz
+from vdgs.export.formats.tiles import NAME, refuse_other_names, write_tiles
+from vdgs.model.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class Format:
+    """One kind of file. `write` returns a sentence for each thing that was lost."""
+
+    #: How the file's name ends, in lower case.
+    ending: str
+    #: What it is, in a few words.
+    what: str
+    write: Callable[[Path, Scene], tuple[str, ...]]
+    #: Reads a file back into the ground frame, where that makes sense.
+    read: Callable[[Path], Gaussians] | None = None
+    #: Raises VdgsError for what can be known to fail before the first chunk is asked for.
+    check: Callable[[Path, Scene], None] = lambda path, scene: None
+    #: Whether facts are written to FILE.json, for the format has no room for them.
+    facts_beside: bool = False
+
+
+#: The longer endings first: `.points.ply` is a `.ply` too.
+FORMATS: tuple[Format, ...] = (
+    Format(".points.ply", "point cloud, local coordinates", write_points),
+    Format(".ply", "3DGS PLY, nothing lost", write_ply, read_ply),
+    Format(".spz", "SPZ, a twelfth of the PLY", write_spz, read_spz, refuse_too_far, True),
+    Format(".splat", "32 bytes a Gaussian, fixed colours", write_splat, read_splat, facts_beside=True),
+    Format(".sog", "PlayCanvas' SOG, a fifteenth of the PLY", write_sog, facts_beside=True),
+    Format(".glb", "glTF with KHR_gaussian_splatting, nothing lost", write_glb, check=refuse_too_large),
+    Format(NAME, "3D Tiles for CesiumJS, in levels", write_tiles, check=refuse_other_names),
+    Format(".laz", "point cloud, map coordinates, compressed", write_laz, check=refuse_without_laspy),
+    Format(".las", "point cloud, map coordinates", write_laz, check=refuse_without_laspy),
+)
+
+
+def format_of(path: Path) -> Format:
+    """The format that a file's name asks for. Raises VdgsError, naming those there are, for any other."""
+    name = path.name.lower()
+    for each in FORMATS:
+        if name == NAME == each.ending or (
+            each.ending[0] == "." and name.endswith(each.ending) and name != each.ending
+        ):
+            return each
+    known = ", ".join(f"{each.ending} ({each.what})" for each in FORMATS)
+    raise VdgsError(f"{path}: no format is known by this name. Let it end in one of: {known}.")
+
+
+def check(path: Path, scene: Scene) -> None:
+    """Raise VdgsError for what would fail: a name, a missing package, too many or too far. Asks for no chunk."""
+    chosen = format_of(path)
+    if scene.count < 1:
+        raise VdgsError(f"{path}: the scene has no Gaussians, there is nothing to write.")
+    if path.is_dir() and chosen.ending != NAME:
+        raise VdgsError(f"{path}: is a folder. Give the name of a file.")
+    chosen.check(path, scene)
+
+
+def write(path: Path, scene: Scene) -> tuple[str, ...]:
+    """Write a scene in the format of the file's name, whole or not at all. Returns what was lost. Raises VdgsError."""
+    check(path, scene)
+    return format_of(path).write(path, scene)
+
+
+def read(path: Path) -> Gaussians:
+    """Read Gaussians back, in the ground frame of the scene that was written. Raises VdgsError."""
+    chosen = format_of(path)
+    if chosen.read is None:
+        able = ", ".join(each.ending for each in FORMATS if each.read)
+        raise VdgsError(f"{path}: such files are written but not read. Readable are: {able}.")
+    return chosen.read(path)
+
+
+def written_by(path: Path) -> tuple[Path, ...]:
+    """The files that writing `path` replaces, beside the tiles of a tileset."""
+    return (path, beside(path)) if format_of(path).facts_beside else (path,)

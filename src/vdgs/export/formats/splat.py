@@ -1,0 +1,71 @@
+"""`.splat`: 32 bytes a Gaussian, as viewers on the web stream them. Colours no longer change with the direction.
+
+Position and standard deviations as float32, colour and opacity as RGBA, rotation wxyz in four bytes; y down.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from vdgs.errors import VdgsError
+from vdgs.export.formats.scene import (
+    Y_DOWN,
+    Scene,
+    bytes_of,
+    colours,
+    logits_of,
+    opacities,
+    sizes,
+    unturned,
+    write_beside,
+)
+from vdgs.model.gaussians import Gaussians
+from vdgs.model.spherical_harmonics import dc_of_colours
+from vdgs.storage.files import write_atomically
+
+LAYOUT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+
+
+def write_splat(path: Path, scene: Scene) -> tuple[str, ...]:
+    """Write the scene, atomically, and its facts beside it. Returns what was lost. Raises VdgsError."""
+    clipped = 0
+
+    def write(temporary: Path) -> None:
+        nonlocal clipped
+        with temporary.open("wb") as file:
+            for piece in scene.pieces(Y_DOWN):
+                rows = np.empty(len(piece), LAYOUT)
+                shown = colours(piece)
+                clipped += int(((shown < 0) | (shown > 1)).any(1).sum())
+                rows["mean"], rows["scale"] = piece.means.numpy(), sizes(piece)
+                rows["rgba"] = bytes_of(np.concatenate([shown, opacities(piece)[:, None]], 1))
+                rows["rotation"] = np.clip(np.rint(piece.quaternions.numpy() * 128 + 128), 0, 255).astype(np.uint8)
+                rows.tofile(file)
+
+    write_atomically(path, write)
+    write_beside(path, scene.facts, {"axes": "x west, y down, z south"})
+    lost = ["colours no longer change with the viewing direction"] if scene.degree else []
+    if clipped:
+        lost.append(f"{clipped} of {scene.count} colours lay outside of 0 .. 1 and were cut off")
+    return tuple(lost)
+
+
+def read_splat(path: Path) -> Gaussians:
+    """The Gaussians of a file, in the ground frame. Raises VdgsError if it is missing or damaged."""
+    try:
+        rows = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    if not len(rows) or len(rows) % LAYOUT.itemsize:
+        raise VdgsError(f"{path}: holds {len(rows)} bytes, which are no whole Gaussians of 32. Write it again.")
+    table = rows.view(LAYOUT)
+    rgba = table["rgba"].astype(np.float32) / 255
+    read = Gaussians(
+        means=torch.from_numpy(table["mean"].copy()), log_scales=torch.from_numpy(table["scale"].copy()).log(),
+        quaternions=torch.from_numpy((table["rotation"].astype(np.float32) - 128) / 128), logits=logits_of(rgba[:, 3]),
+        dc=dc_of_colours(torch.from_numpy(rgba[:, :3])), rest=torch.zeros(len(table), 0, 3),
+    )  # fmt: skip
+    return unturned(read, Y_DOWN)

@@ -1,0 +1,218 @@
+"""SPZ: about a twelfth of a PLY, in fixed point, gzipped (Niantic's format, versions 2 and 3).
+
+Positions have 24 bits, 12 of them after the point: steps of 0.24 mm, within ±2048 m, beyond which other programs wrap
+around silently; here it is an error. y is up (right, up, back). Version 3 keeps rotations to a tenth of a degree,
+version 2, which the oldest readers and the extension of glTF ask for, to about half a degree. Version 4 (zstd) is not
+written: few programs read it yet.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import tempfile
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import torch
+
+from vdgs.errors import VdgsError
+from vdgs.export.formats.gzipping import gzipped
+from vdgs.export.formats.scene import Y_UP, Scene, bytes_of, logits_of, opacities, unturned, write_beside
+from vdgs.model.gaussians import Gaussians
+from vdgs.model.spherical_harmonics import MAX_DEGREE, function_count
+from vdgs.storage.files import write_atomically
+
+MAGIC = 0x5053474E
+HEADER = struct.Struct("<IIIBBBB")
+FRACTION_BITS = 12
+#: Positions lie below this many units from the origin.
+REACH = 2**23 / 2**FRACTION_BITS
+COLOUR_SCALE = 0.15
+#: Steps of the coefficients of the first band and of the others, in units of 1 / 128: what Niantic's writer takes.
+FIRST_STEP, REST_STEP = 8, 16
+#: Columns in the order of the file.
+COLUMNS = ("positions", "alphas", "colours", "scales", "rotations", "harmonics")
+READ_IN = 1 << 22
+
+
+def refuse_too_far(path: Path, scene: Scene) -> None:
+    """Raise VdgsError where it is known beforehand that positions do not fit."""
+    if scene.bounds is not None and (far := float(np.abs(np.array(scene.bounds)).max())) >= REACH:
+        raise _too_far(path, far)
+
+
+def write_spz(path: Path, scene: Scene, version: int = 3) -> tuple[str, ...]:
+    """Write the scene, atomically, and its facts beside it. Returns what was lost. Raises VdgsError.
+
+    The file holds one quantity after the other: they wait in temporary files beside it, so memory stays small.
+    """
+    refuse_too_far(path, scene)
+    cut = {"scales": 0, "colours": 0}
+
+    def write(temporary: Path) -> None:
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+            spools = {name: (Path(folder) / name).open("w+b") for name in COLUMNS}
+            try:
+                for piece in scene.pieces(Y_UP):
+                    far = float(piece.means.abs().max())
+                    if far >= REACH - 1 / 2**FRACTION_BITS:
+                        raise _too_far(path, far)
+                    for name, count in _beyond(piece).items():
+                        cut[name] += count
+                    for name, column in zip(COLUMNS, columns(piece, version), strict=True):
+                        column.tofile(spools[name])
+                with temporary.open("wb") as file:
+                    for part in gzipped(_stream(header(scene.count, scene.degree, version), spools)):
+                        file.write(part)
+            finally:
+                for spool in spools.values():
+                    spool.close()
+
+    write_atomically(path, write)
+    write_beside(path, scene.facts, {"axes": "x east, y up, z south"})
+    kinds = {"scales": "sizes lay outside of 0.05 mm .. 377 m", "colours": "colours lay far outside of 0 .. 1"}
+    return tuple(f"{cut[name]} of {scene.count} {what} and were cut off" for name, what in kinds.items() if cut[name])
+
+
+def header(count: int, degree: int, version: int, fraction: int = FRACTION_BITS) -> bytes:
+    """The head of a file whose positions have `fraction` bits after the point."""
+    return HEADER.pack(MAGIC, version, count, degree, fraction, 0, 0)
+
+
+def columns(piece: Gaussians, version: int, fraction: int = FRACTION_BITS) -> tuple[np.ndarray, ...]:
+    """The bytes of Gaussians whose y is up, a uint8 array [n, bytes] for each of `COLUMNS`."""
+    n = len(piece)
+    fixed = np.rint(piece.means.double().numpy() * 2**fraction).astype("<i4")
+    positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(n, 3, 4)[:, :, :3].reshape(n, 9)
+    colours = bytes_of(piece.dc.numpy() * COLOUR_SCALE + 0.5)
+    scales = np.clip(np.rint((piece.log_scales.numpy() + 10) * 16), 0, 255).astype(np.uint8)
+    rotations = (_three_smallest if version >= 3 else _first_three)(piece.quaternions.numpy())
+    return positions, bytes_of(opacities(piece)[:, None]), colours, scales, rotations, _harmonics(piece.rest.numpy())
+
+
+def encoded(gaussians: Gaussians, version: int) -> bytes:
+    """A whole file, gzipped, of Gaussians in memory whose y is up.
+
+    Where they reach farther than 2048 units, positions have fewer bits after the point; the file says how many.
+    """
+    reach = float(gaussians.means.abs().max()) + 1 / 2**FRACTION_BITS
+    fraction = max(0, min(FRACTION_BITS, math.floor(math.log2(2**23 / reach))))
+    parts = [header(len(gaussians), gaussians.degree, version, fraction)]
+    parts += [column.tobytes() for column in columns(gaussians, version, fraction)]
+    return b"".join(gzipped(parts))
+
+
+def _stream(first: bytes, spools: Mapping[str, IO[bytes]]) -> Iterator[bytes]:
+    yield first
+    for spool in spools.values():
+        spool.seek(0)
+        while piece := spool.read(READ_IN):
+            yield piece
+
+
+def _beyond(piece: Gaussians) -> dict[str, int]:
+    """How many Gaussians have sizes or colours that bytes cannot hold."""
+    scales = (piece.log_scales + 10) * 16
+    shown = piece.dc * COLOUR_SCALE + 0.5
+    return {
+        "scales": int(((scales < -0.5) | (scales > 255.5)).any(1).sum()),
+        "colours": int(((shown < -0.002) | (shown > 1.002)).any(1).sum()),
+    }
+
+
+def _harmonics(rest: np.ndarray) -> np.ndarray:
+    n, r, _ = rest.shape
+    step = np.where(np.arange(r) < 3, FIRST_STEP, REST_STEP)[:, None].astype(np.float32)
+    # The middle of the bytes, 128, is a step of its own: what is zero stays zero.
+    coded = np.rint(rest * np.float32(128) / step) * step + 128
+    return np.clip(coded, 0, 255).astype(np.uint8).reshape(n, 3 * r)
+
+
+def _first_three(quaternions: np.ndarray) -> np.ndarray:
+    """Version 2: x, y, z of the rotation with w >= 0."""
+    signed = np.where(quaternions[:, :1] < 0, -quaternions, quaternions)[:, 1:]
+    return np.clip(np.rint(signed * 127.5 + 127.5), 0, 255).astype(np.uint8)
+
+
+def _three_smallest(quaternions: np.ndarray) -> np.ndarray:
+    """Version 3: which of x, y, z, w is largest, and sign and size of the others in 1 + 9 bits each."""
+    q = quaternions[:, [1, 2, 3, 0]]
+    rows = np.arange(len(q))
+    largest = np.abs(q).argmax(1)
+    negate = q[rows, largest] < 0
+    packed = largest.astype(np.uint32)
+    for part in range(4):
+        size = np.minimum(np.rint(np.abs(q[:, part]) * np.sqrt(2) * 511), 511).astype(np.uint32)
+        added = (packed << np.uint32(10)) | (((q[:, part] < 0) ^ negate).astype(np.uint32) << np.uint32(9)) | size
+        packed = np.where(largest == part, packed, added)
+    return packed.astype("<u4").view(np.uint8).reshape(-1, 4)
+
+
+def read_spz(path: Path) -> Gaussians:
+    """The Gaussians of a file of version 2 or 3, in the ground frame. Raises VdgsError if it is damaged or another."""
+    try:
+        data = zlib.decompress(path.read_bytes(), 31)
+    except OSError as error:
+        raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    except zlib.error as error:
+        raise VdgsError(f"{path}: is no SPZ of versions 2 and 3, or damaged ({error}). Write it again.") from None
+    return unturned(decoded(data, path), Y_UP)
+
+
+def decoded(data: bytes, path: Path) -> Gaussians:
+    """Gaussians, y up, of an inflated file; `path` is for what is said of a damaged one (VdgsError)."""
+    if len(data) < HEADER.size or (fields := HEADER.unpack_from(data))[0] != MAGIC or fields[1] not in (2, 3):
+        raise VdgsError(f"{path}: is no SPZ of versions 2 and 3.")
+    _, version, n, degree, fraction, _, _ = fields
+    rest = function_count(degree) - 1 if degree <= MAX_DEGREE else 0
+    widths = (9, 1, 3, 3, 4 if version == 3 else 3, 3 * rest)
+    if len(data) != HEADER.size + n * sum(widths):
+        raise VdgsError(f"{path}: is shorter or longer than its {n} Gaussians. It is damaged; write it again.")
+    parts, start = [], HEADER.size
+    for width in widths:
+        parts.append(np.frombuffer(data, np.uint8, n * width, start).reshape(n, width))
+        start += n * width
+    positions, alphas, colours, scales, rotations, harmonics = parts
+    whole = np.zeros((n, 3, 4), np.uint8)
+    whole[:, :, 1:] = positions.reshape(n, 3, 3)  # in the upper three bytes, so that the shift back carries the sign
+    means = (whole.view("<i4")[:, :, 0] >> 8) / 2.0**fraction
+    quaternions = (_of_three_smallest if version == 3 else _of_first_three)(rotations)
+    return Gaussians(
+        means=torch.from_numpy(means.astype(np.float32)),
+        log_scales=torch.from_numpy(scales / np.float32(16) - 10),
+        quaternions=torch.from_numpy(quaternions.astype(np.float32)),
+        logits=logits_of(alphas[:, 0] / np.float32(255)),
+        dc=torch.from_numpy((colours / np.float32(255) - np.float32(0.5)) / np.float32(COLOUR_SCALE)),
+        rest=torch.from_numpy((harmonics.reshape(n, rest, 3).astype(np.float32) - 128) / 128),
+    )
+
+
+def _of_first_three(coded: np.ndarray) -> np.ndarray:
+    xyz = coded / 127.5 - 1
+    w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1, keepdims=True)))
+    return np.concatenate([w, xyz], 1)
+
+
+def _of_three_smallest(coded: np.ndarray) -> np.ndarray:
+    packed = np.ascontiguousarray(coded).view("<u4")[:, 0]
+    largest = packed >> np.uint32(30)
+    q = np.zeros((len(packed), 4))
+    for part in range(3, -1, -1):
+        here = largest != part
+        size = (packed & np.uint32(511)) / 511 / np.sqrt(2)
+        q[:, part] = np.where(here, np.where(packed & np.uint32(512), -size, size), 0)
+        packed = np.where(here, packed >> np.uint32(10), packed)
+    q[np.arange(len(q)), largest] = np.sqrt(np.maximum(0, 1 - (q**2).sum(1)))
+    return q[:, [3, 0, 1, 2]]
+
+
+def _too_far(path: Path, far: float) -> VdgsError:
+    return VdgsError(
+        f"{path}: a Gaussian lies {far:.0f} m from the origin, and SPZ holds positions only within {REACH:.0f} m. "
+        "Write a part of the scene or move its origin into its middle; or choose tileset.json, .glb or .ply, which "
+        "hold any extent."
+    )
