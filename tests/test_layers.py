@@ -24,7 +24,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("kernels",),
     ("memory",),
     ("captures", "model"),
-    ("figures", "training"),
+    ("figures", "placing", "training"),
     ("partition", "inspection", "synth"),
     ("runs",),
     ("watching",),
