@@ -29,7 +29,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("runs",),
     ("watching",),
     ("executors", "evaluation"),
-    ("stages", "films", "report", "comparators"),
+    ("stages", "films", "maps", "report", "comparators"),
     ("pipeline", "doctor", "bench"),
     ("verbs",),
     ("cli",),

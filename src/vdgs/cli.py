@@ -25,6 +25,7 @@ its stages, one by one:
 
 more:
   render RUN                        views or a camera path, as PNG or video
+  map RUN                           orthophoto, surface model and visibility as GeoTIFFs
   synth OUTPUT                      generate a small aerial town with known truth
   bench TABLE --output FOLDER       methods x scenes x seeds: the paper's tables, a figure and a verdict
   doctor                            what this machine can use, and what to install for the rest
@@ -34,8 +35,8 @@ transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of Matri
 """
 
 VERBS = (
-    "inspect", "run", "coarse", "visibility", "partition", "train", "merge", "eval", "report", "render", "synth",
-    "bench", "doctor",
+    "inspect", "run", "coarse", "visibility", "partition", "train", "merge", "eval", "report", "render", "map",
+    "synth", "bench", "doctor",
 )  # fmt: skip
 
 

@@ -10,13 +10,14 @@ import os
 from vdgs.verbs.benching import bench
 from vdgs.verbs.captures import inspect, synth
 from vdgs.verbs.machine import doctor
+from vdgs.verbs.mapping import map
 from vdgs.verbs.results import eval, render, report
 from vdgs.verbs.stages import merge, partition, train, visibility
 from vdgs.verbs.starting import coarse, run
 
 __all__ = [
-    "bench", "coarse", "doctor", "eval", "inspect", "merge", "partition", "render", "report", "run", "synth", "train",
-    "visibility",
+    "bench", "coarse", "doctor", "eval", "inspect", "map", "merge", "partition", "render", "report", "run", "synth",
+    "train", "visibility",
 ]  # fmt: skip
 
 # torch's OpenMP threads must block, not spin, beside the kernels' own pool; read once, when torch is imported.
