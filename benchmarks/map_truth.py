@@ -96,9 +96,12 @@ def edges(heights: np.ndarray, truth: np.ndarray, kept: np.ndarray, pitch: float
 
     mine, true = steps(np.where(kept, heights, np.nan)), steps(truth)
     if mine.any() and true.any():
-        away = distance_transform_edt(~mine)[true] * pitch
-        print(f"roof edges: a true one has one of the map's {np.median(away):.2f} m away (median), 75 %: "
-              f"{np.quantile(away, 0.75):.2f} m, of {true.sum()} pixels of edge")  # fmt: skip
+        away, beside = (distance_transform_edt(~to)[of] for to, of in ((mine, true), (true, mine)))
+        print(
+            f"roof edges (V >= 5, steps over 2 m): of the true ones {(away <= 1).mean():.0%} have one of the map's "
+            f"within a pixel ({pitch:g}), {(away <= 2).mean():.0%} within two; of the map's "
+            f"{(beside <= 1).mean():.0%} and {(beside <= 2).mean():.0%} have a true one"
+        )
 
 
 if __name__ == "__main__":

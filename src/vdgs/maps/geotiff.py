@@ -62,7 +62,7 @@ def writing(file: Path, layer: Layer, grid: Grid, placement: Placement, tags: di
     options = {"photometric": "RGB", "alpha": "YES"} if alpha else {}
     with rasterio.open(
         file, "w", driver="GTiff", width=grid.width, height=grid.height, count=len(layer.bands), dtype=layer.dtype,
-        crs=crs_of(placement), transform=rasterio.transform.from_origin(grid.left, grid.top, grid.gsd, grid.gsd),
+        crs=crs_of(placement), transform=rasterio.Affine(grid.gsd, 0.0, grid.left, 0.0, -grid.gsd, grid.top),
         nodata=layer.nodata, tiled=True, blockxsize=TILE_PX, blockysize=TILE_PX, compress="DEFLATE", zlevel=1,
         bigtiff="IF_SAFER", **options,
     ) as stream:  # fmt: skip

@@ -103,6 +103,18 @@ def extent_of(capture: Capture, placement: Placement) -> tuple[float, float, flo
     return (*(low - beyond).tolist(), *(high + beyond).tolist())
 
 
+def refuse_elsewhere(grid: Grid, shown: tuple[float, float, float, float], placement: Placement) -> None:
+    """Raise VdgsError where a grid lies wholly beside what the photographs show, by more than that is wide."""
+    x0, y0, x1, y1 = shown
+    left, bottom, right, top = grid.bounds
+    across, along = x1 - x0, y1 - y0
+    if left > x1 + across or right < x0 - across or bottom > y1 + along or top < y0 - along:
+        raise VdgsError(
+            f"--bbox {' '.join(f'{v:g}' for v in grid.bounds)}: lies beside the scene, which spans "
+            f"{' '.join(f'{v:.1f}' for v in shown)} in {placement.name}."
+        )
+
+
 def ground_sampling(capture: Capture, scale: float) -> float:
     """The median size of a pixel of the training photographs on what they show, in target units, to two digits.
 

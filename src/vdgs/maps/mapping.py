@@ -16,7 +16,7 @@ from rich.progress import track
 
 from vdgs.errors import VdgsError
 from vdgs.maps.geotiff import Layer, cloud_optimised, require_rasterio, write_tile, writing
-from vdgs.maps.grid import Grid, extent_of, grid_over, ground_sampling, middle_of
+from vdgs.maps.grid import Grid, extent_of, grid_over, ground_sampling, middle_of, refuse_elsewhere
 from vdgs.maps.pictures import Sheet, hillshade_png, preview_png
 from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Surveyor, Tile, samples_for
 from vdgs.placing.placement import Placement
@@ -42,8 +42,9 @@ def map_run(asked: MapRequest, console: Console) -> Path:
     placement = Placement.of(capture.ground, asked.crs)
     scale = placement.similarity_at(middle_of(capture)).scale
     finest = ground_sampling(capture, scale)
-    extent = extent_of(capture, placement) if asked.bbox is None else asked.bbox
-    grid = grid_over(extent, finest if asked.gsd is None else asked.gsd)
+    shown = extent_of(capture, placement)
+    grid = grid_over(asked.bbox or shown, finest if asked.gsd is None else asked.gsd)
+    refuse_elsewhere(grid, shown, placement)
     surveyor = Surveyor.of(run.model, capture, placement, samples_for(grid.gsd, finest))
     surveyor.camera(grid.part(0, 0, 1, 1))  # a system that makes no map is refused here
     folder = asked.output or run.folder.path / "maps"
@@ -57,8 +58,8 @@ def map_run(asked: MapRequest, console: Console) -> Path:
         facts |= _draw(surveyor, grid, layers, staging, facts, console)
         if not facts["mapped_share"]:
             raise VdgsError(
-                "--bbox: no photograph shows anything there. The scene spans "
-                f"{' '.join(f'{v:.1f}' for v in extent_of(capture, placement))} in {placement.name}."
+                f"{folder}: the {run.name} model shows nothing solid there, or no training photograph looks there. "
+                "Give another --bbox or leave it out."
             )
         for layer in layers:
             rough = staging / f"rough-{layer.name}"

@@ -141,6 +141,7 @@ def _legend(figure: Figure, axes: Axes, colours: ScalarMappable, label: str) -> 
     legend.outline.set_visible(False)  # type: ignore[operator]
     legend.locator = MaxNLocator(5, integer=True)
     legend.update_ticks()
+    legend.minorticks_off()
     bar.tick_params(labelsize=7, colors=FAINT, labelcolor=INK, length=2)
     bar.set_title(label, fontsize=7, color=INK, loc="left", pad=4)
 
