@@ -81,12 +81,19 @@ def write_tile(stream: Any, column: int, row: int, values: np.ndarray) -> None:
 
 
 def cloud_optimised(source: Path, file: Path, layer: Layer) -> None:
-    """Rewrite a GeoTIFF as a cloud-optimised one: overviews, DEFLATE with a predictor."""
+    """Rewrite a GeoTIFF as a cloud-optimised one: overviews, DEFLATE with a predictor.
+
+    Raises OSError where the result is not what was written: GDAL closes files without a word when a disk is full.
+    """
+    rasterio = require_rasterio()
     predictor = "FLOATING_POINT" if layer.dtype.startswith("float") else "STANDARD"
-    require_rasterio().shutil.copy(
+    rasterio.shutil.copy(
         source, file, driver="COG", COMPRESS="DEFLATE", PREDICTOR=predictor, BLOCKSIZE=TILE_PX, BIGTIFF="IF_SAFER",
         OVERVIEW_RESAMPLING=layer.overviews.upper(), NUM_THREADS="ALL_CPUS",
     )  # fmt: skip
+    with rasterio.open(source) as written, rasterio.open(file) as read:
+        if any(written.checksum(band) != read.checksum(band) for band in written.indexes):
+            raise OSError(f"{layer.name} came out damaged")
 
 
 def read_small(file: Path, longest_px: int) -> tuple[np.ndarray, float]:

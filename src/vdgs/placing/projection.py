@@ -105,7 +105,7 @@ def _operation(crs: Any, code: str, origin: tuple[float, float, float]) -> tuple
     from pyproj.transformer import TransformerGroup
 
     latitude, longitude, _ = origin
-    area = AreaOfInterest(
+    area: Any = AreaOfInterest(
         longitude - _AREA_DEG, max(latitude - _AREA_DEG, -90), longitude + _AREA_DEG, min(latitude + _AREA_DEG, 90)
     )
     with warnings.catch_warnings():  # said below, in words
