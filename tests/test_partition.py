@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shapely.affinity import translate
 
 from vdgs.captures.capture import GroundFrame
-from vdgs.captures.geodesy import enu_from_geodetic
+from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.errors import RunError, VdgsError
 from vdgs.memory.estimate import Need, estimate
 from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks, save_blocks_wgs84
@@ -323,6 +325,14 @@ def test_blocks_on_the_map(tmp_path: Path, origin: tuple[float, float, float]) -
     nearest = np.linalg.norm(back[:, None] - shapely.get_coordinates(ring)[None], axis=2).min(axis=1)
     assert nearest.max() < 1e-3
     assert np.ptp(corners[:, 0]) < 0.02
+    # A frame whose origin was moved keeps its axes: the same blocks about another origin are in the same place.
+    moved = tuple(geodetic_from_enu(np.array([[3000.0, 4000, 0]]), origin)[0])
+    away = replace(ground, origin_geo=moved, axes_geo=origin[:2])
+    there = Blocks(tuple(Block(*(translate(s, -3000, -4000) for s in (b.core, b.expanded))) for b in blocks.items))
+    save_blocks_wgs84(tmp_path / "moved.geojson", there, [{}, {}], away)
+    again = json.loads((tmp_path / "moved.geojson").read_text())["features"][0]["geometry"]
+    apart = shapely.get_coordinates(shapely.geometry.shape(again)) - corners
+    np.testing.assert_allclose((apart + 180) % 360 - 180, 0, atol=1e-9)
     with pytest.raises(ValueError, match="not georeferenced"):
         save_blocks_wgs84(
             tmp_path / "map.geojson", blocks, [{}, {}], GroundFrame(1.0, np.eye(3), np.zeros(3), True, "-")

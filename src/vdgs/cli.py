@@ -26,6 +26,7 @@ its stages, one by one:
 
 more:
   render RUN                        views or a camera path, as PNG or video
+  map RUN                           orthophoto, surface model and visibility as GeoTIFFs
   synth OUTPUT                      generate a small aerial town with known truth
   bench TABLE --output FOLDER       methods x scenes x seeds: the paper's tables, a figure and a verdict
   doctor                            what this machine can use, and what to install for the rest
@@ -36,6 +37,7 @@ transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of Matri
 
 VERBS = (
     "inspect", "run", "status", "coarse", "visibility", "partition", "train", "merge", "eval", "report", "render",
+    "map",
     "synth", "bench", "doctor",
 )  # fmt: skip
 #: Verbs that take up what they left when they were interrupted.

@@ -30,6 +30,16 @@ class GroundFrame:
     how: str
     #: Latitude (deg), longitude (deg), altitude (m) of the ground frame's origin (ENU), where known.
     origin_geo: tuple[float, float, float] | None = None
+    #: Latitude and longitude (deg) of the place whose east, north and up are the axes, where it is not the origin: a
+    #: frame that is moved keeps its axes.
+    axes_geo: tuple[float, float] | None = None
+
+    @property
+    def level_at(self) -> tuple[float, float]:
+        """Latitude and longitude (deg) of the place whose east, north and up are the axes (georeferenced frames)."""
+        if self.origin_geo is None:
+            raise ValueError("a frame that is not georeferenced is level at no known place")
+        return self.axes_geo or self.origin_geo[:2]
 
     @property
     def unit(self) -> str:

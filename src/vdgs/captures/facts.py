@@ -24,6 +24,7 @@ def capture_facts(capture: Capture) -> dict[str, Any]:
         "ground_frame": {
             "scale": ground.scale, "rotation": ground.rotation.tolist(), "translation": ground.translation.tolist(),
             "metric": ground.metric, "how": ground.how, "origin_geo": ground.origin_geo,
+            "axes_geo": ground.axes_geo,
         },
         "warnings": list(capture.warnings),
         "fingerprint": fingerprint(capture),

@@ -60,13 +60,20 @@ def enu_axes(latitude_deg: float, longitude_deg: float) -> np.ndarray:
     )
 
 
-def enu_from_geodetic(geodetic: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
-    """(lat, lon, alt) [n, 3] to east-north-up metres [n, 3] about `origin` (lat, lon, alt)."""
+def enu_from_geodetic(
+    geodetic: np.ndarray, origin: tuple[float, float, float], level_at: tuple[float, float] | None = None
+) -> np.ndarray:
+    """(lat, lon, alt) [n, 3] to east-north-up metres [n, 3] about `origin` (lat, lon, alt).
+
+    `level_at` (lat, lon): the place whose east, north and up the axes are, where it is another one.
+    """
     centre = ecef_from_geodetic(np.array([origin]))
-    return (ecef_from_geodetic(geodetic) - centre) @ enu_axes(origin[0], origin[1]).T
+    return (ecef_from_geodetic(geodetic) - centre) @ enu_axes(*(level_at or origin[:2])).T
 
 
-def geodetic_from_enu(enu: np.ndarray, origin: tuple[float, float, float]) -> np.ndarray:
+def geodetic_from_enu(
+    enu: np.ndarray, origin: tuple[float, float, float], level_at: tuple[float, float] | None = None
+) -> np.ndarray:
     """The inverse of `enu_from_geodetic`."""
     centre = ecef_from_geodetic(np.array([origin]))
-    return geodetic_from_ecef(enu @ enu_axes(origin[0], origin[1]) + centre)
+    return geodetic_from_ecef(enu @ enu_axes(*(level_at or origin[:2])) + centre)

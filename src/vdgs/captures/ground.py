@@ -123,9 +123,9 @@ def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFram
 def _shifted(frame: GroundFrame, shift: np.ndarray, how: str) -> GroundFrame:
     """The frame with its origin moved; the axes stay those of the first origin."""
     assert frame.origin_geo is not None
-    moved = geodetic_from_enu(-shift[None], frame.origin_geo)[0]
+    moved = geodetic_from_enu(-shift[None], frame.origin_geo, frame.level_at)[0]
     origin = (float(moved[0]), float(moved[1]), float(moved[2]))
-    return replace(frame, translation=frame.translation + shift, how=how, origin_geo=origin)
+    return replace(frame, translation=frame.translation + shift, how=how, origin_geo=origin, axes_geo=frame.level_at)
 
 
 def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | None:

@@ -25,6 +25,7 @@ EXTRAS = {
     "synth": "the generated city, ray-traced (vdgs synth)",
     "lpips": "the linear heads of LPIPS",
     "tensorboard": "curves of the training in TensorBoard",
+    "geo": "maps as GeoTIFFs, any EPSG system (vdgs map)",
     "gsplat": "another rasteriser on an NVIDIA GPU, to compare with",
     "test": "the test suite",
 }

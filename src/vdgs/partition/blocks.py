@@ -75,17 +75,15 @@ def save_blocks(path: Path, blocks: Blocks, facts: Sequence[dict[str, Any]]) -> 
 def save_blocks_wgs84(path: Path, blocks: Blocks, facts: Sequence[dict[str, Any]], ground: GroundFrame) -> None:
     """The same in longitude, latitude (RFC 7946), for maps: every corner at the height of the ground frame's origin.
 
-    Longitudes run on past 180 degrees where a scene lies across the antimeridian. The axes of the ground frame are
-    taken for east and north at its origin. In a frame whose origin was moved (captures/ground.py) they are of the
-    first origin: at middle latitudes that turns the map by a metre in a kilometre for every six kilometres moved.
+    Longitudes run on past 180 degrees where a scene lies across the antimeridian.
     Raises ValueError if the frame is not georeferenced.
     """
     if ground.origin_geo is None:
         raise ValueError(f"the ground frame ({ground.how}) is not georeferenced: blocks have no longitude")
-    origin = ground.origin_geo
+    origin, level_at = ground.origin_geo, ground.level_at
 
     def on_earth(shape: shapely.Polygon) -> shapely.Polygon:
-        turned = shapely.transform(shape, lambda places: _longitude_latitude(places, origin))
+        turned = shapely.transform(shape, lambda places: _longitude_latitude(places, origin, level_at))
         return shapely.orient_polygons(turned)
 
     turned = Blocks(tuple(Block(on_earth(block.core), on_earth(block.expanded)) for block in blocks.items))
@@ -93,10 +91,11 @@ def save_blocks_wgs84(path: Path, blocks: Blocks, facts: Sequence[dict[str, Any]
 
 
 def _longitude_latitude(
-    places: Float[np.ndarray, "n 2"], origin: tuple[float, float, float]
+    places: Float[np.ndarray, "n 2"], origin: tuple[float, float, float], level_at: tuple[float, float]
 ) -> Float[np.ndarray, "n 2"]:
-    """Degrees of places east and north of `origin` (lat deg, lon deg, alt m), at its height."""
-    geodetic = geodetic_from_enu(np.column_stack([places, np.zeros(len(places))]), origin)
+    """Degrees of places east and north of `origin` (lat deg, lon deg, alt m), at its height; the axes are east and
+    north at `level_at` (lat deg, lon deg)."""
+    geodetic = geodetic_from_enu(np.column_stack([places, np.zeros(len(places))]), origin, level_at)
     longitude = geodetic[:, 1]
     return np.column_stack([longitude + 360 * np.round((origin[1] - longitude) / 360), geodetic[:, 0]])
 

@@ -85,3 +85,27 @@ class RenderRequest:
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
+
+
+@dataclass(frozen=True)
+class MapRequest:
+    """Maps of a run as GeoTIFFs and pictures (`vdgs map`)."""
+
+    run: Path
+    """Run folder."""
+    output: Path | None = None
+    """Folder for the maps; by default RUN/maps."""
+    gsd: float | None = None
+    """Side of a pixel in units of the map (metres, mostly); by default the median that a pixel of the training
+    photographs shows of the ground, at the size at which they were used."""
+    bbox: tuple[float, float, float, float] | None = None
+    """X0 Y0 X1 Y1 in coordinates of the map; by default what the training photographs show."""
+    crs: str | None = None
+    """Coordinates of the map: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source` (those
+    of the capture) or `local` (the ground frame). By default the UTM zone of a georeferenced capture, else `local`."""
+    model: ModelName = "best"
+    """Which model; `best` is the merged one where there is one."""
+    threads: int = 0
+    """Threads of the kernels; 0 for all cores."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""

@@ -10,12 +10,14 @@ import os
 from vdgs.verbs.benching import bench
 from vdgs.verbs.captures import inspect, synth
 from vdgs.verbs.machine import doctor
+from vdgs.verbs.mapping import map
 from vdgs.verbs.results import eval, render, report, status
 from vdgs.verbs.stages import merge, partition, train, visibility
 from vdgs.verbs.starting import coarse, run
 
 __all__ = [
-    "bench", "coarse", "doctor", "eval", "inspect", "merge", "partition", "render", "report", "run", "status", "synth",
+    "bench", "coarse", "doctor", "eval", "inspect", "map", "merge", "partition", "render", "report", "run", "status",
+    "synth",
     "train", "visibility",
 ]  # fmt: skip
 

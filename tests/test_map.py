@@ -1,0 +1,304 @@
+"""Maps: every pixel where it says it is, heights of surfaces and of nothing between, files whole or absent."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections import namedtuple
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from captures_support import look_down
+from merging_support import model_at, opaque_plane
+from vdgs.cameras import Camera
+from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.errors import VdgsError
+from vdgs.maps import mapping, tiles
+from vdgs.maps.grid import Grid, extent_of, grid_over, ground_sampling
+from vdgs.maps.pictures import hillshade, round_length
+from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Surveyor, samples_for
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.render import render
+from vdgs.placing.placement import Placement
+from vdgs.settings.requests import MapRequest
+
+rasterio = pytest.importorskip("rasterio")
+pytest.importorskip("pyproj")
+
+#: Far from the middle of its zone: grid north is 1.1 degrees off.
+PLACE = (46.95, 7.44, 560.0)
+SPACING, ROOF = 0.25, 5.0
+#: Where the house stands, in the ground frame: x0, y0, x1, y1.
+HOUSE = (2.0, -3.0, 6.0, 1.0)
+
+
+def surface(x0: float, y0: float, x1: float, y1: float, z: float) -> np.ndarray:
+    x, y = np.meshgrid(np.arange(x0 + SPACING / 2, x1, SPACING), np.arange(y0 + SPACING / 2, y1, SPACING))
+    # Not quite level: which of two splats at one depth comes first is a matter of rounding.
+    return np.column_stack([x.ravel(), y.ravel(), z + np.random.default_rng(0).uniform(-0.02, 0.02, x.size)])
+
+
+def model_of(places: np.ndarray) -> AnchorModel:
+    """Opaque splats at these places, each of its own colour, flat enough that roofs stay roofs."""
+    plane = opaque_plane(spacing=SPACING)
+    anchors = model_at(places).anchors
+    anchors = replace(
+        anchors,
+        offsets=torch.zeros_like(anchors.offsets),
+        log_scales=torch.full_like(anchors.log_scales, float(np.log(SPACING))),
+    )
+    return replace(plane, anchors=anchors)
+
+
+GROUND, TOP = surface(-10, -10, 10, 10, 0.0), surface(*HOUSE, ROOF)
+
+
+def capture_of(points: np.ndarray, origin: tuple[float, float, float] | None = PLACE, flying: float = 20.0) -> Capture:
+    """Cameras in a row over the scene, looking down; the sparse points as given."""
+    views = []
+    for number, x in enumerate((-6.0, -2.0, 2.0, 6.0)):
+        camera = Camera(look_down(np.array([x, 0.0, flying]), 5.0, 90.0), 80.0, 80.0, 32.0, 24.0, 64, 48)
+        views.append(View(f"{number}.png", camera, Path("images") / f"{number}.png", None, "train"))
+    ground = GroundFrame(1.0, np.eye(3), np.zeros(3), True, "hand-made", origin)
+    return Capture(
+        Path("place"), "colmap", "images", tuple(views), points, np.zeros((len(points), 3), np.uint8), ground
+    )
+
+
+@pytest.fixture
+def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """`vdgs map` of a model and a capture that were never trained; returns the folder of the maps."""
+
+    def run(capture: Capture, model: AnchorModel, **asked) -> Path:
+        folder = SimpleNamespace(path=tmp_path / "run")
+        opened = SimpleNamespace(folder=folder, capture=capture, model=model, name="coarse")
+        monkeypatch.setattr(mapping, "open_run", lambda *_: opened)
+        request = MapRequest(tmp_path / "run", device="cpu", **asked)
+        return mapping.map_run(request, Console(file=sys.stderr, soft_wrap=True))
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def house() -> tuple[Capture, AnchorModel]:
+    places = np.concatenate([GROUND, TOP])
+    return capture_of(places), model_of(places)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:2056", "enu", "local", "source"])
+@pytest.mark.parametrize("away", [(0.0, 0.0), (900.0, -700.0)])
+def test_every_place_falls_on_its_pixel_to_a_tenth(crs, away):
+    """Through the camera that draws a tile, against the exact coordinates; 512 pixels of 4 cm, and 5 m high things."""
+    centre = np.array([*away, 0.0])
+    places = centre + np.random.default_rng(1).uniform(-1, 1, (200, 3)) * (10, 10, 5)
+    capture = capture_of(places)
+    placement = Placement.of(capture.ground, crs)
+    exact = placement.places(places)
+    x, y = placement.places(centre[None])[0, :2]
+    grid = Grid(float(x) - 10.24, float(y) + 10.24, 0.04, 512, 512)
+    pixels, _ = Surveyor.of(model_of(places), capture, placement).camera(grid).project(places)
+    expected = np.stack([(exact[:, 0] - grid.left) / grid.gsd, (grid.top - exact[:, 1]) / grid.gsd], axis=1)
+    assert np.abs(pixels - expected).max() < 0.1
+
+
+def test_files_open_at_the_right_place_with_the_right_heights(house, make):
+    capture, model = house
+    folder = make(capture, model, gsd=0.1)
+    corners = np.array([[HOUSE[0], HOUSE[1], ROOF], [HOUSE[2], HOUSE[3], ROOF]])
+    easting, northing, height = Placement.of(capture.ground).places(corners.mean(axis=0, keepdims=True))[0]
+    with rasterio.open(folder / "dsm.tif") as file:
+        assert file.crs.to_epsg() == 32632
+        heights = file.read(1)
+        roof = np.argwhere(heights > height - ROOF / 2)
+        middle = file.xy(*roof.T)
+    # To a tenth of a pixel: the middle of a roof of 1600 pixels.
+    assert np.mean(middle[0]) == pytest.approx(easting, abs=0.01)
+    assert np.mean(middle[1]) == pytest.approx(northing, abs=0.01)
+    assert np.median(heights[tuple(roof.T)]) == pytest.approx(height, abs=0.02)
+    # What a photograph shows in some pixel is there in the map.
+    camera = capture.views[2].camera
+    depth = render(model, camera, depth=True).median_depth
+    place = Placement.of(capture.ground).places(camera.unproject(depth.numpy())[24, 32][None])[0]
+    with rasterio.open(folder / "dsm.tif") as file:
+        assert file.read(1)[file.index(*place[:2])] == pytest.approx(place[2], abs=0.05)
+
+
+def test_files_are_cloud_optimised_and_say_what_they_are(house, make):
+    folder = make(*house, gsd=0.03)
+    names = {file.name for file in folder.iterdir()}
+    assert names == {"orthophoto.tif", "dsm.tif", "visibility.tif", "hillshade.png", "preview.png", "map.json"}
+    layers = {"orthophoto": (4, "uint8", None), "dsm": (1, "float32", NO_HEIGHT), "visibility": (1, "uint16", NO_COUNT)}
+    for name, (count, dtype, nodata) in layers.items():
+        with rasterio.open(folder / f"{name}.tif") as file:
+            assert (file.count, file.dtypes[0], file.nodata) == (count, dtype, nodata)
+            structure = file.tags(ns="IMAGE_STRUCTURE")
+            assert (structure["LAYOUT"], structure["COMPRESSION"]) == ("COG", "DEFLATE")
+            assert structure["PREDICTOR"] == ("3" if dtype == "float32" else "2")
+            assert file.overviews(1)
+            assert "ellipsoidal" in file.tags()["HEIGHTS"]
+            assert file.tags()["MODEL"] == "coarse"
+    with rasterio.open(folder / "dsm.tif") as file:
+        assert file.units == ("m",)
+        assert "ellipsoidal" in file.descriptions[0]
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_walls_do_not_smear(house, samples):
+    """No pixel has a height between ground and roof: not at an edge, not where samples are put together."""
+    capture, model = house
+    surveyor = Surveyor.of(model, capture, Placement.of(capture.ground, "local"), samples)
+    tile = surveyor.tile(Grid(-4.0, 5.0, 0.1, 130, 100))
+    heights = tile.heights[tile.alpha > 0]
+    assert tile.alpha.mean() > 250
+    between = (heights > 0.2) & (heights < ROOF - 0.2)
+    assert between.mean() < 0.001
+    roof = np.count_nonzero(heights > ROOF / 2) * 0.01
+    assert roof == pytest.approx((HOUSE[2] - HOUSE[0]) * (HOUSE[3] - HOUSE[1]), rel=0.15)
+
+
+def test_tiles_show_what_one_picture_shows(house):
+    capture, model = house
+    surveyor = Surveyor.of(model, capture, Placement.of(capture.ground))
+    x0, y0, x1, y1 = extent_of(capture, surveyor.placement)
+    grid = grid_over((x0, y0, x1, y1), 0.2)
+    whole = surveyor.tile(grid)
+    for column, row, part in grid.tiles(40):
+        tile = surveyor.tile(part)
+        at = np.s_[row : row + part.height, column : column + part.width]
+        # Grid north turns by a millionth from tile to tile; what lies between two splats may fall to the other.
+        assert (np.abs(tile.colours.astype(int) - whole.colours[at]) <= 3).mean() > 0.995
+        assert (np.abs(tile.heights - whole.heights[at]) < 0.01).mean() > 0.995
+        assert (tile.visibility == whole.visibility[at]).mean() > 0.995
+
+
+def test_visibility_counts_cameras_and_what_none_sees_is_blank(house):
+    capture, model = house
+    surveyor = Surveyor.of(model, capture, Placement.of(capture.ground, "local"))
+    grid = Grid(-10.0, 10.0, 0.25, 80, 80)
+    tile = surveyor.tile(grid)
+    x, y = np.meshgrid(grid.left + (np.arange(80) + 0.5) * 0.25, grid.top - (np.arange(80) + 0.5) * 0.25)
+    shown = tile.alpha > 0
+    places = np.stack([x[shown], y[shown], tile.heights[shown]], axis=1)
+    count = sum(view.camera.sees(places).astype(int) for view in capture.train_views)
+    assert (tile.visibility[shown] == count).mean() > 0.999
+    assert tile.visibility[shown].min() >= 1
+    assert not shown.all()  # beyond all pictures, though the model is opaque there
+    assert set(np.unique(tile.visibility[~shown])) == {NO_COUNT}
+    assert set(np.unique(tile.heights[~shown])) == {np.float32(NO_HEIGHT)}
+
+
+def test_what_hangs_as_high_as_cameras_is_not_in_the_map_and_a_tower_is():
+    veil, tower = surface(-3, -3, 0, 0, 21.0), surface(4, 4, 6, 6, 24.0)
+    # The tower has sparse points, as what is solid has; the veil has none.
+    capture = capture_of(np.concatenate([GROUND, TOP, tower]))
+    model = model_of(np.concatenate([GROUND, TOP, tower, veil]))
+    tower_seen = replace(capture, views=(*capture.views, replace(capture.views[0], camera=_above(5.0, 5.0, 60.0))))
+    surveyor = Surveyor.of(model, tower_seen, Placement.of(capture.ground, "local"))
+    grid = Grid(-3.0, 6.5, 0.25, 40, 40)
+    heights = surveyor.tile(grid).heights
+    assert heights.max() == pytest.approx(24.0, abs=0.1)
+    low = Surveyor.of(model, capture, Placement.of(capture.ground, "local")).tile(Grid(-3.0, 0.0, 0.25, 12, 12))
+    assert low.heights[low.alpha > 0].max() < 1.0
+
+
+def _above(x: float, y: float, z: float) -> Camera:
+    return Camera(look_down(np.array([x, y, z])), 80.0, 80.0, 32.0, 24.0, 64, 48)
+
+
+def test_a_capture_without_georeference_has_a_map_that_says_so(house, make, capsys):
+    capture, model = house
+    folder = make(replace(capture, ground=replace(capture.ground, origin_geo=None, metric=False)), model, gsd=0.2)
+    assert "units without known size" in capsys.readouterr().err
+    with rasterio.open(folder / "dsm.tif") as file:
+        assert file.crs.to_epsg() is None
+        assert "local units" in file.crs.to_wkt()
+        assert file.units == ("units",)
+        assert "units without known size" in file.tags()["CRS_NAME"]
+        assert file.read(1).max() == pytest.approx(ROOF, abs=0.05)
+        assert file.bounds.left < -6
+
+
+def test_without_options_pixels_are_those_of_the_photographs(house, make):
+    capture, model = house
+    assert ground_sampling(capture, 1.0) == pytest.approx(20 / 80, rel=0.1)
+    with rasterio.open(make(capture, model) / "orthophoto.tif") as file:
+        assert file.res[0] == pytest.approx(0.25, rel=0.1)
+    assert [samples_for(gsd, 0.1) for gsd in (0.02, 0.1, 0.3, 5.0)] == [1, 1, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"gsd": 0.0}, "--gsd 0.0: a pixel needs a size"),
+        ({"gsd": float("nan")}, "--gsd nan"),
+        ({"bbox": (5.0, 0.0, 1.0, 3.0)}, "--bbox 5 0 1 3: must be"),
+        ({"gsd": 1e-6}, r"more than 1e\+10\. Give --gsd 0\.00018 or larger"),
+        (
+            {"bbox": (0.0, 0.0, 10.0, 10.0), "gsd": 0.5},
+            "0 0 10 10: lies beside the scene, which spans 3812",
+        ),
+        ({"crs": "EPSG:4978"}, "does not point up"),
+        ({"crs": "EPSG:4326"}, "degrees"),
+        ({"crs": "EPSG:3857", "gsd": 0.02}, "stretches north and east unlike"),
+    ],
+)
+def test_what_makes_no_map_is_refused_and_leaves_nothing(house, make, tmp_path, asked, message):
+    with pytest.raises(VdgsError, match=message):
+        make(*house, **asked)
+    assert not (tmp_path / "run" / "maps").exists()
+
+
+def test_a_disk_without_room_is_named_before_anything_is_drawn(house, make, monkeypatch):
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 9, 1))
+    monkeypatch.setattr(tiles.Surveyor, "tile", lambda *_: pytest.fail("drawn"))
+    with pytest.raises(VdgsError, match=r"0 MB are free\. Give a larger --gsd"):
+        make(*house, gsd=0.2)
+
+
+def test_a_map_that_fails_leaves_the_old_one_whole(house, make, monkeypatch):
+    folder = make(*house, gsd=0.5)
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(mapping, "preview_png", full)
+    with pytest.raises(VdgsError, match=r"No space left on device.*maps that were there are kept"):
+        make(*house, gsd=0.4)
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+
+
+def test_without_rasterio_the_remedy_is_named(house, make, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    with pytest.raises(VdgsError, match=r"pip install 'vdgs\[geo\]'"):
+        make(*house)
+
+
+def test_lines_of_a_grid_are_at_multiples_of_its_pixels():
+    grid = grid_over((100.03, 50.0, 101.97, 51.0), 0.1)
+    np.testing.assert_allclose(grid.bounds, (100.0, 50.0, 102.0, 51.0), atol=1e-9)
+    assert (grid.width, grid.height, grid.tile_count(8)) == (20, 10, 6)
+    assert sum(part.width * part.height for _, _, part in grid.tiles(8)) == 200
+
+
+def test_light_of_a_hillshade():
+    x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
+    assert hillshade(np.zeros((5, 5)), 1.0) == pytest.approx(np.sin(np.pi / 4))
+    # Rising to the south-east, a slope looks at the sun in the north-west; the same in pixels of another size.
+    facing, away = hillshade(0.3 * (x + y), 1.0), hillshade(-0.3 * (x + y), 1.0)
+    assert facing.min() > 0.9 > 0.5 > away.max()
+    np.testing.assert_allclose(hillshade(0.6 * (x + y), 2.0), facing)
+    holed = np.where((x > 5) & (x < 9), np.nan, 0.0)
+    assert np.isnan(hillshade(holed, 1.0)).sum() == np.isnan(holed).sum()
+
+
+@pytest.mark.parametrize(("about", "length"), [(10.0, 10.0), (9.9, 5.0), (0.23, 0.2), (499.0, 200.0)])
+def test_scale_bars_are_round(about, length):
+    assert round_length(about) == pytest.approx(length)

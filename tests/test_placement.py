@@ -1,0 +1,151 @@
+"""Coordinates on the map: exact, invertible, with the right north, and refused where nobody knows them."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from vdgs.captures.capture import GroundFrame
+from vdgs.captures.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_enu
+from vdgs.errors import VdgsError
+from vdgs.placing.placement import Placement
+
+pyproj = pytest.importorskip("pyproj")
+
+BERN = (46.95, 7.44, 560.0)
+
+
+def frame(origin=BERN, axes=None, metric=True):
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    return GroundFrame(2.0, turn, np.array([3.0, -4, 5]), metric, "GPS", origin, axes)
+
+
+def scattered(count=50, reach=(900.0, 700.0, 60.0), seed=3):
+    return np.random.default_rng(seed).uniform(-1, 1, (count, 3)) * reach
+
+
+SYSTEMS = [None, "enu", "source", "local", "EPSG:2056", "EPSG:25832", "epsg:4978", "EPSG:32632", "EPSG:3857"]
+
+
+@pytest.mark.parametrize("crs", SYSTEMS)
+def test_there_and_back_to_a_micrometre(crs):
+    placement = Placement.of(frame(), crs)
+    points = scattered()
+    np.testing.assert_allclose(placement.to_ground(placement.places(points)), points, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("origin", [BERN, (-33.9, -70.6, 900.0), (64.1, -21.9, 20.0), (-17.0, 179.9999, 5.0)])
+def test_the_default_is_the_utm_zone_as_pyproj_has_it(origin):
+    placement = Placement.of(frame(origin))
+    zone = int((origin[1] + 180) // 6) + 1
+    assert placement.crs == f"EPSG:{(32600 if origin[0] > 0 else 32700) + zone}"
+    assert (placement.unit, placement.metres) == ("m", 1.0)
+    points = scattered()
+    latitude, longitude, height = geodetic_from_enu(points, origin).T
+    x, y = pyproj.Proj(placement.crs)(longitude, latitude)
+    np.testing.assert_allclose(placement.places(points), np.stack([x, y, height], axis=1), rtol=0, atol=1e-6)
+    assert pyproj.CRS.from_wkt(placement.wkt).to_epsg() == int(placement.crs[5:])
+
+
+def test_a_local_similarity_turns_by_the_meridian_convergence_and_scales_by_the_map():
+    placement = Placement.of(frame())
+    centre = np.array([350.0, -200.0, 10.0])
+    scale, rotation, _ = placement.similarity_at(centre)
+    latitude, longitude, height = geodetic_from_enu(centre[None], BERN)[0]
+    factors = pyproj.Proj(placement.crs).get_factors(longitude, latitude)
+    turned = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
+    # The ground frame's north is that of its origin; meridians run together on the way to the centre.
+    between = (longitude - BERN[1]) * np.sin(np.radians(latitude))
+    assert turned == pytest.approx(factors.meridian_convergence - between, abs=1e-4)
+    assert abs(turned) > 1
+    above = 1 / (1 + height / 6.385e6)  # metres up here are longer than those of the ellipsoid
+    assert scale == pytest.approx(factors.meridional_scale * above, abs=2e-6)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("crs", SYSTEMS[:-1])  # Web Mercator stretches north more than east: no similarity does that
+def test_a_local_similarity_keeps_to_the_map_over_a_hundred_metres(crs):
+    placement = Placement.of(frame(), crs)
+    centre = np.array([600.0, 500.0, -20.0])
+    near = centre + scattered(reach=(50.0, 50.0, 20.0))
+    found = placement.similarity_at(centre).apply(near)
+    off = np.abs(found - placement.places(near))
+    assert off[:, :2].max() < 1e-3  # on a map of 10 cm a pixel: a hundredth of one
+    assert off[:, 2].max() < 0.02
+
+
+def test_a_moved_frame_keeps_its_axes_and_its_place_on_earth():
+    """The same photographs about an origin 30 km away: every point lands where it did."""
+    first = frame()
+    shift = np.array([25_000.0, -17_000.0, 120.0])
+    moved = frame(tuple(geodetic_from_enu(shift[None], BERN)[0]), axes=BERN[:2])
+    points = scattered()
+    for crs in ("EPSG:32632", "EPSG:4978"):
+        np.testing.assert_allclose(
+            Placement.of(moved, crs).places(points - shift), Placement.of(first, crs).places(points), rtol=0, atol=1e-5
+        )
+    # enu is level at the frame's own origin, whatever its axes are.
+    rising = Placement.of(moved, "enu").places(np.array([[0.0, 0, 0], [0, 0, 1]]))
+    np.testing.assert_allclose(rising[0], 0, atol=1e-9)
+    assert np.degrees(np.arccos(rising[1, 2])) == pytest.approx(np.degrees(np.hypot(25, 17) / 6378), rel=0.02)
+
+
+def test_source_is_the_world_of_the_capture():
+    ground, points = frame(), scattered()
+    np.testing.assert_allclose(Placement.of(ground, "source").places(ground.to_ground(points)), points, atol=1e-9)
+
+
+def test_geocentric_places_are_those_of_geodesy():
+    points = scattered()
+    expected = points @ enu_axes(*BERN[:2]) + ecef_from_geodetic(np.array([BERN]))
+    np.testing.assert_allclose(Placement.of(frame(), "EPSG:4978").places(points), expected, rtol=0, atol=1e-6)
+
+
+def test_feet_are_feet_up_as_across():
+    ground = frame((40.7, -73.9, 10.0))
+    feet, metres = Placement.of(ground, "EPSG:2263"), Placement.of(ground)
+    assert feet.unit == "US survey foot"
+    up = np.array([[0.0, 0, 0], [0, 0, 30]])
+    rise = np.diff(feet.places(up)[:, 2])[0] * feet.metres
+    assert rise == pytest.approx(np.diff(metres.places(up)[:, 2])[0], abs=1e-6)
+    assert "foot" in feet.heights
+
+
+def test_what_a_place_outside_the_area_of_a_system_gets_is_a_note():
+    assert any("outside" in note for note in Placement.of(frame(), "EPSG:32611").notes)
+    assert Placement.of(frame(), "EPSG:32632").notes == ()
+
+
+@pytest.mark.parametrize(
+    ("crs", "message"),
+    [
+        ("EPSG:4326", "degrees"),
+        ("EPSG:999999", "not in the EPSG catalogue"),
+        ("utm", "no coordinate system known here.*enu"),
+        ("EPSG:", "not in the EPSG catalogue"),
+        ("EPSG:32632+3855", r"heights .*EGM2008 height.*without heights, EPSG:32632"),
+        ("EPSG:5703", "degrees, or heights alone"),
+    ],
+)
+def test_systems_that_make_no_map_are_named(crs, message):
+    with pytest.raises(VdgsError, match=message):
+        Placement.of(frame(), crs)
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_without_a_georeference_there_is_the_ground_frame_and_the_source(metric):
+    ground = frame(None, metric=metric)
+    local = Placement.of(ground)
+    assert (local.crs, local.unit, local.wkt) == ("local", "m" if metric else "units", None)
+    np.testing.assert_array_equal(local.places(scattered()), scattered())
+    assert Placement.of(ground, "source").crs == "source"
+    for crs in ("enu", "EPSG:32632"):
+        with pytest.raises(VdgsError, match=r"not georeferenced.*--crs local"):
+            Placement.of(ground, crs)
+
+
+def test_without_pyproj_the_remedy_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    with pytest.raises(VdgsError, match=r"pip install 'vdgs\[geo\]'"):
+        Placement.of(frame(), "EPSG:32632")
+    assert Placement.of(frame(), "enu").unit == "m"
