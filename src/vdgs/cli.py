@@ -27,6 +27,7 @@ its stages, one by one:
 more:
   render RUN                        views or a camera path, as PNG or video
   map RUN                           orthophoto, surface model and visibility as GeoTIFFs
+  export RUN --to FILE              the scene for other programs: PLY, SPZ, SOG, glTF, 3D Tiles, LAZ
   synth OUTPUT                      generate a small aerial town with known truth
   bench TABLE --output FOLDER       methods x scenes x seeds: the paper's tables, a figure and a verdict
   doctor                            what this machine can use, and what to install for the rest
@@ -37,8 +38,7 @@ transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of Matri
 
 VERBS = (
     "inspect", "run", "status", "coarse", "visibility", "partition", "train", "merge", "eval", "report", "render",
-    "map",
-    "synth", "bench", "doctor",
+    "map", "export", "synth", "bench", "doctor",
 )  # fmt: skip
 #: Verbs that take up what they left when they were interrupted.
 CONTINUES = ("run", "coarse", "train", "bench")

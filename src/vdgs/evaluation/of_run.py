@@ -53,7 +53,7 @@ def evaluate_run(
         key=run.key,
     )
     chosen = run.capture.test_views if views == "test" else run.capture.train_views
-    coarse = _coarse(run)
+    coarse = coarse_of(run)
     model = MeasuredModel(
         lambda camera: render(run.model, camera),
         visibility_map(coarse),
@@ -110,7 +110,8 @@ def seen_by_run(coarse: TrainedRun) -> Callable[[Camera], Bool[np.ndarray, "h w"
     return seen_map(lambda camera: render(coarse.model, camera, depth=True), cameras)
 
 
-def _coarse(run: TrainedRun) -> TrainedRun:
+def coarse_of(run: TrainedRun) -> TrainedRun:
+    """The run with its coarse model, whichever it was opened with."""
     if run.name == "coarse":
         return run
     return replace(run, model=AnchorModel.load(run.folder.coarse.model).to(run.device), name="coarse")

@@ -109,3 +109,35 @@ class MapRequest:
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """A scene as files of Gaussians or points for other programs (`vdgs export`)."""
+
+    run: Path
+    """Run folder."""
+    to: tuple[Path, ...] = ()
+    """A file to write, by its ending: .ply (3DGS), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles),
+    .points.ply, .laz, .las (point clouds). Give --to again for more: the scene is baked once (docs/export.md)."""
+    model: ModelName = "best"
+    """Which model; `best` is the merged one where there is one."""
+    block: int | None = None
+    """Only what this block of the merged scene owns."""
+    bbox: tuple[float, float, float, float] | None = None
+    """Only Gaussians whose centres lie within X0 Y0 X1 Y1, in coordinates of --crs."""
+    max_gaussians: int = 0
+    """Only so many Gaussians, those that make most of the training photographs; 0 for all."""
+    sh_degree: Literal[0, 1, 2, 3] = 3
+    """How colours change with the direction: spherical harmonics up to this degree. 0: not at all, and a fifth of the
+    size."""
+    crs: str | None = None
+    """Coordinates of the files: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source`
+    (those of the capture) or `local` (the ground frame). By default `enu` where the capture is georeferenced, and UTM
+    for .laz and .las; else `local`."""
+    measure: bool = True
+    """Read a file back, draw the test views and say what was lost against the model itself."""
+    threads: int = 0
+    """Threads of the kernels; 0 for all cores."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""

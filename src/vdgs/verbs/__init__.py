@@ -9,6 +9,7 @@ import os
 
 from vdgs.verbs.benching import bench
 from vdgs.verbs.captures import inspect, synth
+from vdgs.verbs.exporting import export
 from vdgs.verbs.machine import doctor
 from vdgs.verbs.mapping import map
 from vdgs.verbs.results import eval, render, report, status
@@ -16,9 +17,8 @@ from vdgs.verbs.stages import merge, partition, train, visibility
 from vdgs.verbs.starting import coarse, run
 
 __all__ = [
-    "bench", "coarse", "doctor", "eval", "inspect", "map", "merge", "partition", "render", "report", "run", "status",
-    "synth",
-    "train", "visibility",
+    "bench", "coarse", "doctor", "eval", "export", "inspect", "map", "merge", "partition", "render", "report", "run",
+    "status", "synth", "train", "visibility",
 ]  # fmt: skip
 
 # torch's OpenMP threads must block, not spin, beside the kernels' own pool; read once, when torch is imported.

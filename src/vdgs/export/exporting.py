@@ -1,0 +1,228 @@
+"""`vdgs export`: a run's scene baked once, and written into as many files as were asked for."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int
+from rich.console import Console
+from rich.progress import Progress
+
+from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
+from vdgs.errors import VdgsError
+from vdgs.export.baking import Survey, bake, survey
+from vdgs.export.formats import registry
+from vdgs.export.formats.scene import ROWS, Scene
+from vdgs.export.formats.spool import Spooled, spooled
+from vdgs.export.frame import Frame, frame_of, usual_crs
+from vdgs.export.loss import loss_of
+from vdgs.model.gaussians import Gaussians
+from vdgs.model.world import places
+from vdgs.placing.placement import Placement
+from vdgs.runs.opening import TrainedRun, open_run
+from vdgs.settings.requests import ExportRequest
+from vdgs.storage.files import jsonable, write_json
+from vdgs.watching.interrupts import stop_if_asked
+
+#: What was written and lost, beside the run's other results.
+RECORD = "export.json"
+
+
+@dataclass(frozen=True, eq=False)
+class _Baked:
+    """The Gaussians of a scene on the disk, in the ground frame."""
+
+    spool: Spooled
+    degree: int
+
+    def scene(self, frame: Frame) -> Scene:
+        """What a writer is given."""
+        count = len(self.spool.means)
+        corners = frame.scale * self.spool.means.astype(np.float64) @ frame.rotation.T + frame.translation
+        low, high = tuple(corners.min(axis=0).tolist()), tuple(corners.max(axis=0).tolist())
+        return Scene(self._chunks(frame, count), count, self.degree, frame.facts, (low, high))
+
+    def _chunks(self, frame: Frame, count: int) -> Iterator[Gaussians]:
+        for first in range(0, count, ROWS):
+            stop_if_asked()
+            yield frame.place(self.spool.rows(np.arange(first, min(first + ROWS, count))))
+
+    def whole(self) -> Gaussians:
+        """All of them in memory."""
+        return self.spool.rows(np.arange(len(self.spool.means)))
+
+
+def export_run(asked: ExportRequest, console: Console) -> dict[str, Any]:
+    """Write what was asked for, on a device that is chosen already; returns what RUN/export.json holds.
+
+    Raises VdgsError, before any Gaussian is baked, for file names of no format, outputs among a capture's inputs, an
+    empty choice, and coordinates that a format or the capture does not have.
+    """
+    _check_names(asked.to)
+    run = open_run(asked.run, asked.model, asked.device)
+    if run.caution:
+        console.print(f"[yellow]warning[/] {run.caution}", highlight=False)
+    for path in asked.to:
+        refuse_among_inputs(path, run.capture)
+    centre = np.median(run.model.anchors.positions.cpu().double().numpy(), axis=0)
+    frames = {path: frame_of(run.capture.ground, asked.crs or usual_crs(run.capture.ground, path), centre)
+              for path in asked.to}  # fmt: skip
+    began = time.monotonic()
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
+        seen = _surveyed(run, bar)
+        kept = chosen(seen, run, asked)
+        _check_scenes(frames, seen, kept, asked.sh_degree)
+        console.print(
+            f"{run.line}: {len(kept):,} Gaussians of {len(seen.pixels):,} are drawn by the training cameras"
+            + (" and asked for" if len(kept) < np.count_nonzero(seen.pixels) else ""),
+            highlight=False,
+        )
+        with _baked(seen, kept, asked.sh_degree, asked.to[0].parent, bar) as baked:
+            seconds = time.monotonic() - began
+            files = [_write(path, frames[path], baked, console) for path in asked.to]
+            loss = _loss(run, frames, baked, asked, bar, console)
+    record = jsonable({
+        "model": run.name, "key": run.key, "gaussians": len(kept), "sh_degree": asked.sh_degree,
+        "seconds_to_bake": seconds, "files": files, "loss": loss,
+    })  # fmt: skip
+    write_json(run.folder.path / RECORD, record)
+    return record
+
+
+def _check_names(paths: tuple[Path, ...]) -> None:
+    if not paths:
+        raise VdgsError("Nothing to write: give --to FILE, such as --to scene.ply.")
+    for path in paths:
+        registry.format_of(path)
+        refuse_in_a_capture(path)
+    twice = sorted({str(path) for path in paths if paths.count(path) > 1})
+    if twice:
+        raise VdgsError(f"--to {twice[0]}: is given twice.")
+
+
+def _surveyed(run: TrainedRun, bar: Progress) -> Survey:
+    cameras = [view.camera for view in run.capture.train_views]
+    task = bar.add_task("what the training cameras see", total=len(cameras))
+
+    def after_view() -> None:
+        stop_if_asked()
+        bar.advance(task)
+
+    return survey(run.model, cameras, after_view)
+
+
+def chosen(seen: Survey, run: TrainedRun, asked: ExportRequest) -> Int[np.ndarray, " m"]:
+    """The Gaussians to write, ascending: drawn by a training camera, of the block, within the box, most drawn first
+    where they are too many. Raises VdgsError where none is left."""
+    k = seen.model.anchors.offsets.shape[1]
+    wanted = seen.pixels > 0
+    if asked.block is not None:
+        wanted &= np.repeat(_of_block(run, asked.block), k)
+    if asked.bbox is not None:
+        x0, y0, x1, y1 = asked.bbox
+        if not (x0 < x1 and y0 < y1):
+            raise VdgsError(f"--bbox {x0:g} {y0:g} {x1:g} {y1:g}: is empty. Give X0 Y0 X1 Y1, the lower corner first.")
+        crs = asked.crs or usual_crs(run.capture.ground, asked.to[0])
+        inside = Placement.of(run.capture.ground, crs).places(
+            places(seen.model.anchors).cpu().double().reshape(-1, 3).numpy()
+        )
+        wanted &= (inside[:, :2] >= (x0, y0)).all(1) & (inside[:, :2] <= (x1, y1)).all(1)
+        if not wanted.any():
+            low, high = inside[seen.pixels > 0, :2].min(0), inside[seen.pixels > 0, :2].max(0)
+            raise VdgsError(
+                f"--bbox {x0:g} {y0:g} {x1:g} {y1:g}: holds nothing of the scene, which lies within "
+                f"{low[0]:.1f} {low[1]:.1f} {high[0]:.1f} {high[1]:.1f} of --crs {crs or 'UTM'}."
+            )
+    kept = np.flatnonzero(wanted)
+    if not len(kept):
+        raise VdgsError(f"{run.model_path}: no training camera draws anything of what was asked for.")
+    if 0 < asked.max_gaussians < len(kept):
+        most = np.argpartition(seen.pixels[kept], -asked.max_gaussians)[-asked.max_gaussians :]
+        kept = np.sort(kept[most])
+    return kept
+
+
+def _of_block(run: TrainedRun, block: int) -> np.ndarray:
+    """Which anchors of a merged model a block has made."""
+    counts = [part.count for part in run.model.parts]
+    if run.name != "merged" or not 0 <= block < len(counts):
+        have = f"has blocks 0 to {len(counts) - 1}" if counts else "is not made of blocks with decoders of their own"
+        raise VdgsError(f"--block {block}: the {run.name} model {have}.")
+    return np.repeat(np.arange(len(counts)) == block, counts)
+
+
+def _check_scenes(frames: dict[Path, Frame], seen: Survey, kept: np.ndarray, degree: int) -> None:
+    """What a format cannot hold is said before the work."""
+    means = places(seen.model.anchors).cpu().double().reshape(-1, 3).numpy()[kept]
+    for path, frame in frames.items():
+        local = frame.scale * means @ frame.rotation.T + frame.translation
+        low, high = tuple(local.min(axis=0).tolist()), tuple(local.max(axis=0).tolist())
+        registry.check(path, Scene((), len(kept), degree, frame.facts, (low, high)))
+
+
+@contextmanager
+def _baked(seen: Survey, kept: np.ndarray, degree: int, folder: Path, bar: Progress) -> Iterator[_Baked]:
+    """The Gaussians in a temporary file beside the first output."""
+    task = bar.add_task("fitting Gaussians", total=len(kept))
+
+    def after_part(done: int) -> None:
+        stop_if_asked()
+        bar.update(task, completed=done)
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".baking-") as temporary:
+        try:
+            spool = spooled(Scene(bake(seen, kept, degree, after_part), len(kept), degree), Path(temporary) / "spool")
+        except OSError as error:
+            raise VdgsError(
+                f"{folder}: cannot hold the scene ({error.strerror or error}). Nothing was written."
+            ) from error
+        yield _Baked(spool, degree)
+
+
+def _write(path: Path, frame: Frame, baked: _Baked, console: Console) -> dict[str, Any]:
+    began = time.monotonic()
+    lost = registry.write(path, baked.scene(frame))
+    seconds, size = time.monotonic() - began, _size(path)
+    console.print(f"{path}: {size / 1e6:,.1f} MB in {seconds:.1f} s", highlight=False)
+    for each in lost:
+        console.print(f"[yellow]note[/] {path.name}: {each}", highlight=False)
+    return {"file": str(path.resolve()), "bytes": size, "seconds": seconds, "notes": list(lost)}
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file, or of all the tiles about it."""
+    if registry.format_of(path).ending == registry.NAME:
+        return sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
+    return path.stat().st_size
+
+
+def _loss(
+    run: TrainedRun, frames: dict[Path, Frame], baked: _Baked, asked: ExportRequest, bar: Progress, console: Console
+) -> dict[str, Any] | None:
+    """What the first file that can be read back loses, or, where none can, the Gaussians that were written."""
+    if not asked.measure:
+        return None
+    readable = next((path for path in asked.to if registry.format_of(path).read), None)
+    gaussians = baked.whole() if readable is None else frames[readable].to_ground(registry.read(readable))
+    task = bar.add_task("comparing with the model", total=len(run.capture.test_views))
+
+    def after_view() -> None:
+        stop_if_asked()
+        bar.advance(task)
+
+    loss = loss_of(run, gaussians, after_view)
+    what = "as baked" if readable is None else f"{readable.name}, read back"
+    console.print(
+        f"{what}, on {loss.views} {loss.of} views: PSNR {loss.psnr:.2f} → {loss.psnr_baked:.2f} dB "
+        f"({loss.psnr_baked - loss.psnr:+.2f}), SSIM {loss.ssim:.3f} → {loss.ssim_baked:.3f}",
+        highlight=False,
+    )
+    return {"file": str(readable) if readable else None, **asdict(loss)}

@@ -1,0 +1,66 @@
+"""In which coordinates an exported scene stands: local ones about an origin that each file keeps in full precision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from vdgs.captures.capture import GroundFrame
+from vdgs.export.formats.scene import Facts
+from vdgs.model.gaussians import Gaussians
+from vdgs.model.similarity import transformed
+from vdgs.placing.placement import Placement
+
+#: Coordinates up to here (m or units) keep a millimetre in float32: they need no origin of their own.
+FAR = 10_000.0
+#: Origins are whole multiples of this, so that people can type them.
+ROUND = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """local = scale * rotation @ ground + translation, and what a file says of its local coordinates."""
+
+    scale: float
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+    facts: Facts
+
+    def place(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians of the ground frame in local coordinates."""
+        return transformed(gaussians, self.scale, self.rotation, self.translation)
+
+    def to_ground(self, gaussians: Gaussians) -> Gaussians:
+        """The inverse of `place`."""
+        back = self.rotation.T
+        return transformed(gaussians, 1 / self.scale, back, -back @ self.translation / self.scale)
+
+
+def frame_of(ground: GroundFrame, crs: str | None, centre: Float[np.ndarray, "3"]) -> Frame:
+    """The local coordinates of a system (`Placement.of`) about a scene whose middle is `centre` (ground frame).
+
+    Gaussians take the similarity that is right about the centre: over a kilometre a projection departs from it by
+    centimetres, mostly in height (the Earth is round). Raises VdgsError for a system that cannot be had.
+    """
+    placement = Placement.of(ground, crs)
+    similarity = placement.similarity_at(centre)
+    middle = similarity.apply(centre[None])[0]
+    origin = np.round(middle / ROUND) * ROUND if np.abs(middle).max() > FAR else np.zeros(3)
+    facts = Facts(
+        origin=(float(origin[0]), float(origin[1]), float(origin[2])),
+        crs=placement.wkt,
+        unit="metre" if placement.unit == "m" else placement.unit,
+        geodetic=ground.origin_geo if placement.crs == "enu" and not origin.any() else None,
+    )
+    return Frame(similarity.scale, similarity.rotation, similarity.origin - origin, facts)
+
+
+def usual_crs(ground: GroundFrame, path: Path) -> str | None:
+    """The system that people expect of a file: point clouds for maps in map coordinates, the globe for 3D Tiles,
+    east, north and up (or local coordinates, without a georeference) for what is only looked at."""
+    if path.suffix.lower() in (".laz", ".las"):
+        return None
+    return "local" if ground.origin_geo is None else "enu"
