@@ -83,6 +83,19 @@ def train_each(run: Path, *settings: str) -> None:
         assert done.returncode == 0, done.stderr
 
 
+def test_a_scene_goes_out_and_says_what_it_loses(copied, tmp_path):
+    scene = tmp_path / "out" / "scene.ply"
+    done = vdgs("export", copied, "--to", scene, "--to", tmp_path / "out" / "scene.splat")
+    assert done.returncode == 0, done.stderr
+    assert "scene.ply, read back, on" in done.stdout
+    loss = json.loads((copied / "export.json").read_text())["loss"]
+    measured = json.loads((copied / "evaluation" / "metrics.json").read_text())
+    assert loss["psnr"] == pytest.approx(measured["psnr"], abs=1e-6)
+    assert loss["ssim"] == pytest.approx(measured["ssim"], abs=1e-6)
+    assert abs(loss["psnr_baked"] - loss["psnr"]) < 0.5
+    assert {"psnr", "psnr_baked", "ssim_baked", "lower"} <= loss["by_visibility"][0].keys()
+
+
 def test_blocks_draw_parts_of_photographs_and_the_pixels_that_were_asked_for(unbroken, copied):
     """So many photographs' worth of pixels in more steps, or so many steps with fewer pixels: by the setting."""
     for index, folder in enumerate(RunFolder(unbroken).block_folders()):

@@ -26,7 +26,14 @@ DEPENDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 #: setting has it, keys do not mention it, so that a newer version takes older runs for finished, as they are.
 SINCE: dict[str, dict[str, Any]] = {
     "training": {"sampling": "even", "average": 0.0, "early": 1.0},
-    "block": {"sampling": "even", "decoder": "frozen", "average": 0.0, "crop": "off", "max_anchors_total": 0},
+    "block": {
+        "sampling": "even",
+        "decoder": "frozen",
+        "average": 0.0,
+        "crop": "off",
+        "max_anchors_total": 0,
+        "early": 1.0,
+    },
 }
 
 

@@ -13,6 +13,7 @@ def validate(config: MethodConfig) -> list[str]:
     block = config.block
     problems += [f"block.{each}" for each in _validate_growth(block.growth)]
     problems += [f"block.{each}" for each in _validate_resolutions(block.resolutions)]
+    problems += [f"block.{each}" for each in _validate_early(block.early)]
     problems += [f"block.{each}" for each in _validate_compensation(block.compensation)]
     if block.iterations < 0 or block.scale_iterations <= 0:
         problems.append("block.iterations must not be negative and block.scale_iterations must be positive")
@@ -48,6 +49,10 @@ def _validate_compensation(config: CompensationConfig) -> list[str]:
     if config.beta_g < 0 or config.cap < 0:
         return ["compensation.beta_g and cap must not be negative"]
     return []
+
+
+def _validate_early(early: float) -> list[str]:
+    return [] if early >= 1 else [f"early is {early}; it must be at least 1, which is Adam as it is"]
 
 
 def _validate_growth(growth: GrowthConfig) -> list[str]:
@@ -97,8 +102,7 @@ def _validate_training(config: TrainConfig) -> list[str]:
         problems.append(f"loss.ssim_weight is {config.loss.ssim_weight}; it lies between 0 and 1")
     if config.loss.alpha_weight < 0:
         problems.append(f"loss.alpha_weight is {config.loss.alpha_weight}; it must not be negative, and 0 is without")
-    if not config.early >= 1:
-        problems.append(f"early is {config.early}; it must be at least 1, which is Adam as it is")
+    problems += _validate_early(config.early)
     for rate in dataclasses.fields(config.rates):
         if min(getattr(config.rates, rate.name)) <= 0:
             problems.append(f"rates.{rate.name} must be positive")

@@ -151,9 +151,9 @@ class TrainConfig:
     rates: RateConfig = field(default_factory=RateConfig)
     """Learning rates."""
     early: float = 1.0
-    """Up to how many times faster an anchor moves while it has had few updates, here and in blocks: after u of them, by
-    the least of this and 1 / sqrt(1 - 0.999^u), which is 3 after 118 updates and 1.3 after 900 (choice: in short
-    trainings an anchor is seen a few hundred times; 1 is Adam as it is)."""
+    """Up to how many times faster an anchor moves while it has had few updates: after u of them, by the least of this
+    and 1 / sqrt(1 - 0.999^u), which is 3 after 118 updates and 1.3 after 900 (choice: in short trainings an anchor is
+    seen a few hundred times; 1 is Adam as it is)."""
     growth: GrowthConfig = field(default_factory=GrowthConfig)
     """Growth and pruning of anchors."""
     loss: LossConfig = field(default_factory=LossConfig)
@@ -232,6 +232,8 @@ class BlockConfig:
     """... and those of log-scales times this."""
     feature_rate: float = 1.0
     """... and those of features times this (choice; 1 is the paper's)."""
+    early: float = 1.0
+    """As `early` of the coarse stage, for the block's own updates: its anchors begin trained."""
     background_noise: float = 0.0
     """As in the loss of the coarse stage, but for blocks: there the ground is opaque already (choice)."""
     decoder: Literal["frozen", "own"] = "frozen"
@@ -307,6 +309,7 @@ def block_training(config: MethodConfig, views: int) -> TrainConfig:
         iterations=max(1, round(scale * (block.iterations or _steps(views, *BLOCK_STEPS)))),
         sampling=block.sampling,
         average=block.average,
+        early=block.early,
         resolutions=block.resolutions,
         rates=replace(
             rates,

@@ -1,0 +1,181 @@
+"""`vdgs export`: what is chosen, in which coordinates it stands, and what is refused before the work."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from captures_support import look_down
+from merging_support import camera_above, model_at
+from vdgs.cameras import Camera
+from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.errors import VdgsError
+from vdgs.export import exporting
+from vdgs.export.baking import survey
+from vdgs.export.exporting import RECORD, export_run
+from vdgs.export.formats import registry
+from vdgs.export.frame import FAR, frame_of
+from vdgs.model.anchor_model import AnchorModel, Part
+from vdgs.model.gaussians import draw_gaussians
+from vdgs.model.render import render
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import TrainedRun
+from vdgs.runs.status import Status
+from vdgs.settings.requests import ExportRequest
+from vdgs.storage.files import read_json
+
+#: Far from the middle of its UTM zone: grid north is 1.1 degrees off.
+PLACE = (46.95, 7.44, 560.0)
+QUIET = Console(quiet=True)
+
+
+def ground(origin: tuple[float, float, float] | None) -> GroundFrame:
+    return GroundFrame(1.0, np.eye(3), np.zeros(3), True, "hand-made", origin)
+
+
+def capture_at(origin: tuple[float, float, float] | None) -> Capture:
+    cameras = [camera_above(0.3, -0.2), camera_above(-2.0, 1.0, tilt_deg=30.0), camera_above(1.5, 2.0)]
+    views = [View(f"{n}.png", camera, Path("images") / f"{n}.png", None, "train") for n, camera in enumerate(cameras)]
+    points = np.zeros((1, 3))
+    return Capture(Path("place"), "colmap", "images", tuple(views), points, np.zeros((1, 3), np.uint8), ground(origin))
+
+
+def scattered(parts: tuple[int, ...] = ()) -> AnchorModel:
+    places = np.random.default_rng(0).uniform((-3, -3, 0), (3, 3, 0.5), (200, 3))
+    model = model_at(places)
+    return replace(model, parts=tuple(Part(count, model.decoder) for count in parts))
+
+
+@pytest.fixture
+def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """`vdgs export` of a model that was never trained, into files of these names."""
+
+    def run(
+        *names: str, model: AnchorModel | None = None, origin: tuple[float, float, float] | None = None, **asked: Any
+    ) -> dict[str, Any]:
+        file, shown = tmp_path / "run" / "merged" / "model.safetensors", model or scattered()
+        shown.save(file)
+        opened = TrainedRun(RunFolder(tmp_path / "run"), capture_at(origin), shown, file, "merged", Status(), "k")
+        monkeypatch.setattr(exporting, "open_run", lambda *_: opened)
+        request = ExportRequest(
+            tmp_path / "run", tuple(tmp_path / name for name in names), measure=False, device="cpu", **asked
+        )
+        return export_run(request, QUIET)
+
+    return run
+
+
+def test_all_files_of_one_baking_hold_the_same_scene(export, tmp_path: Path):
+    record = export("a.ply", "b.splat", "c.ply", "d.points.ply", sh_degree=2)
+    whole, small = registry.read(tmp_path / "a.ply"), registry.read(tmp_path / "b.splat")
+    assert record["gaussians"] == len(whole) == len(small)
+    assert whole.degree == 2
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "c.ply").read_bytes()
+    model = scattered()
+    for view in capture_at(None).train_views:
+        with torch.no_grad():
+            drawn = draw_gaussians(whole, view.camera, torch.tensor(model.background), 2)[0].image
+        assert (drawn - render(model, view.camera).image).abs().mean() < 0.01
+    assert read_json(tmp_path / "run" / RECORD) == record
+    assert [Path(file["file"]).name for file in record["files"]] == ["a.ply", "b.splat", "c.ply", "d.points.ply"]
+    assert not list(tmp_path.glob(".baking-*"))
+
+
+def test_files_about_a_place_on_earth_keep_its_origin_apart(export, tmp_path: Path):
+    pytest.importorskip("pyproj")
+    export("utm.ply", "enu.ply", origin=PLACE, crs="EPSG:32632")
+    frame = frame_of(ground(PLACE), "EPSG:32632", np.zeros(3))
+    assert max(np.abs(frame.facts.origin)) > FAR
+    assert all(value % 100 == 0 for value in frame.facts.origin)
+    local = registry.read(tmp_path / "utm.ply")
+    assert float(local.means.abs().max()) < 100
+    back = frame.to_ground(local)
+    assert float(back.means[:, :2].abs().max()) < 20
+    text = (tmp_path / "utm.ply").read_bytes()[:6000].decode("ascii", "replace")
+    assert "origin" in text
+    assert "UTM zone 32N" in text
+    # In the default system, metres east and north of the origin, nothing is turned.
+    export("plain.ply", origin=PLACE)
+    export("local.ply")
+    plain, here = registry.read(tmp_path / "plain.ply"), registry.read(tmp_path / "local.ply")
+    assert torch.allclose(plain.means, here.means, atol=1e-4)
+
+
+def test_a_frame_and_back_is_where_it_was():
+    pytest.importorskip("pyproj")
+    model = scattered()
+    seen = survey(model, [view.camera for view in capture_at(None).train_views])
+    gaussians = next(iter(exporting.bake(seen, np.flatnonzero(seen.pixels > 0), 3)))
+    for crs in ("EPSG:32632", "enu", "local"):
+        frame = frame_of(ground(PLACE), crs, np.zeros(3))
+        back = frame.to_ground(frame.place(gaussians))
+        for name in ("means", "log_scales", "rest"):
+            assert torch.allclose(getattr(back, name), getattr(gaussians, name), atol=1e-3), (crs, name)
+
+
+def test_boxes_blocks_and_numbers_choose(export, tmp_path: Path):
+    whole = export("all.ply")["gaussians"]
+    assert export("few.ply", max_gaussians=50)["gaussians"] == 50
+    assert export("many.ply", max_gaussians=whole + 1)["gaussians"] == whole
+    box = export("box.ply", bbox=(-1.0, -1.0, 2.0, 0.5))["gaussians"]
+    inside = registry.read(tmp_path / "box.ply").means
+    assert 0 < box < whole
+    assert float(inside[:, 0].min()) >= -1.0
+    assert float(inside[:, 1].max()) <= 0.5
+    parted = scattered((80, 120))
+    first, second = (export(f"{block}.ply", model=parted, block=block)["gaussians"] for block in (0, 1))
+    assert first + second == whole
+    assert min(first, second) > 0
+    # Those that are left out make less of the photographs than those that stay.
+    seen = survey(scattered(), [view.camera for view in capture_at(None).train_views])
+    assert np.sort(seen.pixels)[::-1][:50].sum() > 0.3 * seen.pixels.sum()
+
+
+@pytest.mark.parametrize(
+    ("names", "asked", "said"),
+    [
+        ((), {}, "--to FILE"),
+        (("scene.obj",), {}, "no format is known"),
+        (("a.ply", "a.ply"), {}, "given twice"),
+        (("a.ply",), {"bbox": (50.0, 50.0, 60.0, 60.0)}, "lies within"),
+        (("a.ply",), {"bbox": (1.0, 0.0, 1.0, 5.0)}, "is empty"),
+        (("a.ply",), {"bbox": (float("nan"), 0.0, 1.0, 5.0)}, "is empty"),
+        (("a.ply",), {"block": 3}, "--block 3"),
+        (("a.ply",), {"crs": "EPSG:32632"}, "not georeferenced"),
+    ],
+)
+def test_what_cannot_be_written_is_said_before_anything_is_baked(
+    export, tmp_path: Path, monkeypatch, names, asked, said
+):
+    monkeypatch.setattr(exporting, "bake", lambda *_: pytest.fail("baked"))
+    with pytest.raises(VdgsError, match=said):
+        export(*names, **asked)
+    assert not list(tmp_path.glob("*.ply"))
+
+
+def test_a_scene_too_wide_for_a_format_is_refused_before_it_is_baked(export, monkeypatch):
+    monkeypatch.setattr(exporting, "bake", lambda *_: pytest.fail("baked"))
+    model = scattered()
+    far = model.anchors.positions + torch.tensor([3000.0, 0.0, 0.0])
+    cameras = [Camera(look_down(np.array([3000.0, 0, 8.0]), 0.0, 90.0), 60.0, 60.0, 32.0, 24.0, 64, 48)]
+    capture = capture_at(None)
+    views = tuple(replace(view, camera=cameras[0]) for view in capture.views[:1])
+    monkeypatch.setattr(f"{__name__}.capture_at", lambda _: replace(capture, views=views))
+    with pytest.raises(VdgsError, match="2048"):
+        export("a.spz", model=replace(model, anchors=replace(model.anchors, positions=far)))
+
+
+def test_a_disk_that_fills_leaves_nothing(export, tmp_path: Path, monkeypatch):
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(exporting, "spooled", full)
+    with pytest.raises(VdgsError, match="No space left"):
+        export("a.ply")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
