@@ -1,9 +1,8 @@
-"""SPZ: about a twelfth of a PLY, in fixed point, gzipped (Niantic's format, versions 2 and 3).
+"""SPZ: a sixth of a PLY and less, in fixed point, gzipped (Niantic's format, versions 2 and 3).
 
 Positions have 24 bits, 12 of them after the point: steps of 0.24 mm, within ±2048 m, beyond which other programs wrap
-around silently; here it is an error. y is up (right, up, back). Version 3 keeps rotations to a tenth of a degree,
-version 2, which the oldest readers and the extension of glTF ask for, to about half a degree. Version 4 (zstd) is not
-written: few programs read it yet.
+around silently; here it is an error. y is up (right, up, back). Version 3 keeps rotations finer than version 2, which
+the extension of glTF asks for. Version 4 (zstd) is not written: few programs read it yet.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ import torch
 from vdgs.errors import VdgsError
 from vdgs.export.formats.gzipping import gzipped
 from vdgs.export.formats.scene import Y_UP, Scene, bytes_of, logits_of, opacities, unturned, write_beside
+from vdgs.export.formats.small_turns import with_small_turns
 from vdgs.model.gaussians import Gaussians
 from vdgs.model.spherical_harmonics import MAX_DEGREE, function_count
 from vdgs.storage.files import write_atomically
@@ -86,6 +86,8 @@ def header(count: int, degree: int, version: int, fraction: int = FRACTION_BITS)
 def columns(piece: Gaussians, version: int, fraction: int = FRACTION_BITS) -> tuple[np.ndarray, ...]:
     """The bytes of Gaussians whose y is up, a uint8 array [n, bytes] for each of `COLUMNS`."""
     n = len(piece)
+    if version < 3:
+        piece = with_small_turns(piece)
     fixed = np.rint(piece.means.double().numpy() * 2**fraction).astype("<i4")
     positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(n, 3, 4)[:, :, :3].reshape(n, 9)
     colours = bytes_of(piece.dc.numpy() * COLOUR_SCALE + 0.5)
