@@ -254,9 +254,11 @@ def test_what_bytes_cannot_hold_is_counted(tmp_path):
     bright = random_gaussians(10, 0)
     bright.dc[:3] = 9.0
     bright.log_scales[4] = 7.0
+    bright.log_scales[5:7, 2] = -14.0
     notes = registry.write(tmp_path / "a.spz", Scene.of(bright))
     assert notes == (
-        "1 of 10 sizes lay outside of 0.05 mm .. 377 m and were cut off",
+        "1 of 10 Gaussians are larger than 377 units and were cut to that",
+        "2 of 10 Gaussians are thinner than 0.00005 units and became as thick as that, which nobody sees",
         "3 of 10 colours lay far outside of 0 .. 1 and were cut off",
     )
 

@@ -37,6 +37,12 @@ FIRST_STEP, REST_STEP = 8, 16
 #: Columns in the order of the file.
 COLUMNS = ("positions", "alphas", "colours", "scales", "rotations", "harmonics")
 READ_IN = 1 << 22
+#: What a byte cannot hold, and what became of it.
+CUT = {
+    "large": "Gaussians are larger than 377 units and were cut to that",
+    "thin": "Gaussians are thinner than 0.00005 units and became as thick as that, which nobody sees",
+    "colours": "colours lay far outside of 0 .. 1 and were cut off",
+}
 
 
 def refuse_too_far(path: Path, scene: Scene) -> None:
@@ -51,7 +57,7 @@ def write_spz(path: Path, scene: Scene, version: int = 3) -> tuple[str, ...]:
     The file holds one quantity after the other: they wait in temporary files beside it, so memory stays small.
     """
     refuse_too_far(path, scene)
-    cut = {"scales": 0, "colours": 0}
+    cut = dict.fromkeys(CUT, 0)
 
     def write(temporary: Path) -> None:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
@@ -74,8 +80,7 @@ def write_spz(path: Path, scene: Scene, version: int = 3) -> tuple[str, ...]:
 
     write_atomically(path, write)
     write_beside(path, scene.facts, {"axes": "x east, y up, z south"})
-    kinds = {"scales": "sizes lay outside of 0.05 mm .. 377 m", "colours": "colours lay far outside of 0 .. 1"}
-    return tuple(f"{cut[name]} of {scene.count} {what} and were cut off" for name, what in kinds.items() if cut[name])
+    return tuple(f"{cut[name]} of {scene.count} {what}" for name, what in CUT.items() if cut[name])
 
 
 def header(count: int, degree: int, version: int, fraction: int = FRACTION_BITS) -> bytes:
@@ -117,11 +122,12 @@ def _stream(first: bytes, spools: Mapping[str, IO[bytes]]) -> Iterator[bytes]:
 
 
 def _beyond(piece: Gaussians) -> dict[str, int]:
-    """How many Gaussians have sizes or colours that bytes cannot hold."""
+    """How many Gaussians have sizes or colours that bytes cannot hold, as in `CUT`."""
     scales = (piece.log_scales + 10) * 16
     shown = piece.dc * COLOUR_SCALE + 0.5
     return {
-        "scales": int(((scales < -0.5) | (scales > 255.5)).any(1).sum()),
+        "large": int((scales > 255.5).any(1).sum()),
+        "thin": int((scales < -0.5).any(1).sum()),
         "colours": int(((shown < -0.002) | (shown > 1.002)).any(1).sum()),
     }
 
