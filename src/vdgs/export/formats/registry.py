@@ -39,9 +39,9 @@ class Format:
 FORMATS: tuple[Format, ...] = (
     Format(".points.ply", "point cloud, local coordinates", write_points),
     Format(".ply", "3DGS PLY, nothing lost", write_ply, read_ply),
-    Format(".spz", "SPZ, a twelfth of the PLY", write_spz, read_spz, refuse_too_far, True),
+    Format(".spz", "SPZ, a sixth of the PLY or less", write_spz, read_spz, refuse_too_far, True),
     Format(".splat", "32 bytes a Gaussian, fixed colours", write_splat, read_splat, facts_beside=True),
-    Format(".sog", "PlayCanvas' SOG, a fifteenth of the PLY", write_sog, facts_beside=True),
+    Format(".sog", "PlayCanvas' SOG, a twelfth of the PLY or less", write_sog, facts_beside=True),
     Format(".glb", "glTF with KHR_gaussian_splatting, nothing lost", write_glb, check=refuse_too_large),
     Format(NAME, "3D Tiles for CesiumJS, in levels", write_tiles, check=refuse_other_names),
     Format(".laz", "point cloud, map coordinates, compressed", write_laz, check=refuse_without_laspy),

@@ -1,4 +1,4 @@
-"""SOG, PlayCanvas' files: the numbers of a scene as lossless WebP images in one zip, a fifteenth of a PLY and less.
+"""SOG, PlayCanvas' files: the numbers of a scene as lossless WebP images in one zip, a twelfth of a PLY and less.
 
 Version 2. Positions have 16 bits after a logarithm: fine near the origin, coarse far from it. Sizes and colours are
 indices into 256 values each, spherical harmonics into a palette of whole sets. Gaussians stand in Morton order:

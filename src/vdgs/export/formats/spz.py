@@ -1,9 +1,8 @@
-"""SPZ: about a twelfth of a PLY, in fixed point, gzipped (Niantic's format, versions 2 and 3).
+"""SPZ: a sixth of a PLY and less, in fixed point, gzipped (Niantic's format, versions 2 and 3).
 
 Positions have 24 bits, 12 of them after the point: steps of 0.24 mm, within ±2048 m, beyond which other programs wrap
-around silently; here it is an error. y is up (right, up, back). Version 3 keeps rotations to a tenth of a degree,
-version 2, which the oldest readers and the extension of glTF ask for, to about half a degree. Version 4 (zstd) is not
-written: few programs read it yet.
+around silently; here it is an error. y is up (right, up, back). Version 3 keeps rotations finer than version 2, which
+the extension of glTF asks for. Version 4 (zstd) is not written: few programs read it yet.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ import torch
 from vdgs.errors import VdgsError
 from vdgs.export.formats.gzipping import gzipped
 from vdgs.export.formats.scene import Y_UP, Scene, bytes_of, logits_of, opacities, unturned, write_beside
+from vdgs.export.formats.small_turns import with_small_turns
 from vdgs.model.gaussians import Gaussians
 from vdgs.model.spherical_harmonics import MAX_DEGREE, function_count
 from vdgs.storage.files import write_atomically
@@ -37,6 +37,12 @@ FIRST_STEP, REST_STEP = 8, 16
 #: Columns in the order of the file.
 COLUMNS = ("positions", "alphas", "colours", "scales", "rotations", "harmonics")
 READ_IN = 1 << 22
+#: What a byte cannot hold, and what became of it.
+CUT = {
+    "large": "Gaussians are larger than 377 units and were cut to that",
+    "thin": "Gaussians are thinner than 0.00005 units and became as thick as that, which nobody sees",
+    "colours": "colours lay far outside of 0 .. 1 and were cut off",
+}
 
 
 def refuse_too_far(path: Path, scene: Scene) -> None:
@@ -51,7 +57,7 @@ def write_spz(path: Path, scene: Scene, version: int = 3) -> tuple[str, ...]:
     The file holds one quantity after the other: they wait in temporary files beside it, so memory stays small.
     """
     refuse_too_far(path, scene)
-    cut = {"scales": 0, "colours": 0}
+    cut = dict.fromkeys(CUT, 0)
 
     def write(temporary: Path) -> None:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
@@ -74,8 +80,7 @@ def write_spz(path: Path, scene: Scene, version: int = 3) -> tuple[str, ...]:
 
     write_atomically(path, write)
     write_beside(path, scene.facts, {"axes": "x east, y up, z south"})
-    kinds = {"scales": "sizes lay outside of 0.05 mm .. 377 m", "colours": "colours lay far outside of 0 .. 1"}
-    return tuple(f"{cut[name]} of {scene.count} {what} and were cut off" for name, what in kinds.items() if cut[name])
+    return tuple(f"{cut[name]} of {scene.count} {what}" for name, what in CUT.items() if cut[name])
 
 
 def header(count: int, degree: int, version: int, fraction: int = FRACTION_BITS) -> bytes:
@@ -86,6 +91,8 @@ def header(count: int, degree: int, version: int, fraction: int = FRACTION_BITS)
 def columns(piece: Gaussians, version: int, fraction: int = FRACTION_BITS) -> tuple[np.ndarray, ...]:
     """The bytes of Gaussians whose y is up, a uint8 array [n, bytes] for each of `COLUMNS`."""
     n = len(piece)
+    if version < 3:
+        piece = with_small_turns(piece)
     fixed = np.rint(piece.means.double().numpy() * 2**fraction).astype("<i4")
     positions = np.ascontiguousarray(fixed).view(np.uint8).reshape(n, 3, 4)[:, :, :3].reshape(n, 9)
     colours = bytes_of(piece.dc.numpy() * COLOUR_SCALE + 0.5)
@@ -115,11 +122,12 @@ def _stream(first: bytes, spools: Mapping[str, IO[bytes]]) -> Iterator[bytes]:
 
 
 def _beyond(piece: Gaussians) -> dict[str, int]:
-    """How many Gaussians have sizes or colours that bytes cannot hold."""
+    """How many Gaussians have sizes or colours that bytes cannot hold, as in `CUT`."""
     scales = (piece.log_scales + 10) * 16
     shown = piece.dc * COLOUR_SCALE + 0.5
     return {
-        "scales": int(((scales < -0.5) | (scales > 255.5)).any(1).sum()),
+        "large": int((scales > 255.5).any(1).sum()),
+        "thin": int((scales < -0.5).any(1).sum()),
         "colours": int(((shown < -0.002) | (shown > 1.002)).any(1).sum()),
     }
 

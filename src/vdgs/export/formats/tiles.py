@@ -65,12 +65,12 @@ def write_tiles(path: Path, scene: Scene, most: int = MOST) -> tuple[str, ...]:
     lost. Raises VdgsError.
     """
     refuse_other_names(path, scene)
-    path.parent.mkdir(parents=True, exist_ok=True)
     older = [each for each in path.parent.glob("tiles-*") if each.is_dir()]
     folder = (
         path.parent / f"tiles-{1 + max((int(each.name[6:]) for each in older if each.name[6:].isdecimal()), default=0)}"
     )
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{NAME}.") as spool:
             root = _Tree(spooled(scene, Path(spool) / "rows"), folder, scene.facts, most).built()
         write_json(path, _tileset(root, scene.facts))
