@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import track
 
 from vdgs.errors import VdgsError
-from vdgs.maps.geotiff import Layer, cloud_optimised, require_rasterio, write_tile, writing
+from vdgs.maps.geotiff import Layer, bounded_cache, cloud_optimised, require_rasterio, write_tile, writing
 from vdgs.maps.grid import Grid, extent_of, grid_over, ground_sampling, middle_of, refuse_elsewhere
 from vdgs.maps.pictures import Sheet, hillshade_png, preview_png
 from vdgs.maps.sharpening import Sharpener
@@ -55,7 +55,7 @@ def map_run(asked: MapRequest, console: Console) -> Path:
     _announce(grid, placement, folder, console)
     started = time.monotonic()
     layers = layers_of(placement)
-    with ExitStack() as ending, _staged(folder) as staging:
+    with ExitStack() as ending, _staged(folder) as staging, bounded_cache():
         if sharpener is not None:
             ending.callback(sharpener.close)
         facts = _facts(run, grid, placement, surveyor)
