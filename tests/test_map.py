@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from rich.console import Console
 
 from captures_support import look_down
@@ -22,6 +23,7 @@ from vdgs.errors import VdgsError
 from vdgs.maps import mapping, tiles
 from vdgs.maps.grid import Grid, extent_of, grid_over, ground_sampling
 from vdgs.maps.pictures import hillshade, round_length
+from vdgs.maps.sharpening import Sharpener
 from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Surveyor, samples_for
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import render
@@ -302,3 +304,44 @@ def test_light_of_a_hillshade():
 @pytest.mark.parametrize(("about", "length"), [(10.0, 10.0), (9.9, 5.0), (0.23, 0.2), (499.0, 200.0)])
 def test_scale_bars_are_round(about, length):
     assert round_length(about) == pytest.approx(length)
+
+
+def pattern(places: np.ndarray) -> np.ndarray:
+    """A fine weave of the ground, -1 or 1, by x and y."""
+    return np.sign(np.sin(places[..., 0] * 2 * np.pi / 0.9) * np.sin(places[..., 1] * 2 * np.pi / 0.9))
+
+
+def photographed(capture: Capture, model: AnchorModel, folder: Path, woven: float) -> Capture:
+    """Photographs of the model on disk, the ground (not the roof) woven with detail that the model does not have."""
+    views = []
+    for view in capture.views:
+        sharp = view.camera.resized(320, 240)
+        drawn = render(model, sharp, depth=True)
+        places = sharp.unproject(drawn.median_depth.numpy())
+        low = (places[..., 2] < 1.0)[..., None]
+        image = (drawn.image.numpy() + woven * low * pattern(places)[..., None]).clip(0, 1)
+        Image.fromarray((image * 255 + 0.5).astype(np.uint8)).save(folder / view.name)
+        views.append(replace(view, camera=sharp, image_path=folder / view.name))
+    return replace(capture, views=tuple(views))
+
+
+@pytest.mark.parametrize("woven", [0.0, 0.06])
+def test_detail_comes_from_the_photographs_where_they_see_the_place(house, tmp_path, woven):
+    capture, model = house
+    capture = photographed(capture, model, tmp_path, woven)
+    grid = Grid(-3.0, 5.0, 0.08, 120, 100)
+    placement, sharpener = Placement.of(capture.ground, "local"), Sharpener(model, capture)
+    plain = Surveyor.of(model, capture, placement).tile(grid)
+    sharp = Surveyor.of(model, capture, placement, sharpener=sharpener).tile(grid)
+    sharpener.close()
+    np.testing.assert_array_equal(sharp.heights, plain.heights)
+    gained = (sharp.colours.astype(float) - plain.colours).mean(axis=-1) / 255
+    x = grid.left + (np.arange(120) + 0.5) * 0.08
+    y = grid.top - (np.arange(100) + 0.5) * 0.08
+    ground = plain.heights < 1.0
+    if not woven:
+        assert np.abs(gained).mean() < 0.01
+        return
+    detail = pattern(np.stack(np.meshgrid(x, y), axis=-1))
+    assert np.corrcoef(gained[ground], detail[ground])[0, 1] > 0.7
+    assert np.abs(gained[~ground]).mean() < 0.35 * np.abs(gained[ground]).mean()

@@ -14,6 +14,9 @@ from vdgs.errors import VdgsError
 from vdgs.maps.grid import TILE_PX, Grid
 from vdgs.placing.placement import Placement
 
+#: What GDAL may keep of files in memory.
+_CACHE_MB = 128
+
 
 @dataclass(frozen=True)
 class Layer:
@@ -42,6 +45,11 @@ def require_rasterio() -> Any:
     except ImportError:
         raise VdgsError("Maps are GeoTIFFs, which need rasterio: pip install 'vdgs[geo]'.") from None
     return rasterio
+
+
+def bounded_cache() -> Any:
+    """A context in which GDAL keeps no more than `_CACHE_MB` of files in memory, whatever the size of the machine."""
+    return require_rasterio().Env(GDAL_CACHEMAX=_CACHE_MB)
 
 
 def crs_of(placement: Placement) -> Any:

@@ -15,9 +15,10 @@ from rich.console import Console
 from rich.progress import track
 
 from vdgs.errors import VdgsError
-from vdgs.maps.geotiff import Layer, cloud_optimised, require_rasterio, write_tile, writing
+from vdgs.maps.geotiff import Layer, bounded_cache, cloud_optimised, require_rasterio, write_tile, writing
 from vdgs.maps.grid import Grid, extent_of, grid_over, ground_sampling, middle_of, refuse_elsewhere
 from vdgs.maps.pictures import Sheet, hillshade_png, preview_png
+from vdgs.maps.sharpening import Sharpener
 from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Surveyor, Tile, samples_for
 from vdgs.placing.placement import Placement
 from vdgs.runs.opening import TrainedRun, open_run
@@ -45,7 +46,8 @@ def map_run(asked: MapRequest, console: Console) -> Path:
     shown = extent_of(capture, placement)
     grid = grid_over(asked.bbox or shown, finest if asked.gsd is None else asked.gsd)
     refuse_elsewhere(grid, shown, placement)
-    surveyor = Surveyor.of(run.model, capture, placement, samples_for(grid.gsd, finest))
+    sharpener = Sharpener(run.model, capture) if asked.sharp else None
+    surveyor = Surveyor.of(run.model, capture, placement, samples_for(grid.gsd, finest), sharpener)
     surveyor.camera(grid.part(0, 0, 1, 1))  # a system that makes no map is refused here
     folder = asked.output or run.folder.path / "maps"
     for note in placement.notes:
@@ -53,8 +55,10 @@ def map_run(asked: MapRequest, console: Console) -> Path:
     _announce(grid, placement, folder, console)
     started = time.monotonic()
     layers = layers_of(placement)
-    with _staged(folder) as staging:
-        facts = _facts(run, grid, placement, surveyor.samples)
+    with ExitStack() as ending, _staged(folder) as staging, bounded_cache():
+        if sharpener is not None:
+            ending.callback(sharpener.close)
+        facts = _facts(run, grid, placement, surveyor)
         facts |= _draw(surveyor, grid, layers, staging, facts, console)
         if not facts["mapped_share"]:
             raise VdgsError(
@@ -143,14 +147,15 @@ def _bands(tile: Tile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.moveaxis(coloured, -1, 0), tile.heights[None], tile.visibility[None]
 
 
-def _facts(run: TrainedRun, grid: Grid, placement: Placement, samples: int) -> dict[str, Any]:
+def _facts(run: TrainedRun, grid: Grid, placement: Placement, surveyor: Surveyor) -> dict[str, Any]:
     from vdgs import __version__
 
     return {
         "software": f"vdgs {__version__}", "model": run.name, "crs": placement.crs, "crs_name": placement.name,
         "unit": placement.unit, "heights": placement.heights, "georeference": run.capture.ground.how,
         "gsd": grid.gsd, "width": grid.width, "height": grid.height, "bounds": list(grid.bounds),
-        "samples_per_pixel": samples**2, "training_cameras": len(run.capture.train_views),
+        "samples_per_pixel": surveyor.samples**2, "sharpened": surveyor.sharpener is not None,
+        "training_cameras": len(run.capture.train_views),
         "notes": list(placement.notes),
     }  # fmt: skip
 

@@ -45,11 +45,10 @@ class Sheet:
 def hillshade(heights: Float[np.ndarray, "h w"], pixel: float) -> Float[np.ndarray, "h w"]:
     """Light on a surface (NaN where there is none), 0 to 1, for pixels of so many units; level ground has 0.71."""
     down, right = np.gradient(heights, pixel) if min(heights.shape) > 1 else (np.zeros_like(heights),) * 2
-    # North is up: rows run south.
-    normal = np.stack([-right, down, np.ones_like(heights)])
+    # The normal is (-right, down, 1): rows run south, north is up.
     azimuth, altitude = np.radians(AZIMUTH_DEG), np.radians(ALTITUDE_DEG)
     sun = np.array([np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)])
-    lit = np.einsum("i,ihw->hw", sun, normal) / np.linalg.norm(normal, axis=0)
+    lit = (sun[2] - sun[0] * right + sun[1] * down) / np.sqrt(1 + right * right + down * down)
     return np.where(np.isfinite(heights), np.nan_to_num(lit, nan=sun[2]).clip(0, 1), np.nan)
 
 

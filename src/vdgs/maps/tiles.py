@@ -13,6 +13,7 @@ from vdgs.captures.capture import Capture
 from vdgs.captures.heights import reach
 from vdgs.errors import VdgsError
 from vdgs.maps.grid import Grid, ground_height
+from vdgs.maps.sharpening import Sharpener
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import render
 from vdgs.model.visibility import visibility_of
@@ -84,10 +85,14 @@ class Surveyor:
     ceiling: Ceiling
     #: Samples per pixel, each way.
     samples: int
+    #: Takes detail from the photographs, where that is asked for.
+    sharpener: Sharpener | None
 
     @staticmethod
-    def of(model: AnchorModel, capture: Capture, placement: Placement, samples: int = 1) -> Surveyor:
-        return Surveyor(model, capture, placement, Ceiling.of(capture), samples)
+    def of(
+        model: AnchorModel, capture: Capture, placement: Placement, samples: int = 1, sharpener: Sharpener | None = None
+    ) -> Surveyor:
+        return Surveyor(model, capture, placement, Ceiling.of(capture), samples, sharpener)
 
     def camera(self, grid: Grid) -> Camera:
         """The orthographic camera whose pixels are those of the grid, above everything solid.
@@ -137,8 +142,10 @@ class Surveyor:
             np.zeros((*shown.shape, 3), np.uint8), np.zeros(shown.shape, np.uint8),
             np.full(shown.shape, NO_HEIGHT, np.float32), np.full(shown.shape, NO_COUNT, np.uint16),
         )  # fmt: skip
-        colours = light[shown] / opacity[shown][:, None]
-        tile.colours[shown] = (colours.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+        colours = light / np.maximum(opacity, DRAWN_ALPHA)[..., None]
+        if self.sharpener is not None and shown.any():
+            colours = self.sharpener.sharpened(points[seen], colours, shown)
+        tile.colours[shown] = (colours[shown].clip(0, 1) * 255 + 0.5).astype(np.uint8)
         tile.alpha[shown] = 255
         tile.heights[shown] = heights[seen]
         tile.visibility[shown] = counts[seen].clip(max=NO_COUNT - 1)

@@ -103,6 +103,8 @@ class MapRequest:
     crs: str | None = None
     """Coordinates of the map: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source` (those
     of the capture) or `local` (the ground frame). By default the UTM zone of a georeferenced capture, else `local`."""
+    sharp: bool = False
+    """Take the fine detail of the orthophoto from the photographs, where they truly see a place."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
     threads: int = 0
