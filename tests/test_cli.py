@@ -67,4 +67,4 @@ def test_a_missing_capture_is_one_line_and_no_traceback(tmp_path):
 def test_settings_that_do_not_work_are_named(tmp_path):
     done = vdgs("coarse", str(tmp_path), "--output", str(tmp_path / "run"), "--iterations", "-1")
     assert done.returncode == 1
-    assert "iterations is -1" in done.stderr
+    assert "--iterations -1: must be at least 0" in done.stderr

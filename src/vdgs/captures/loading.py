@@ -20,6 +20,7 @@ from vdgs.captures.splits import choose_splits, nearest_to_middle
 from vdgs.captures.undistortion import ImageFile, undistort
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.ranges import problems
 
 #: Points farther from the cameras than this many times their spread are strays of the matching.
 FAR_POINT = 100.0
@@ -70,17 +71,12 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
 
 
 def _check_options(options: CaptureOptions) -> None:
-    if not (np.isfinite(options.downscale) and options.downscale >= 1):
-        raise CaptureError(f"--downscale {options.downscale}: must be at least 1.")
+    found = problems(options)
+    if found:
+        raise CaptureError("\n  ".join(found))
     for flag, folder in (("--images", options.images), ("--masks", options.masks)):
         if folder is not None and (Path(folder).is_absolute() or ".." in Path(folder).parts or not folder):
             raise CaptureError(f"{flag} {folder}: must be a folder inside the capture, such as images_4.")
-    if options.test_every < 2:
-        raise CaptureError(
-            f"--test-every {options.test_every}: must be at least 2 (1 would leave nothing to train on)."
-        )
-    if options.max_images is not None and options.max_images < 2:
-        raise CaptureError(f"--max-images {options.max_images}: must be at least 2.")
 
 
 # ------------------------------------------------------------------------------------------- reading

@@ -18,6 +18,7 @@ from vdgs.films.video import VideoWriter
 from vdgs.model.render import render, render_values
 from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.runs.visibility import visibility_of_run
+from vdgs.settings.ranges import refuse
 from vdgs.settings.requests import RenderRequest
 
 #: Pace of a film of separate views.
@@ -29,8 +30,7 @@ def render_run(asked: RenderRequest, console: Console) -> None:
 
     Raises VdgsError for an unusable path, codec or output.
     """
-    if min(asked.width, asked.fps, asked.seconds) < 0:
-        raise VdgsError("--width, --fps and --seconds must not be negative")
+    refuse(asked)
     run = open_run(asked.run, asked.model, asked.device)
     named, fps = _cameras(asked, run)
     if asked.width:

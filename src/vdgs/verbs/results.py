@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-import tyro
 from tyro.conf import Positional
 
-from vdgs.settings.requests import ModelName, RenderRequest
-from vdgs.verbs.shared import open_console, use_device, use_threads
+from vdgs.settings.ranges import WORKERS
+from vdgs.settings.requests import BINS, ModelName, RenderRequest
+from vdgs.verbs.shared import open_console, parse, use_device, use_threads
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,16 @@ class EvalArguments:
     overfits. Blocks and seams are measured on test views only."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
-    bins: int = 4
+    bins: Annotated[int, BINS] = 4
     """Number of visibility quantiles by which metrics are reported."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 
 
 def eval(arguments: list[str]) -> None:
-    asked = tyro.cli(EvalArguments, args=arguments, prog="vdgs eval")
+    asked = parse(EvalArguments, arguments, "vdgs eval")
     from vdgs.stages.evaluate import evaluate_stage
 
     device = use_device(asked.device)
@@ -53,7 +53,7 @@ class ReportArguments:
 
 
 def report(arguments: list[str]) -> None:
-    asked = tyro.cli(ReportArguments, args=arguments, prog="vdgs report")
+    asked = parse(ReportArguments, arguments, "vdgs report")
     from vdgs.report import write_report
     from vdgs.runs.folder import RunFolder
 
@@ -69,7 +69,7 @@ class RenderArguments(RenderRequest):
 
 
 def render(arguments: list[str]) -> None:
-    asked = tyro.cli(RenderArguments, args=arguments, prog="vdgs render")
+    asked = parse(RenderArguments, arguments, "vdgs render")
     from vdgs.films.film import render_run
 
     device = use_device(asked.device)

@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import tyro
 
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.presets import PRESETS, PresetName
+from vdgs.settings.ranges import refuse
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from vdgs.runs.folder import RunFolder
+
+
+Parsed = TypeVar("Parsed")
+
+
+def parse(kind: type[Parsed], arguments: list[str], prog: str, default: Parsed | None = None) -> Parsed:
+    """The arguments of a verb. Raises VdgsError for a number that is outside its range (`settings.ranges`)."""
+    if default is None:
+        asked = tyro.cli(kind, args=arguments, prog=prog)
+    else:
+        asked = tyro.cli(kind, args=arguments, prog=prog, default=default)
+    refuse(asked)
+    return asked
 
 
 def named_preset(arguments: list[str]) -> PresetName:
@@ -34,8 +48,8 @@ def recorded_run(arguments: list[str], kind: type, prog: str) -> tuple[RunFolder
 
     if "-h" in arguments or "--help" in arguments:
         named = next((RunFolder(Path(a)) for a in arguments if (Path(a) / "config.yaml").is_file()), None)
-        return (named, named.method()) if named else tyro.cli(kind, args=arguments, prog=prog)
-    run = RunFolder(tyro.cli(kind, args=arguments, prog=prog).run)
+        return (named, named.method()) if named else parse(kind, arguments, prog)
+    run = RunFolder(parse(kind, arguments, prog).run)
     return run, run.method()
 
 

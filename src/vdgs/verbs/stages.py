@@ -10,8 +10,9 @@ import tyro
 from tyro.conf import Positional, arg
 
 from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, PartitionConfig
+from vdgs.settings.ranges import WORKERS, Range
 from vdgs.settings.watching import WatchOptions
-from vdgs.verbs.shared import change_settings, open_console, recorded_run, use_device, use_threads
+from vdgs.verbs.shared import change_settings, open_console, parse, recorded_run, use_device, use_threads
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class VisibilityArguments:
 
 
 def visibility(arguments: list[str]) -> None:
-    asked = tyro.cli(VisibilityArguments, args=arguments, prog="vdgs visibility")
+    asked = parse(VisibilityArguments, arguments, "vdgs visibility")
     from vdgs.runs.folder import RunFolder
     from vdgs.stages.visibility import measure_visibility
 
@@ -40,7 +41,7 @@ class PartitionArguments:
     """Allow another cut to discard blocks that are trained."""
     why: str | None = None
     """Name of a training photograph: also say how well it shows each block and why it was assigned or not."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
@@ -49,7 +50,7 @@ class PartitionArguments:
 def partition(arguments: list[str]) -> None:
     run, method = recorded_run(arguments, PartitionArguments, "vdgs partition")
     default = PartitionArguments(tyro.MISSING, partition=method.partition, assignment=method.assignment)
-    asked = tyro.cli(PartitionArguments, args=arguments, prog="vdgs partition", default=default)
+    asked = parse(PartitionArguments, arguments, "vdgs partition", default)
     from vdgs.stages.partition import explain_view, partition_run
 
     use_threads(asked.threads)
@@ -65,13 +66,13 @@ class TrainArguments:
 
     run: Positional[Path]
     """Run folder that is cut into blocks."""
-    block: int | None = None
+    block: Annotated[int | None, Range(0, 10_000)] = None
     """Only this block, in this process; without it all of them, several at once."""
-    jobs: int = 0
+    jobs: Annotated[int, WORKERS] = 0
     """Blocks trained at once; 0 takes what cores and memory allow."""
     redo: bool = False
     """Allow other settings to discard blocks that are trained with the old ones."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels for --block; 0 for all cores. The result does not depend on it."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
@@ -82,7 +83,7 @@ class TrainArguments:
 def train(arguments: list[str]) -> None:
     run, method = recorded_run(arguments, TrainArguments, "vdgs train")
     default = TrainArguments(tyro.MISSING, settings=method.block)
-    asked = tyro.cli(TrainArguments, args=arguments, prog="vdgs train", default=default)
+    asked = parse(TrainArguments, arguments, "vdgs train", default)
     device = use_device(asked.device)
     change_settings(run, replace(method, block=asked.settings), asked.redo)
     if asked.block is not None:
@@ -112,7 +113,7 @@ class MergeArguments:
 def merge(arguments: list[str]) -> None:
     run, method = recorded_run(arguments, MergeArguments, "vdgs merge")
     default = MergeArguments(tyro.MISSING, merge=method.merge)
-    asked = tyro.cli(MergeArguments, args=arguments, prog="vdgs merge", default=default)
+    asked = parse(MergeArguments, arguments, "vdgs merge", default)
     from vdgs.stages.merge import merge_run
 
     change_settings(run, replace(method, merge=asked.merge), redo=False)
