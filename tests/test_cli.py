@@ -53,7 +53,7 @@ def test_an_unknown_verb_is_a_usage_error(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["trian"])
     assert ended.value.code == 2
-    assert "trian" in capsys.readouterr().err
+    assert "there is no verb 'trian'; did you mean 'train'?" in capsys.readouterr().err
 
 
 def test_a_missing_capture_is_one_line_and_no_traceback(tmp_path):

@@ -129,7 +129,7 @@ def test_a_truncated_state_falls_back_and_says_so(capture, unbroken, tmp_path):
 def test_other_settings_are_refused_with_the_difference(capture, unbroken):
     done = finish(capture, unbroken, "--seed", "3")
     assert done.returncode == 1
-    assert "training.seed: 0 -> 3" in done.stderr
+    assert "--seed: 0 -> 3" in done.stderr
     assert "Traceback" not in done.stderr
 
 

@@ -186,7 +186,7 @@ def test_other_settings_are_refused_where_they_cost_training(capture, copied):
     before = moments(copied)
     refused = vdgs("run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0")
     assert refused.returncode == 1
-    assert "partition.lambda_vis: 1.0 -> 0.0" in refused.stderr
+    assert "--lambda-vis: 1.0 -> 0.0" in refused.stderr
     assert "--redo" in refused.stderr
     assert changed_files(copied, before) == set()
 

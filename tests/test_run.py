@@ -92,10 +92,10 @@ def test_a_change_that_costs_trained_work_needs_redo(tmp_path):
     run.change_settings(other, redo=False)  # nothing is trained yet
     run.block(0).discard_unless(run.keys().blocks)
     run.block(0).model.write_bytes(b"a trained block")
-    with pytest.raises(RunError, match=r"partition\.lambda_vis: 0\.7 -> 1\.0(?s:.*)a block useless. Add --redo"):
+    with pytest.raises(RunError, match=r"--lambda-vis: 0\.7 -> 1\.0(?s:.*)a block useless. Add --redo"):
         run.change_settings(settings(), redo=False)
     assert run.settings() == other
-    assert run.change_settings(settings(), redo=True) == ["partition.lambda_vis: 0.7 -> 1.0"]
+    assert run.change_settings(settings(), redo=True) == ["--lambda-vis: 0.7 -> 1.0"]
     assert run.settings() == settings()
 
 

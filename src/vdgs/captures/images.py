@@ -180,7 +180,7 @@ def load_picture(view: View) -> Picture:
         None if keep is None else torch.from_numpy(keep.astype(np.uint8)),
     )
     camera = view.camera
-    if abs(width / camera.width - height / camera.height) * min(camera.width, camera.height) > 2:
+    if not _is_shrunk(camera.width, width, camera.height, height):
         raise CaptureError(
             f"{view.image_path}: is {width}x{height} now, but was another shape when the capture was read "
             f"(camera {camera.width}x{camera.height}). Do not change images while they are in use."
@@ -201,3 +201,10 @@ def shrink(picture: Picture, width: int, height: int) -> Picture:
         share = cv2.resize(picture.mask.numpy().astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         mask = torch.from_numpy((share >= 1 - 1e-4).astype(np.uint8))
     return Picture(torch.from_numpy(image), mask)
+
+
+def _is_shrunk(width: int, full_width: int, height: int, full_height: int) -> bool:
+    """Whether both sides are those of a picture divided by one factor, each rounded up or down to a whole pixel."""
+    least = max((full_width - 1) / (width + 1), (full_height - 1) / (height + 1))
+    most = min((full_width + 1) / max(width - 1, 0.5), (full_height + 1) / max(height - 1, 0.5))
+    return least <= most

@@ -24,6 +24,8 @@ from vdgs.settings.ranges import problems
 
 #: Points farther from the cameras than this many times their spread are strays of the matching.
 FAR_POINT = 100.0
+#: The shorter side of a photograph that --downscale leaves, at least, in pixels.
+LEAST_SIDE_PX = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +52,7 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     source = _without_bad_points(source, warnings)
     photographs = _find_photographs(root, source, options, warnings)
     photographs = _undistorted(root, photographs, options, warnings)
+    _refuse_tiny(photographs, options)
     ground, ground_warnings = find_ground_frame(source, root, options)
     views = [_view(photo, options, ground) for photo in photographs]
     points, colours = ground.to_ground(source.points), source.colours
@@ -261,6 +264,18 @@ def _undistorted(
     straight = undistort(folder, [photo.file for photo in photographs])
     warnings.append(f"{len(bent)} photographs were undistorted into {folder}.")
     return [_FoundView(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
+
+
+def _refuse_tiny(photographs: list[_FoundView], options: CaptureOptions) -> None:
+    """Raise CaptureError where so little is left of a photograph by --downscale that it shows nothing."""
+    sizes = [(photo.file.intrinsics.width, photo.file.intrinsics.height) for photo in photographs]
+    width, height = min(sizes, key=min)
+    if options.downscale > 1 and min(width, height) / options.downscale < LEAST_SIDE_PX:
+        most = max(1, min(width, height) // LEAST_SIDE_PX)
+        raise CaptureError(
+            f"--downscale {options.downscale:g}: photographs of {width}x{height} would be "
+            f"{int(width / options.downscale)}x{int(height / options.downscale)}. Give at most {most}."
+        )
 
 
 def _view(photo: _FoundView, options: CaptureOptions, ground: GroundFrame) -> View:

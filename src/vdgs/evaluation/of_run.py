@@ -102,7 +102,7 @@ def visibility_map(run: TrainedRun) -> Callable[[Camera], np.ndarray]:
     if run.name != "coarse":
         model = AnchorModel.load(run.folder.coarse.model).to(run.device)
         coarse = replace(run, model=model, name="coarse")
-    visibility = visibility_of_run(coarse).float()
+    visibility = visibility_of_run(coarse, [view.camera for view in run.capture.train_views]).float()
     return lambda camera: render_values(coarse.model, visibility, camera).cpu().numpy()
 
 

@@ -10,19 +10,26 @@ from rich.console import Console
 from rich.progress import track
 
 from vdgs.cameras import Camera
+from vdgs.captures.facts import refuse_another_capture
 from vdgs.errors import VdgsError
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.evaluation.saving import file_stems, write_png
 from vdgs.films import paths as render_paths
+from vdgs.films.path_files import load_path
 from vdgs.films.video import VideoWriter
+from vdgs.memory.process import available_bytes
 from vdgs.model.render import render, render_values
-from vdgs.runs.opening import TrainedRun, open_run
+from vdgs.runs.flight import Flight, flight_of, kept_flight
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import OpenedModel, open_capture, open_model
 from vdgs.runs.visibility import visibility_of_run
 from vdgs.settings.ranges import refuse
-from vdgs.settings.requests import RenderRequest
+from vdgs.settings.requests import LARGEST_SIDE_PX, RenderRequest
 
 #: Pace of a film of separate views.
 SLIDES_PER_SECOND = 2.0
+#: What drawing takes at most of memory for each pixel: the raster, its depth, pictures made of it.
+BYTES_PER_PIXEL = 100
 
 
 def render_run(asked: RenderRequest, console: Console) -> None:
@@ -31,11 +38,14 @@ def render_run(asked: RenderRequest, console: Console) -> None:
     Raises VdgsError for an unusable path, codec or output.
     """
     refuse(asked)
-    run = open_run(asked.run, asked.model, asked.device)
-    named, fps = _cameras(asked, run)
+    folder = RunFolder(asked.run)
+    run = open_model(folder, asked.model, asked.device)
+    flight = _flight(asked, run)
+    named, fps = _cameras(asked, flight)
     if asked.width:
         named = [(name, camera.resized(asked.width, _height(camera, asked.width))) for name, camera in named]
-    frames = _frames(asked.kind, run, named, console)
+    _refuse_large(asked, [camera for _, camera in named])
+    frames = _frames(asked.kind, run, flight, named, console)
     if asked.output.suffix:
         sizes = {(camera.width, camera.height) for _, camera in named}
         if len(sizes) > 1:
@@ -51,23 +61,49 @@ def render_run(asked: RenderRequest, console: Console) -> None:
     console.print(f"{len(named)} views: {asked.output}", highlight=False)
 
 
-def _cameras(asked: RenderRequest, run: TrainedRun) -> tuple[list[tuple[str, Camera]], float]:
+def _flight(asked: RenderRequest, run: OpenedModel) -> Flight:
+    """The cameras of the run: as it keeps them, else of its capture, which is asked too where it is named."""
+    facts = run.model.facts.get("capture", {})
+    kept = kept_flight(run.folder, facts) if asked.capture is None else None
+    if kept is not None:
+        return kept
+    capture = open_capture(run.folder, asked.capture)
+    refuse_another_capture(run.model_path, facts, capture)
+    return flight_of(capture)
+
+
+def _cameras(asked: RenderRequest, flight: Flight) -> tuple[list[tuple[str, Camera]], float]:
     """The cameras with their names, and the frames per second for a film of them."""
-    capture = run.capture
     if asked.path is None and asked.views in ("test", "train"):
-        views = capture.test_views if asked.views == "test" else capture.train_views
-        stems = file_stems([view.name for view in views])
-        cameras, fps = [view.camera for view in views], asked.fps or SLIDES_PER_SECOND
-        return list(zip(stems, cameras, strict=True)), fps
-    flown, template = [view.camera for view in capture.train_views], capture.train_views[0].camera
+        names, cameras = zip(*(flight.test if asked.views == "test" else flight.train), strict=True)
+        return list(zip(file_stems(list(names)), cameras, strict=True)), asked.fps or SLIDES_PER_SECOND
+    template = flight.cameras[0]
     length, rate = asked.seconds or render_paths.SECONDS, asked.fps or render_paths.FPS
     if asked.path is not None:
-        path = render_paths.load_path(asked.path, template, capture.ground, asked.seconds or None, asked.fps or None)
+        path = load_path(asked.path, template, flight.ground, asked.seconds or None, asked.fps or None)
     elif asked.views == "orbit":
-        path = render_paths.orbit(capture.points, flown, template, length, rate)
+        path = render_paths.orbit(flight.middle[None], flight.cameras, template, length, rate)
     else:
-        path = render_paths.flyover(flown, template, length, rate)
+        path = render_paths.flyover(flight.cameras, template, length, rate)
     return [(f"{i:05d}", camera) for i, camera in enumerate(path.cameras)], path.fps
+
+
+def _refuse_large(asked: RenderRequest, cameras: list[Camera]) -> None:
+    """Raise VdgsError, before anything is drawn, for pictures that memory does not hold or nothing can show."""
+    largest = max(cameras, key=lambda camera: camera.width * camera.height)
+    size = f"{largest.width}x{largest.height}"
+    where = f"{asked.path}: " if asked.path is not None and not asked.width else ""
+    if max(largest.width, largest.height) > LARGEST_SIDE_PX:
+        raise VdgsError(
+            f"{where}pictures of {size} are too large: at most {LARGEST_SIDE_PX} pixels a side can be drawn. "
+            "Give a smaller --width."
+        )
+    need, free = largest.width * largest.height * BYTES_PER_PIXEL, available_bytes()
+    if need > free:
+        raise VdgsError(
+            f"{where}a picture of {size} takes about {need / 1e9:.1f} GB to draw, and {free / 1e9:.1f} GB are free. "
+            "Give a smaller --width."
+        )
 
 
 def _height(camera: Camera, width: int) -> int:
@@ -75,10 +111,10 @@ def _height(camera: Camera, width: int) -> int:
 
 
 def _frames(
-    kind: str, run: TrainedRun, named: list[tuple[str, Camera]], console: Console
+    kind: str, run: OpenedModel, flight: Flight, named: list[tuple[str, Camera]], console: Console
 ) -> Iterator[tuple[str, np.ndarray]]:
     """One uint8 RGB picture per camera, in order."""
-    counts = visibility_of_run(run).float() if kind == "visibility" else None
+    counts = visibility_of_run(run, flight.cameras).float() if kind == "visibility" else None
     span: tuple[float, float] | None = None if counts is None else (0.0, float(counts.max()))
     for name, camera in track(named, "rendering", console=console, disable=not console.is_terminal):
         if kind == "image":

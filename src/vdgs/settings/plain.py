@@ -42,13 +42,14 @@ def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> l
 def from_dict(kind: type, values: Mapping[str, Any], where: str = "settings") -> Any:
     """The inverse of `to_dict` for a config class: what is not named keeps its default.
 
-    Raises ValueError, naming the setting, for one that the class does not have or of another shape.
+    Raises ValueError, naming the setting, for one that the class does not have or of another kind. `where` is the group
+    that it all stands in.
     """
     hints = typing.get_type_hints(kind, include_extras=True)
     unknown = sorted(values.keys() - hints.keys(), key=str)
     if unknown:
-        raise ValueError(f"{where} has no {unknown[0]!r}{suggestion(str(unknown[0]), hints)}")
-    return kind(**{name: _read(hints[name], value, f"{where}.{name}") for name, value in values.items()})
+        raise ValueError(f"{where or 'this file'} has no {unknown[0]!r}{suggestion(str(unknown[0]), hints)}")
+    return kind(**{name: _read(hints[name], value, f"{where}.{name}".lstrip(".")) for name, value in values.items()})
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:
@@ -80,9 +81,9 @@ def _read(hint: Any, value: Any, where: str) -> Any:
     if kind is float and isinstance(value, str):  # YAML takes 1e-4 for text: it wants 1.0e-4
         with suppress(ValueError):
             return float(value)
-    if isinstance(kind, type) and isinstance(value, (int, float) if kind is float else kind):
-        if kind is bool or not isinstance(value, bool):
-            return value
+    plain = isinstance(kind, type) and isinstance(value, (int, float) if kind is float else kind)
+    if plain and (kind is bool or not isinstance(value, bool)):
+        return value
     raise ValueError(f"{where} is {value!r}; it must be {_words(hint)}")
 
 

@@ -73,13 +73,19 @@ class RenderRequest:
     views: Literal["test", "train", "orbit", "flyover"] = "test"
     """Which cameras; `orbit` and `flyover` are paths made from the capture."""
     path: Path | None = None
-    """JSON file with a camera path (docs/conventions.md); overrides --views."""
+    """JSON file with a camera path; overrides --views. Either one exported by nerfstudio's viewer, or
+    {"keyframes": [{"position": [x, y, z], "look_at": [x, y, z], "fov_deg": 60}, ...]} in the ground frame; beside it,
+    as you like, "frame": "source" (that of the capture's own cameras), "seconds", "fps", "closed", "interpolate". A key
+    frame may also have "up", "width", "height", "fx", "fy", "cx", "cy", or in place of position and look_at a matrix
+    "camera_from_world" (docs/conventions.md)."""
     seconds: Annotated[float, SECONDS] = 0.0
     """Length of a camera path; 0: what its file says, or 12 seconds."""
     fps: Annotated[float, FPS] = 0.0
     """Frames per second of a camera path and of the video; 0: what its file says, or 30 (2 for separate views)."""
     width: Annotated[int, Range(0, LARGEST_SIDE_PX)] = 0
     """Image width; 0 takes that of the training views."""
+    capture: Path | None = None
+    """Where the capture lies now. Only runs that do not keep their cameras (of an older version) need it."""
     kind: Literal["image", "depth", "visibility"] = "image"
     """What to draw: the picture; the median depth, at which a pixel becomes half opaque (black where it never does); or
     the number of cameras that see each place."""

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from vdgs.settings.ranges import WORKERS
 from vdgs.settings.requests import BINS, ModelName, RenderRequest
-from vdgs.verbs.shared import open_console, parse, use_device, use_threads
+from vdgs.verbs.shared import find_capture, open_console, parse, use_device, use_threads
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,8 @@ class EvalArguments:
     views: Literal["test", "training"] = "test"
     """Which views. `training` goes into evaluation_training: a model that is much better there than on test views
     overfits. Blocks and seams are measured on test views only."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     bins: Annotated[int, BINS] = 4
@@ -37,9 +39,11 @@ class EvalArguments:
 
 def eval(arguments: list[str]) -> None:
     asked = parse(EvalArguments, arguments, "vdgs eval")
+    from vdgs.runs.folder import RunFolder
     from vdgs.stages.evaluate import evaluate_stage
 
     device = use_device(asked.device)
+    find_capture(RunFolder(asked.run), asked.capture)
     use_threads(asked.threads)
     evaluate_stage(asked.run, asked.model, asked.lpips_weights, asked.bins, open_console(), asked.views, device)
 

@@ -69,6 +69,14 @@ def change_settings(run: RunFolder, method: MethodConfig, redo: bool) -> None:
                 open_console().print(f"[yellow]changed[/] {line}", highlight=False)
 
 
+def find_capture(run: RunFolder, at: Path | None) -> None:
+    """Let the run find its capture where --capture says that it lies now, if it says so."""
+    if at is not None:
+        from vdgs.runs.opening import remember_capture
+
+        remember_capture(run, at)
+
+
 def use_threads(count: int) -> None:
     from vdgs.kernels import set_threads, threads
 

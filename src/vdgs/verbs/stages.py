@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, PartitionConfig
 from vdgs.settings.ranges import WORKERS, Range
 from vdgs.settings.watching import WatchOptions
-from vdgs.verbs.shared import change_settings, open_console, parse, recorded_run, use_device, use_threads
+from vdgs.verbs.shared import change_settings, find_capture, open_console, parse, recorded_run, use_device, use_threads
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,8 @@ class VisibilityArguments:
 
     run: Positional[Path]
     """Run folder with a coarse model."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
 
 
 def visibility(arguments: list[str]) -> None:
@@ -28,7 +30,9 @@ def visibility(arguments: list[str]) -> None:
     from vdgs.runs.folder import RunFolder
     from vdgs.stages.visibility import measure_visibility
 
-    measure_visibility(RunFolder(asked.run), open_console())
+    run = RunFolder(asked.run)
+    find_capture(run, asked.capture)
+    measure_visibility(run, open_console())
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,8 @@ class PartitionArguments:
     """Run folder with a coarse model."""
     redo: bool = False
     """Allow another cut to discard blocks that are trained."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
     why: str | None = None
     """Name of a training photograph: also say how well it shows each block and why it was assigned or not."""
     threads: Annotated[int, WORKERS] = 0
@@ -54,6 +60,7 @@ def partition(arguments: list[str]) -> None:
     from vdgs.stages.partition import explain_view, partition_run
 
     use_threads(asked.threads)
+    find_capture(run, asked.capture)
     change_settings(run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.redo)
     partition_run(run, open_console())
     if asked.why is not None:
@@ -68,6 +75,8 @@ class TrainArguments:
     """Run folder that is cut into blocks."""
     block: Annotated[int | None, Range(0, 10_000)] = None
     """Only this block, in this process; without it all of them, several at once."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
     jobs: Annotated[int, WORKERS] = 0
     """Blocks trained at once; 0 takes what cores and memory allow."""
     redo: bool = False
@@ -85,6 +94,7 @@ def train(arguments: list[str]) -> None:
     default = TrainArguments(tyro.MISSING, settings=method.block)
     asked = parse(TrainArguments, arguments, "vdgs train", default)
     device = use_device(asked.device)
+    find_capture(run, asked.capture)
     change_settings(run, replace(method, block=asked.settings), asked.redo)
     if asked.block is not None:
         from vdgs.executors.parent import stop_when_parent_dies
@@ -105,6 +115,8 @@ class MergeArguments:
 
     run: Positional[Path]
     """Run folder whose blocks are trained."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
     incomplete: bool = False
     """Let the coarse model stand in for blocks that are missing or failed."""
     merge: Annotated[MergeConfig, arg(name="")] = field(default_factory=MergeConfig)
@@ -116,5 +128,6 @@ def merge(arguments: list[str]) -> None:
     asked = parse(MergeArguments, arguments, "vdgs merge", default)
     from vdgs.stages.merge import merge_run
 
+    find_capture(run, asked.capture)
     change_settings(run, replace(method, merge=asked.merge), redo=False)
     merge_run(asked.run, asked.incomplete, open_console())

@@ -264,7 +264,7 @@ def _points_binary(file: Path) -> tuple[np.ndarray, np.ndarray]:
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
     """Numbered lines without the leading comments."""
     try:
-        with file.open(encoding="utf-8") as stream:
+        with file.open(encoding="utf-8-sig") as stream:
             for number, line in enumerate(stream, 1):
                 if not line.startswith("#"):
                     yield number, line.rstrip("\r\n")
