@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"vdgs {__version__}")
         return
     if arguments[0] not in VERBS:
-        print(f"vdgs: there is no verb {arguments[0]!r}{_like(arguments[0])}\n\n{HELP}", end="", file=sys.stderr)
+        print(f"{HELP}\nvdgs: there is no verb {arguments[0]!r}{_like(arguments[0])}", file=sys.stderr)
         sys.exit(2)
     sys.exit(_run(arguments[0], arguments[1:]))
 

@@ -12,7 +12,16 @@ from tyro.conf import Positional, arg
 from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, PartitionConfig
 from vdgs.settings.ranges import WORKERS, Range
 from vdgs.settings.watching import WatchOptions
-from vdgs.verbs.shared import change_settings, find_capture, open_console, parse, recorded_run, use_device, use_threads
+from vdgs.verbs.shared import (
+    change_settings,
+    find_capture,
+    open_console,
+    parse,
+    recorded_run,
+    refuse_idle_blocks,
+    use_device,
+    use_threads,
+)
 
 
 @dataclass(frozen=True)
@@ -57,6 +66,7 @@ def partition(arguments: list[str]) -> None:
     run, method = recorded_run(arguments, PartitionArguments, "vdgs partition")
     default = PartitionArguments(tyro.MISSING, partition=method.partition, assignment=method.assignment)
     asked = parse(PartitionArguments, arguments, "vdgs partition", default)
+    refuse_idle_blocks(arguments, asked.partition)
     from vdgs.stages.partition import explain_view, partition_run
 
     use_threads(asked.threads)

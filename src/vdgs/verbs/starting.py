@@ -15,7 +15,7 @@ from vdgs.settings.presets import PRESETS, PresetName
 from vdgs.settings.ranges import WORKERS
 from vdgs.settings.requests import RunRequest
 from vdgs.settings.watching import WatchOptions
-from vdgs.verbs.shared import named_preset, open_console, parse, use_device, use_threads
+from vdgs.verbs.shared import named_preset, open_console, parse, refuse_idle_blocks, use_device, use_threads
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,7 @@ def run(arguments: list[str]) -> None:
         assignment=settings.assignment, block=settings.block, merge=settings.merge,
     )  # fmt: skip
     asked = parse(RunArguments, arguments, "vdgs run", default)
+    refuse_idle_blocks(arguments, asked.partition)
     from vdgs.pipeline import run_all
 
     device = use_device(asked.device)
