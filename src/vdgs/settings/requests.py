@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.settings.presets import PresetName
+from vdgs.settings.ranges import WORKERS, Named, Range
 from vdgs.settings.watching import WatchOptions
+
+#: Groups by visibility: with more than some dozens none holds enough pixels to say anything.
+BINS = Range(1, 100)
+#: Length and pace of a film; 0 leaves them to the path. Encoders take no more frames a second.
+SECONDS, FPS = Range(0, 86_400), Range(0, 1000)
+#: The longest side of a picture that is drawn, in pixels: more than any film and any screen holds.
+LARGEST_SIDE_PX = 16_384
+#: Frames of one film: nearly two hours at 30 a second.
+MOST_FRAMES = 200_000
 
 #: `best` is the merged model where there is one for the run's settings, else the coarse one.
 ModelName = Literal["best", "coarse", "merged"]
@@ -27,25 +37,25 @@ class RunRequest:
     """`paper`: the paper's settings (100 000 + 50 000 iterations a block). `laptop`: a good result in minutes."""
     redo: bool = False
     """Allow other settings than the run has to discard what was trained with the old ones."""
-    jobs: int = 0
+    jobs: Annotated[int, WORKERS] = 0
     """Blocks trained at once; 0 takes what cores and memory allow."""
     incomplete: bool = False
     """Go on if a block fails: the coarse model stands in for it."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
-    bins: int = 4
+    bins: Annotated[int, BINS] = 4
     """Number of visibility quantiles by which metrics are reported."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
-    options: CaptureOptions = field(default_factory=CaptureOptions)
-    training: TrainConfig = field(default_factory=TrainConfig)
-    partition: PartitionConfig = field(default_factory=PartitionConfig)
+    options: Annotated[CaptureOptions, Named("")] = field(default_factory=CaptureOptions)
+    training: Annotated[TrainConfig, Named("")] = field(default_factory=TrainConfig)
+    partition: Annotated[PartitionConfig, Named("")] = field(default_factory=PartitionConfig)
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
     block: BlockConfig = field(default_factory=BlockConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
-    watching: WatchOptions = field(default_factory=WatchOptions)
+    watching: Annotated[WatchOptions, Named("")] = field(default_factory=WatchOptions)
 
     def method(self) -> MethodConfig:
         """The settings that the result depends on."""
@@ -64,13 +74,19 @@ class RenderRequest:
     views: Literal["test", "train", "orbit", "flyover"] = "test"
     """Which cameras; `orbit` and `flyover` are paths made from the capture."""
     path: Path | None = None
-    """JSON file with a camera path (docs/conventions.md); overrides --views."""
-    seconds: float = 0.0
+    """JSON file with a camera path; overrides --views. Either one exported by nerfstudio's viewer, or
+    {"keyframes": [{"position": [x, y, z], "look_at": [x, y, z], "fov_deg": 60}, ...]} in the ground frame; beside it,
+    as you like, "frame": "source" (that of the capture's own cameras), "seconds", "fps", "closed", "interpolate". A key
+    frame may also have "up", "width", "height", "fx", "fy", "cx", "cy", or in place of position and look_at a matrix
+    "camera_from_world" (docs/conventions.md)."""
+    seconds: Annotated[float, SECONDS] = 0.0
     """Length of a camera path; 0: what its file says, or 12 seconds."""
-    fps: float = 0.0
+    fps: Annotated[float, FPS] = 0.0
     """Frames per second of a camera path and of the video; 0: what its file says, or 30 (2 for separate views)."""
-    width: int = 0
+    width: Annotated[int, Range(0, LARGEST_SIDE_PX)] = 0
     """Image width; 0 takes that of the training views."""
+    capture: Path | None = None
+    """Where the capture lies now. Only runs that do not keep their cameras (of an older version) need it."""
     kind: Literal["image", "depth", "visibility", "alpha"] = "image"
     """What to draw: the picture; the median depth, at which a pixel becomes half opaque (grey where it never does); the
     number of training cameras that see each place, V; or alpha, how opaque the scene is."""
@@ -81,7 +97,7 @@ class RenderRequest:
     units of the ground frame (metres where known); depth and V are NaN where nothing is drawn."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
