@@ -8,6 +8,7 @@ from typing import Any, Literal
 from rich.console import Console
 
 from vdgs.errors import RunError
+from vdgs.evaluation.lpips import refuse_missing
 from vdgs.evaluation.of_run import evaluation_folder
 from vdgs.report import write_report
 from vdgs.runs.beginning import begin_run
@@ -29,6 +30,7 @@ def run_all(asked: RunRequest, console: Console) -> None:
     Raises what the stages raise; all that was finished before stays, and the same command continues.
     """
     refuse(asked)
+    refuse_missing(asked.lpips_weights)
     run, capture = begin_run(asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo)
     _title(console, "coarse model")
     train_coarse(run, capture, asked.watching, console, asked.device)
