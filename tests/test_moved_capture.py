@@ -200,6 +200,16 @@ def test_a_setting_in_the_file_that_cannot_be_is_named(folder, change, says, tmp
     assert f"config.yaml: {says}" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("verb", ["run", "eval"])
+def test_weights_that_are_not_there_are_said_before_any_work(trained, tmp_path, verb, capsys):
+    first = [str(trained / "place"), "--output", str(tmp_path / "new")] if verb == "run" else [str(trained / "run")]
+    with pytest.raises(SystemExit) as ended:
+        main([verb, *first, "--device", "cpu", "--threads", "1", "--lpips-weights", "nowhere.pth"])
+    assert ended.value.code == 1
+    assert "--lpips-weights nowhere.pth: no such file" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
 @pytest.mark.parametrize("verb", ["run", "partition"])
 def test_a_number_of_blocks_without_blocks_asks_which_is_meant(trained, verb, capsys):
     first = [str(trained / "place"), "--output", str(trained / "new")] if verb == "run" else [str(trained / "run")]

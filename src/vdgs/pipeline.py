@@ -10,6 +10,7 @@ from rich.markup import escape
 
 from vdgs.captures.capture import Capture
 from vdgs.errors import RunError
+from vdgs.evaluation.lpips import refuse_missing
 from vdgs.evaluation.of_run import evaluation_folder
 from vdgs.report import write_report
 from vdgs.report.terminal import next_step, whole_standing
@@ -35,6 +36,7 @@ def run_all(asked: RunRequest, console: Console, command: str | None = None) -> 
     Raises what the stages raise; all that was finished before stays, and the same command continues.
     """
     refuse(asked)
+    refuse_missing(asked.lpips_weights)
     run, capture = begin_run(
         asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo, command=command
     )

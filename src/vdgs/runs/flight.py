@@ -91,12 +91,10 @@ def kept_flight(run: RunFolder, facts: dict[str, Any]) -> Flight | None:
             float(frame["scale"]), np.array(frame["rotation"], np.float64), np.array(frame["translation"], np.float64),
             bool(frame["metric"]), str(frame["how"]), None if geo is None else tuple(geo),
         )  # fmt: skip
-        train, test = (
-            tuple(_view(each) for each in record["views"] if each["split"] == side) for side in ("train", "test")
-        )
+        views = [(each["split"], _view(each)) for each in record["views"]]
         return Flight(
-            train,
-            test,
+            tuple(view for split, view in views if split == "train"),
+            tuple(view for split, view in views if split == "test"),
             ground,
             np.array(record["middle"], np.float64),
             float(record["camera_height"]),

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.settings.presets import PresetName
-from vdgs.settings.ranges import WORKERS, Named, Range
+from vdgs.settings.ranges import LARGE, MANY, WORKERS, Named, Range
 from vdgs.settings.watching import WatchOptions
 
 #: Groups by visibility: with more than some dozens none holds enough pixels to say anything.
@@ -20,6 +20,9 @@ SECONDS, FPS = Range(0, 86_400), Range(0, 1000)
 LARGEST_SIDE_PX = 16_384
 #: Frames of one film: nearly two hours at 30 a second.
 MOST_FRAMES = 200_000
+
+#: Coordinates of maps: no system on Earth has larger ones (Earth-centred metres have seven digits).
+PLACE = Range(-1e9, 1e9)
 
 #: `best` is the merged model where there is one for the run's settings, else the coarse one.
 ModelName = Literal["best", "coarse", "merged"]
@@ -111,10 +114,10 @@ class MapRequest:
     """Run folder."""
     output: Path | None = None
     """Folder for the maps; by default RUN/maps."""
-    gsd: float | None = None
+    gsd: Annotated[float | None, Range(0, LARGE, above=True)] = None
     """Side of a pixel in units of the map (metres, mostly); by default the median that a pixel of the training
     photographs shows of the ground, at the size at which they were used."""
-    bbox: tuple[float, float, float, float] | None = None
+    bbox: Annotated[tuple[float, float, float, float] | None, PLACE] = None
     """X0 Y0 X1 Y1 in coordinates of the map; by default what the training photographs show."""
     crs: str | None = None
     """Coordinates of the map: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source` (those
@@ -123,7 +126,7 @@ class MapRequest:
     """Take the fine detail of the orthophoto from the photographs, where they truly see a place."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
@@ -140,11 +143,11 @@ class ExportRequest:
     .points.ply, .laz, .las (point clouds). Give --to again for more: the scene is baked once (docs/export.md)."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
-    block: int | None = None
+    block: Annotated[int | None, Range(0, 10_000)] = None
     """Only what this block of the merged scene owns."""
-    bbox: tuple[float, float, float, float] | None = None
+    bbox: Annotated[tuple[float, float, float, float] | None, PLACE] = None
     """Only Gaussians whose centres lie within X0 Y0 X1 Y1, in coordinates of --crs."""
-    max_gaussians: int = 0
+    max_gaussians: Annotated[int, Range(0, MANY)] = 0
     """Only so many Gaussians, those that make most of the training photographs; 0 for all."""
     sh_degree: Literal[0, 1, 2, 3] = 3
     """How colours change with the direction: spherical harmonics up to this degree. 0: not at all, and a fifth of the
@@ -155,7 +158,7 @@ class ExportRequest:
     for .laz and .las; else `local`."""
     measure: bool = True
     """Read a file back, draw the test views and say what was lost against the model itself."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
