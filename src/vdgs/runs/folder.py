@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -281,13 +283,14 @@ class RunFolder:
         write_text(self.config_file, yaml.safe_dump(header | settings, sort_keys=False, allow_unicode=True))
 
     def command(self) -> str | None:
-        """The command that gave the run the settings that it has; None where several did, or nothing says it."""
+        """The command that gave the run the settings that it has; None where several did, nothing says it, or the
+        folder is a copy of the one that the command works on."""
         try:
             header = yaml.safe_load(self.config_file.read_text(encoding="utf-8-sig"))["vdgs"]
         except (OSError, yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError):
             return None
         command = header.get("command") if isinstance(header, dict) else None
-        return command if isinstance(command, str) else None
+        return command if isinstance(command, str) and not _makes_another(command, self.path) else None
 
     def settings(self) -> dict[str, Any]:
         """The settings of the run, every section whole, without the header that says which version wrote them."""
@@ -358,6 +361,17 @@ class RunFolder:
     @property
     def _driver(self) -> Path:
         return self.path / ".run"
+
+
+def _makes_another(command: str, folder: Path) -> bool:
+    """Whether a command names the whole path of another folder as its output: this one is a copy."""
+    try:
+        words = shlex.split(command)
+    except ValueError:
+        return True
+    outputs = [after for word, after in pairwise(words) if word == "--output"]
+    outputs += [word.removeprefix("--output=") for word in words if word.startswith("--output=")]
+    return any(os.path.isabs(each) and os.path.realpath(each) != os.path.realpath(folder) for each in outputs)
 
 
 def _commit() -> str | None:
