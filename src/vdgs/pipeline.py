@@ -9,15 +9,16 @@ from rich.console import Console
 from rich.markup import escape
 
 from vdgs.captures.capture import Capture
-from vdgs.errors import RunError
+from vdgs.errors import RunError, VdgsError
 from vdgs.evaluation.lpips import refuse_missing
 from vdgs.evaluation.of_run import evaluation_folder
+from vdgs.maps.mapping import can_map, is_mapped, map_run
 from vdgs.report import write_report
 from vdgs.report.terminal import next_step, whole_standing
 from vdgs.runs.beginning import begin_run
 from vdgs.runs.folder import RunFolder
 from vdgs.settings.ranges import refuse
-from vdgs.settings.requests import RunRequest
+from vdgs.settings.requests import MapRequest, RunRequest
 from vdgs.stages.coarse import train_coarse
 from vdgs.stages.evaluate import evaluate_stage, is_measured
 from vdgs.stages.merge import merge_run
@@ -64,8 +65,24 @@ def _stages(run: RunFolder, capture: Capture, asked: RunRequest, console: Consol
     merge_run(run.path, asked.incomplete, console)
     _measure(run, "merged", asked, console)
     _verdict(run, console)
+    if asked.maps:
+        _map(run, asked, console)
     stop_if_asked()
     console.print(f"report: {write_report(run)}", highlight=False)
+
+
+def _map(run: RunFolder, asked: RunRequest, console: Console) -> None:
+    """Orthophoto, surface model and visibility. What hinders a map does not spoil a run: it is said."""
+    _title(console, "maps")
+    if not can_map():
+        console.print("[yellow]note[/] no maps: they need pip install 'vdgs\\[geo]'", highlight=False)
+    elif is_mapped(run):
+        console.print(f"{run.path / 'maps'}: already drawn; nothing to do", highlight=False)
+    else:
+        try:
+            map_run(MapRequest(run.path, device=asked.device), console)
+        except VdgsError as error:
+            console.print(f"[yellow]note[/] no maps: {escape(str(error))}", highlight=False)
 
 
 def _title(console: Console, name: str) -> None:

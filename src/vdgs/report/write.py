@@ -13,7 +13,7 @@ from vdgs.report.costs import costs_section, settings_section
 from vdgs.report.page import Html, contents, document, escaped, joined, paragraph
 from vdgs.report.reading import Record, Shown, Source
 from vdgs.report.results import by_visibility_section, metrics_of, result_table, seams_section, verdict, views_section
-from vdgs.report.scene import assignment_section, blocks_section, visibility_section
+from vdgs.report.scene import assignment_section, blocks_section, maps_section, visibility_section
 from vdgs.report.training import training_section
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.standing import RunStanding, Standing, standing_of
@@ -22,7 +22,7 @@ from vdgs.storage.files import write_text
 #: name and title of the sections, for the links at the top
 CONTENTS = (
     ("visibility", "visibility"), ("blocks", "blocks"), ("cameras", "cameras"), ("training", "training"),
-    ("views", "test views"), ("by-visibility", "quality by visibility"), ("seams", "per block"),
+    ("views", "test views"), ("maps", "maps"), ("by-visibility", "quality by visibility"), ("seams", "per block"),
     ("costs", "time and memory"), ("settings", "settings"),
 )  # fmt: skip
 
@@ -46,6 +46,7 @@ def write_report(run: RunFolder) -> Path:
         assignment_section(shown),
         training_section(shown),
         views_section(shown),
+        maps_section(shown),
         by_visibility_section(shown),
         seams_section(shown),
         costs_section(shown),

@@ -44,6 +44,8 @@ class RunRequest:
     """Blocks trained at once; 0 takes what cores and memory allow."""
     incomplete: bool = False
     """Go on if a block fails: the coarse model stands in for it."""
+    maps: bool = True
+    """End with orthophoto, surface model and visibility as GeoTIFFs in RUN/maps, where `vdgs map` can make them."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     bins: Annotated[int, BINS] = 4
