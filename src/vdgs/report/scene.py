@@ -156,7 +156,7 @@ def maps_section(shown: Shown) -> Html:
     facts = source.record("maps/map.json")
     parts: list[Html] = []
     if not facts:
-        parts.append(paragraph("No maps were made of this run. `vdgs map RUN` makes them.", "note"))
+        parts.append(paragraph("No maps were made of this run. `vdgs map RUN` makes them."))
     elif facts.text("model_identity") != shown.run.merged.status().model:
         parts.append(
             paragraph("The maps are of another model than the run has now; `vdgs map RUN` draws them anew.", "note")
