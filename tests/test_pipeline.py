@@ -97,7 +97,8 @@ def test_a_scene_goes_out_and_says_what_it_loses(copied, tmp_path):
     done = vdgs("export", copied, "--to", scene, "--to", tmp_path / "out" / "scene.splat")
     assert done.returncode == 0, done.stderr
     assert "scene.ply, read back, on" in done.stdout
-    loss = json.loads((copied / "export.json").read_text())["loss"]
+    assert "scene.splat, read back, on" in done.stdout
+    loss = json.loads((copied / "export.json").read_text())["losses"][0]
     measured = json.loads((copied / "evaluation" / "metrics.json").read_text())
     assert loss["psnr"] == pytest.approx(measured["psnr"], abs=1e-6)
     assert loss["ssim"] == pytest.approx(measured["ssim"], abs=1e-6)
