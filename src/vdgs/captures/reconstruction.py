@@ -10,6 +10,10 @@ from vdgs.storage.files import read_json
 from vdgs.storage.records import record_of
 
 FILE, FIGURE = "reconstruction.json", "reconstruction.png"
+#: The folder of one that is not finished, or whose intermediate files are kept.
+WORK = "work"
+#: What says in it, and in the capture, which steps are done.
+STEPS = "steps.json"
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,11 @@ class ReconstructionFacts:
     advice: tuple[str, ...]
     seconds: float
     """Of the last part of the work, where it was interrupted."""
+
+
+def is_reconstruction(root: Path) -> bool:
+    """Whether a folder is a capture made of photographs here, finished or not."""
+    return (root / FILE).is_file() or (root / WORK / STEPS).is_file()
 
 
 def read_reconstruction(root: Path) -> ReconstructionFacts | None:

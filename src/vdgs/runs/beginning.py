@@ -10,13 +10,15 @@ from vdgs.captures.capture import Capture
 from vdgs.captures.facts import refuse_another_capture
 from vdgs.captures.loading import load_capture
 from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
+from vdgs.captures.reconstruction import FIGURE as RECONSTRUCTION_FIGURE
+from vdgs.captures.reconstruction import FILE as RECONSTRUCTION
 from vdgs.errors import VdgsError
 from vdgs.runs.folder import RunFolder
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.checks import validate
 from vdgs.settings.method import MethodConfig, with_iterations
 from vdgs.settings.plain import to_dict
-from vdgs.storage.files import read_json
+from vdgs.storage.files import read_json, write_bytes
 
 
 def begin_run(
@@ -51,7 +53,17 @@ def begin_run(
             run.begin(settings, ("capture", "training"), command)
         else:
             run.change_settings(settings, redo, command)
+        _keep_reconstruction(capture.root, run.path)
     return run, capture
+
+
+def _keep_reconstruction(root: Path, run: Path) -> None:
+    """How the capture was made of photographs, where it was made here: for the report, which reads the run alone."""
+    for name in (RECONSTRUCTION, RECONSTRUCTION_FIGURE):
+        if (root / name).is_file():
+            content = (root / name).read_bytes()
+            if not (run / name).is_file() or (run / name).read_bytes() != content:
+                write_bytes(run / name, content)
 
 
 def run_settings(capture_path: Path, capture_options: CaptureOptions, method: MethodConfig) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Literal
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.settings.presets import PresetName
+from vdgs.settings.sfm import SfmOptions
 from vdgs.settings.watching import WatchOptions
 
 #: `best` is the merged model where there is one for the run's settings, else the coarse one.
@@ -20,7 +21,7 @@ class RunRequest:
     """Everything from a capture to a report (`vdgs run`)."""
 
     capture: Path
-    """Folder of the capture."""
+    """Folder of the capture, or of photographs alone: they become one in RUN/capture first (`vdgs sfm`)."""
     output: Path
     """Run folder; new, or the run to continue."""
     preset: PresetName = "paper"
@@ -40,6 +41,7 @@ class RunRequest:
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
     options: CaptureOptions = field(default_factory=CaptureOptions)
+    sfm: SfmOptions = field(default_factory=SfmOptions)
     training: TrainConfig = field(default_factory=TrainConfig)
     partition: PartitionConfig = field(default_factory=PartitionConfig)
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)

@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
 
+from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source import listing
 from vdgs.captures.outputs import is_capture
 from vdgs.captures.photographs import IMAGE_SUFFIXES, without_suffix
+from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.errors import CaptureError
 from vdgs.sfm.photograph import Photograph, Unusable, read_photograph
 
@@ -50,6 +52,8 @@ def collect(folders: Sequence[Path]) -> Collection:
     for folder in folders:
         if not folder.is_dir():
             raise CaptureError(f"{folder}: no such folder. Give the folder that the photographs are in.")
+        if is_reconstruction(folder) and not is_capture(folder):
+            raise CaptureError(f"{folder}: is a capture that is not finished. Give its photographs and --output {folder}")
         if is_capture(folder):
             raise CaptureError(f"{folder}: is a capture already. Use it as it is: vdgs run {folder} --output RUN")
     named, others = _named(folders)
@@ -75,9 +79,11 @@ def collect(folders: Sequence[Path]) -> Collection:
     return Collection(tuple(folders), tuple(photographs), tuple(left_out), others)
 
 
-def holds_photographs(folder: Path) -> bool:
-    """Whether photographs lie in the folder or below it."""
-    return folder.is_dir() and any(_is_photograph(path) for path in folder.rglob("*"))
+def only_photographs(folder: Path) -> bool:
+    """Whether photographs lie in the folder or below it and no capture, whole or in part, is there."""
+    if not folder.is_dir() or is_capture(folder) or is_reconstruction(folder) or partial_model(folder) or (folder / "sparse").exists():
+        return False
+    return any(_is_photograph(path) for path in folder.rglob("*"))
 
 
 def _is_photograph(path: Path) -> bool:

@@ -57,7 +57,7 @@ def draw_residuals(points: np.ndarray, positions: Positions, placed: Placed | No
 def _axes(title: str, metric: bool = True):  # type: ignore[no-untyped-def]
     figure = Figure(figsize=(8.5, 7.5), dpi=DPI, layout="constrained")
     axes = figure.subplots()
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")
     axes.set_title(title, loc="left", fontsize=TEXT, color=INK)
     axes.set(xlabel="east [m]" if metric else "x", ylabel="north [m]" if metric else "y")
     plain(axes)

@@ -15,7 +15,14 @@ from rich.console import Console
 
 from vdgs import __version__
 from vdgs.captures.outputs import refuse_in_a_capture
-from vdgs.captures.reconstruction import FIGURE, FILE, ReconstructionFacts, read_reconstruction
+from vdgs.captures.reconstruction import (
+    FIGURE,
+    FILE,
+    WORK,
+    ReconstructionFacts,
+    is_reconstruction,
+    read_reconstruction,
+)
 from vdgs.errors import VdgsError
 from vdgs.kernels import threads as threads_available
 from vdgs.runs.locks import hold
@@ -28,7 +35,7 @@ from vdgs.sfm.figures import draw_positions, draw_residuals
 from vdgs.sfm.look import Look, look_at, seconds
 from vdgs.sfm.positions import Positions, find_positions
 from vdgs.sfm.telling import tell_facts, tell_look
-from vdgs.sfm.work import WORK, Work, key_of, quiet_colmap
+from vdgs.sfm.work import Work, key_of, quiet_colmap
 from vdgs.storage.files import jsonable, write_json
 from vdgs.storage.records import plain
 
@@ -97,6 +104,7 @@ def reconstruct(request: SfmRequest, console: Console) -> ReconstructionFacts:
     tell(prepared, console)
     _check_disk(prepared)
     with hold(output):
+        work.path.mkdir(exist_ok=True)
         draw_positions(prepared.positions, _in_time(prepared), "Where the photographs were taken", output / MAP)
         facts = _steps(prepared, work, keys, console)
         if not request.keep_work:
@@ -152,7 +160,7 @@ def _is_finished(output: Path, key: str) -> bool:
 
 def _refuse_other_things(output: Path) -> None:
     """Only a new folder, an empty one, or one of an earlier reconstruction is written to."""
-    if output.is_dir() and any(output.iterdir()) and not (output / WORK).is_dir() and not (output / FILE).is_file():
+    if output.is_dir() and not is_reconstruction(output) and any(each.name != ".lock" for each in output.iterdir()):
         raise VdgsError(f"{output}: holds other things already. Choose a new folder with --output.")
     if output.exists() and not output.is_dir():
         raise VdgsError(f"{output}: is a file. Choose a new folder with --output.")

@@ -16,13 +16,12 @@ import pycolmap
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from vdgs.captures.reconstruction import STEPS
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.storage.files import read_record, write_json
 from vdgs.watching.interrupts import stop_if_asked
 
 Result = TypeVar("Result")
-#: The folder inside the output; it also says that the output is a reconstruction that is not finished.
-WORK = "work"
 #: Seconds between two looks whether a person asked to stop.
 _GLANCE = 0.2
 
@@ -63,7 +62,7 @@ class Work:
         shutil.rmtree(self.path, ignore_errors=True)
 
     def _steps(self, which: str) -> dict[str, Any]:
-        steps = read_record(self.path / "steps.json").get(which)
+        steps = read_record(self.path / STEPS).get(which)
         return steps if isinstance(steps, dict) else {}
 
     def _note(self, which: str, step: str, key: str) -> None:
@@ -71,7 +70,7 @@ class Work:
         steps[which][step] = key
         if which == "begun":
             steps["done"].pop(step, None)
-        write_json(self.path / "steps.json", steps)
+        write_json(self.path / STEPS, steps)
 
 
 def key_of(*parts: Any) -> str:
