@@ -39,8 +39,8 @@ transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of Matri
 """
 
 VERBS = (
-    "inspect", "run", "sfm", "status", "coarse", "visibility", "partition", "train", "merge", "eval", "report", "render",
-    "map", "export", "synth", "bench", "doctor",
+    "inspect", "run", "sfm", "status", "coarse", "visibility", "partition", "train", "merge", "eval", "report",
+    "render", "map", "export", "synth", "bench", "doctor",
 )  # fmt: skip
 #: Verbs that take up what they left when they were interrupted.
 CONTINUES = ("run", "sfm", "coarse", "train", "bench")

@@ -61,7 +61,10 @@ class Plan:
 
 
 def plan_run(asked: RunRequest, console: Console) -> Plan | None:
-    """Say what `vdgs run` would do and take; None of photographs alone, whose training nobody knows yet. Raises what reading the capture raises, VdgsError for bad settings."""
+    """Say what `vdgs run` would do and take; None of photographs alone, whose training nobody knows.
+
+    Raises what reading the capture raises, VdgsError for bad settings.
+    """
     method = asked.method()
     if problems := validate(method):
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))

@@ -96,8 +96,8 @@ def _read(root: Path, options: CaptureOptions) -> SourceCapture:
         return read_transforms(root, options)
     if is_reconstruction(root):
         raise CaptureError(
-            f"{root}: is not finished: vdgs sfm was stopped. The command that began it goes on with it (its photographs, "
-            f"--output {root})."
+            f"{root}: is not finished: vdgs sfm was stopped. The command that began it goes on "
+            f"with it (its photographs, --output {root})."
         )
     raise CaptureError(
         f"{root}: not a capture. {partial_model(root)}Looked for a COLMAP model (sparse/0/cameras.bin and "

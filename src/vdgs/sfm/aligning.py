@@ -1,4 +1,4 @@
-"""A model brought to metres, east, north and up: by positions, and by the recorded attitudes where they do not suffice."""
+"""A model brought to metres, east, north and up: by positions, and by recorded attitudes where they do not do."""
 
 from __future__ import annotations
 
@@ -32,9 +32,7 @@ class Placed:
     """Which of them the placing trusts, [m] bool."""
 
 
-def place(
-    model: pycolmap.Reconstruction, photographs: Sequence[Photograph], positions: Positions
-) -> Placed | None:
+def place(model: pycolmap.Reconstruction, photographs: Sequence[Photograph], positions: Positions) -> Placed | None:
     """The similarity that brings the model to its positions; None where they are too few. Does not change the model."""
     images = {image.name: image for image in model.images.values() if image.has_pose}
     placed = [row for row, i in enumerate(positions.index) if photographs[int(i)].name in images]

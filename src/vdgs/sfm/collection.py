@@ -53,7 +53,9 @@ def collect(folders: Sequence[Path]) -> Collection:
         if not folder.is_dir():
             raise CaptureError(f"{folder}: no such folder. Give the folder that the photographs are in.")
         if is_reconstruction(folder) and not is_capture(folder):
-            raise CaptureError(f"{folder}: is a capture that is not finished. Give its photographs and --output {folder}")
+            raise CaptureError(
+                f"{folder}: is a capture that is not finished. Give its photographs and --output {folder}"
+            )
         if is_capture(folder):
             raise CaptureError(f"{folder}: is a capture already. Use it as it is: vdgs run {folder} --output RUN")
     named, others = _named(folders)
@@ -81,7 +83,13 @@ def collect(folders: Sequence[Path]) -> Collection:
 
 def only_photographs(folder: Path) -> bool:
     """Whether photographs lie in the folder or below it and no capture, whole or in part, is there."""
-    if not folder.is_dir() or is_capture(folder) or is_reconstruction(folder) or partial_model(folder) or (folder / "sparse").exists():
+    if (
+        not folder.is_dir()
+        or is_capture(folder)
+        or is_reconstruction(folder)
+        or partial_model(folder)
+        or (folder / "sparse").exists()
+    ):
         return False
     return any(_is_photograph(path) for path in folder.rglob("*"))
 

@@ -78,7 +78,7 @@ def why_left_out(
             if image.has_pose:
                 reasons.setdefault(
                     image.name,
-                    f"belongs to a part of {count} photographs that nothing joins to the rest: fly more overlap between",
+                    f"belongs to a part of {count} photographs that nothing joins to the rest: more overlap between",
                 )
     found = []
     for name in names:
@@ -142,8 +142,8 @@ def _warnings(
         drift = camera.focal_after_px / camera.focal_before_px - 1
         if not held and camera.focal_source != "a guess" and abs(drift) > FOCAL_DRIFT:
             found.append(
-                f"{camera.name}: the fitted focal length is {drift:+.0%} of what {camera.focal_source} says; if heights "
-                "look wrong, hold it: --focal hold"
+                f"{camera.name}: the fitted focal length is {drift:+.0%} of what {camera.focal_source} says; if "
+                "heights look wrong, hold it: --focal hold"
             )
     if height is not None and recorded is not None and abs(height / recorded - 1) > HEIGHT_DRIFT:
         found.append(
@@ -164,8 +164,8 @@ def _advice(look: Look, held: bool, registered: int, found: int, metric: bool) -
         advice.append("fly the strips closer together, or a second grid across the first: every place in 8 or more.")
     if held and look.oblique is not None and look.oblique == 0:
         advice.append(
-            f"add oblique views (camera {OBLIQUE_DEG + 10:.0f}° or more from straight down) or a second height: walls come "
-            "out, and the focal length is fixed by the flight itself."
+            f"add oblique views (camera {OBLIQUE_DEG + 10:.0f}° or more from straight down) or a second height: walls "
+            "come out, and the focal length is fixed by the flight itself."
         )
     if not metric:
         advice.append("let the drone write GPS into the photographs: metres, north, maps.")

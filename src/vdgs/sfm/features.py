@@ -84,7 +84,9 @@ def stand_upright(work: Work, photographs: Sequence[Photograph]) -> list[LeftOut
 def _write_upright(source: Path, target: Path) -> None:
     with pillow_quietly(), Image.open(source) as image:
         upright = ImageOps.exif_transpose(image).convert("RGB")
-    kind = "PNG" if target.suffix.lower() == ".png" else "TIFF" if target.suffix.lower() in (".tif", ".tiff") else "JPEG"
+    kind = (
+        "PNG" if target.suffix.lower() == ".png" else "TIFF" if target.suffix.lower() in (".tif", ".tiff") else "JPEG"
+    )
 
     def write(file: Path) -> None:
         upright.save(file, kind, quality=_UPRIGHT_QUALITY, subsampling=0)
@@ -127,7 +129,9 @@ def find_features(
             size = max(kind.width, kind.height)
             for start in range(0, len(missing), AT_ONCE * threads):
                 chunk = missing[start : start + AT_ONCE * threads]
-                _extract(work, chunk, number, -1 if min(size, feature_size) < SMALL_PX else 0, feature_size, most, threads)
+                _extract(
+                    work, chunk, number, -1 if min(size, feature_size) < SMALL_PX else 0, feature_size, most, threads
+                )
                 done += len(chunk)
                 tell(done)
     return feature_counts(work)
@@ -170,7 +174,7 @@ def without_features(photographs: Sequence[Photograph], counts: dict[str, int]) 
             found.append(LeftOut(photo.name, f"shows only {count} features: blurred, dark, sky or water?"))
     if len(photographs) - len(found) < 3:
         raise CaptureError(
-            f"{len(photographs) - len(found)} of {len(photographs)} photographs show enough to be matched; a scene needs "
-            f"3. The first: {found[0].name} {found[0].why}."
+            f"{len(photographs) - len(found)} of {len(photographs)} photographs show enough to be matched; a scene "
+            f"needs 3. The first: {found[0].name} {found[0].why}."
         )
     return found

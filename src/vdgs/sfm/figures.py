@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from matplotlib.figure import Figure
 from vdgs.figures.style import ACCENT, DPI, FAINT, INK, TEXT, plain
 from vdgs.sfm.aligning import Placed
 from vdgs.sfm.positions import Positions
+from vdgs.storage.files import write_bytes
 
 #: The longest arrow of a residual is drawn this share of the picture long at most.
 LONGEST_ARROW = 0.12
@@ -65,5 +67,6 @@ def _axes(title: str, metric: bool = True):  # type: ignore[no-untyped-def]
 
 
 def _write(figure: Figure, file: Path) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    FigureCanvasAgg(figure).print_png(file)  # type: ignore[arg-type]
+    drawn = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(drawn)
+    write_bytes(file, drawn.getvalue())

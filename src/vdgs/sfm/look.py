@@ -145,7 +145,7 @@ def _warnings(collection: Collection, overlap: float | None, views: float | None
     if small:
         found.append(f"{_first(small)}: far smaller files than the others: blurred, dark, or showing little?")
     if overlap is not None and overlap < LEAST_OVERLAP:
-        found.append(f"photographs overlap by about {overlap:.0%} along the flight; below {LEAST_OVERLAP:.0%} gaps come.")
+        found.append(f"they overlap by about {overlap:.0%} along the flight; below {LEAST_OVERLAP:.0%} gaps come.")
     if views is not None and views < LEAST_VIEWS:
         found.append(f"a place is seen by about {views:.1f} photographs; from {LEAST_VIEWS:g} on scenes become good.")
     moments = [when for when in (_time(photo.taken) for photo in photographs) if when is not None]

@@ -1,4 +1,4 @@
-"""Photographs matched: pairs chosen by what is known of them, features compared, pairs verified, all in the database."""
+"""Photographs matched: pairs chosen by what is known of them, features compared, pairs verified, in the database."""
 
 from __future__ import annotations
 

@@ -26,7 +26,12 @@ def near(places: np.ndarray, neighbours: int) -> set[tuple[int, int]]:
         return set()
     count = min(neighbours + 1, len(known))
     _, found = cKDTree(places[known, :2]).query(places[known, :2], k=count)
-    return {_pair(int(known[i]), int(known[j])) for i, row in enumerate(found.reshape(len(known), -1)) for j in row if i != j}
+    return {
+        _pair(int(known[i]), int(known[j]))
+        for i, row in enumerate(found.reshape(len(known), -1))
+        for j in row
+        if i != j
+    }
 
 
 def in_order(order: Sequence[int], following: int, doublings: int = 0) -> set[tuple[int, int]]:

@@ -86,10 +86,11 @@ def read_photograph(path: Path, name: str) -> Photograph:
     if orientation in QUARTER_TURNS:
         width, height = height, width
     altitude, altitude_type = _altitude(gps, xmp)
+    attitude = _attitude(xmp) if orientation == 1 else None
     return Photograph(
         name, path, width, height, orientation, _camera(tags, details, xmp), lens,
         _text(details.get(0x9003)) or _text(tags.get(0x0132)), _place(gps), altitude, altitude_type, _deviations(xmp),
-        number(xmp, "drone-dji:RelativeAltitude", "sensefly:Height"), _attitude(xmp) if orientation == 1 else None, size,
+        number(xmp, "drone-dji:RelativeAltitude", "sensefly:Height"), attitude, size,
     )  # fmt: skip
 
 

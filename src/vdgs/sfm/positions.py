@@ -90,7 +90,9 @@ def find_positions(
         )
         index, enu = index[:0], enu[:0]
     deviations = np.array([_deviation(photographs[i], table, deviation_m) for i in index]).reshape(-1, 3)
-    kinds = list(dict.fromkeys(photographs[i].altitude_type for i in index)) if table is None else [f"as in {table.name}"]
+    kinds = (
+        list(dict.fromkeys(photographs[i].altitude_type for i in index)) if table is None else [f"as in {table.name}"]
+    )
     if len(kinds) > 1:
         notes.append(f"altitudes are of several kinds ({'; '.join(kinds)}): heights may not fit together.")
     return Positions(index, enu, deviations, origin, "; ".join(kinds), source, tuple(notes))

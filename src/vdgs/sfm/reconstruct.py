@@ -58,7 +58,7 @@ class Prepared:
 
 
 def prepare(request: SfmRequest) -> Prepared:
-    """The look before the work; nothing is written. Raises CaptureError for photographs that cannot become a capture."""
+    """The look before the work; nothing is written. Raises CaptureError for photographs that cannot become one."""
     _check(request)
     collection = collect(request.photographs)
     refuse_among_photographs(request.output, collection)
@@ -77,9 +77,9 @@ def tell(prepared: Prepared, console: Console) -> None:
     held, why = mapping.holds_focal(photographs, options)
     how = "near each other by their positions" if prepared.positions.usable else (
         "all with all" if len(photographs) <= options.exhaustive else "next in order, and alike")  # fmt: skip
+    metres = "metres east, north, up, " if prepared.positions.usable else ""
     plan = [
-        f"features, about {pairs} pairs ({how}), poses and points, {'metres east, north, up, ' if prepared.positions.usable else ''}"
-        "photographs without distortion",
+        f"features, about {pairs} pairs ({how}), poses and points, {metres}photographs without distortion",
         f"the focal length is {'held' if held else 'fitted'}: {why}",
         f"about {max(1, round(prepared.seconds / 60))} min on {prepared.threads} threads, if they are idle",
     ]
@@ -89,8 +89,8 @@ def tell(prepared: Prepared, console: Console) -> None:
 def reconstruct(request: SfmRequest, console: Console) -> ReconstructionFacts:
     """Make a capture of photographs in `request.output`, or go on with one that was begun.
 
-    Raises CaptureError for photographs that cannot become one, VdgsError for an output that is something else and a disk
-    that is full. What was done is kept.
+    Raises CaptureError for photographs that cannot become one, VdgsError for an output that is something else and a
+    disk that is full. What was done is kept.
     """
     quiet_colmap()
     prepared = prepare(request)
@@ -160,29 +160,40 @@ def _is_finished(output: Path, key: str) -> bool:
 
 def _refuse_other_things(output: Path) -> None:
     """Only a new folder, an empty one, or one of an earlier reconstruction is written to."""
-    if output.is_dir() and not is_reconstruction(output) and any(each.name != ".lock" for each in output.iterdir()):
+    if output.is_dir() and not is_reconstruction(output) and _strangers(output):
         raise VdgsError(f"{output}: holds other things already. Choose a new folder with --output.")
     if output.exists() and not output.is_dir():
         raise VdgsError(f"{output}: is a file. Choose a new folder with --output.")
+
+
+def _strangers(output: Path) -> bool:
+    """Whether a folder holds anything but what a reconstruction begins with."""
+    return any(each.name not in (".lock", MAP) and each.suffix != ".tmp" for each in output.iterdir())
 
 
 def _check_disk(prepared: Prepared) -> None:
     photographs, options = prepared.collection.photographs, prepared.request.options
     pixels = sum(photo.width * photo.height for photo in photographs)
     needed = PIXEL_BYTES * 1.32 * pixels + FEATURE_BYTES * options.features * len(photographs)
-    parent = next(folder for folder in (prepared.request.output.resolve(), *prepared.request.output.resolve().parents) if folder.exists())
+    parent = next(
+        folder
+        for folder in (prepared.request.output.resolve(), *prepared.request.output.resolve().parents)
+        if folder.exists()
+    )
     free = shutil.disk_usage(parent).free
     if free < needed:
         raise VdgsError(
-            f"{prepared.request.output}: needs about {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free there. Free some "
-            "space, choose another --output, or write smaller photographs (--max-size 2000)."
+            f"{prepared.request.output}: needs about {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free there. Free "
+            "some space, choose another --output, or write smaller photographs (--max-size 2000)."
         )
 
 
 def _in_time(prepared: Prepared) -> list[int]:
     """Rows of the positions in the order in which the photographs were taken."""
     photographs, index = prepared.collection.photographs, prepared.positions.index
-    return sorted(range(len(index)), key=lambda row: (photographs[int(index[row])].taken, photographs[int(index[row])].name))
+    return sorted(
+        range(len(index)), key=lambda row: (photographs[int(index[row])].taken, photographs[int(index[row])].name)
+    )
 
 
 def _steps(prepared: Prepared, work: Work, keys: dict[str, str], console: Console) -> ReconstructionFacts:
@@ -226,16 +237,14 @@ def _features(
     failed = features.stand_upright(work, photographs)
     counts = features.feature_counts(work)
     if not work.is_done("features", key):
-        counts = features.find_features(
-            work, kinds, options.feature_size, options.features, prepared.threads, console
-        )
+        counts = features.find_features(work, kinds, options.feature_size, options.features, prepared.threads, console)
         work.finish("features", key)
     named = {each.name for each in failed}
     return failed + [each for each in features.without_features(photographs, counts) if each.name not in named]
 
 
 def _matches(prepared: Prepared, work: Work, key: str, console: Console) -> int:
-    photographs = [photo for photo in prepared.collection.photographs]
+    photographs = prepared.collection.photographs
     chosen = matching.choose_pairs(work, photographs, prepared.positions, prepared.request.options)
     there = features.feature_counts(work)
     chosen = [pair for pair in chosen if all(there.get(name) for name in pair)]

@@ -16,7 +16,10 @@ MOST_NAMED = 12
 
 def tell_look(look: Look, collection: Collection, plan: list[str], console: Console) -> None:
     """What there is, and what will be done."""
-    rows = [("Photographs", _photographs(look, collection)), ("Cameras", _several([f"{name} ({n})" for name, n in look.cameras]))]
+    rows = [
+        ("Photographs", _photographs(look, collection)),
+        ("Cameras", _several([f"{name} ({n})" for name, n in look.cameras])),
+    ]
     rows.append(("Sizes", _several([f"{width} x {height} ({n})" for width, height, n in look.sizes])))
     if look.days:
         rows.append(("Taken", look.days[0] if len(look.days) == 1 else f"{look.days[0]} to {look.days[-1]}"))
@@ -34,7 +37,7 @@ def tell_look(look: Look, collection: Collection, plan: list[str], console: Cons
     _table(rows, console)
     for warning in look.warnings:
         console.print(f"[yellow]note[/] {escape(warning)}", highlight=False)
-    _name(["%s: %s" % (each.name, each.why) for each in collection.left_out], console)
+    _name([f"{each.name}: {each.why}" for each in collection.left_out], console)
 
 
 def tell_facts(facts: ReconstructionFacts, console: Console) -> None:
@@ -74,7 +77,8 @@ def _positions(look: Look) -> str:
         return "none: the scale will be arbitrary, north unknown"
     east, north = look.spread_m
     rtk = f"; {look.rtk} say how accurate they are (RTK)" if look.rtk else ""
-    return f"{look.positions} of {look.photographs}, over {east:.0f} m x {north:.0f} m; altitude: {look.altitude_reference}{rtk}"
+    spread = f"over {east:.0f} m x {north:.0f} m"
+    return f"{look.positions} of {look.photographs}, {spread}; altitude: {look.altitude_reference}{rtk}"
 
 
 def _several(values: list[str]) -> str:

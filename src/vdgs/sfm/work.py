@@ -114,7 +114,7 @@ def call(function: Callable[..., Result], *arguments: Any, **named: Any) -> Resu
 
 @contextmanager
 def progress(console: Console, title: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar with the time left where the console is a terminal, else one line; yields what to tell how many are done."""
+    """A bar with the time left where the console is a terminal, else one line; yields what tells how many are done."""
     if not console.is_terminal:
         console.print(f"{title}: {total}", highlight=False)
         yield lambda done: None

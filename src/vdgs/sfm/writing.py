@@ -55,7 +55,11 @@ def straighten(camera: pycolmap.Camera, max_size: int) -> Straightened:
 
 
 def write_images(
-    output: Path, work: Work, names: Mapping[int, Sequence[str]], lenses: Mapping[int, Straightened], threads: int,
+    output: Path,
+    work: Work,
+    names: Mapping[int, Sequence[str]],
+    lenses: Mapping[int, Straightened],
+    threads: int,
     console: Console,
 ) -> None:
     """Write images, images_2 and images_4: `names` of the photographs of each camera. What is there is kept.

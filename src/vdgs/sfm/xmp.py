@@ -14,7 +14,9 @@ LONGEST_PACKET = 1 << 18
 #: Values that a packet may have; more are not looked at.
 MOST_VALUES = 2000
 _NAME = r"[A-Za-z_][\w.-]{0,63}"
-_ATTRIBUTE = re.compile(rf"({_NAME}):({_NAME})[ \t\r\n]{{0,16}}=[ \t\r\n]{{0,16}}(?:\"([^\"<]{{0,400}})\"|'([^'<]{{0,400}})')")
+_ATTRIBUTE = re.compile(
+    rf"({_NAME}):({_NAME})[ \t\r\n]{{0,16}}=[ \t\r\n]{{0,16}}(?:\"([^\"<]{{0,400}})\"|'([^'<]{{0,400}})')"
+)
 _ELEMENT = re.compile(rf"<({_NAME}):({_NAME})>([^<]{{0,400}})</")
 
 
