@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import random
+from contextlib import suppress
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -95,10 +97,8 @@ def test_damaged_heads_are_read_or_refused(tmp_path):
         for _ in range(20):
             damaged[draw.randrange(800)] = draw.randrange(256)
         (tmp_path / "damaged.jpg").write_bytes(damaged)
-        try:
+        with suppress(Unusable):  # no other error comes
             read_photograph(tmp_path / "damaged.jpg", "damaged.jpg")
-        except Unusable as why:
-            assert str(why)  # no other error comes
 
 
 # ------------------------------------------------------------------------------------------------------- xmp
@@ -110,7 +110,8 @@ def test_any_bytes_are_xmp_without_surprises(packet):
 
 
 def test_xmp_is_read_as_attributes_and_as_elements_and_expands_nothing():
-    bomb = b'<!DOCTYPE a [<!ENTITY b "bbbb"><!ENTITY c "&b;&b;">]><a:x y:Alt="&c;" y:Height=\'+39.80\'/><z:Roll>-2.5</z:Roll>'
+    bomb = b'<!DOCTYPE a [<!ENTITY b "bbbb"><!ENTITY c "&b;&b;">]><a:x y:Alt="&c;" y:Height=\'+39.80\'/>'
+    bomb += b"<z:Roll>-2.5</z:Roll>"
     values = read_xmp(bomb)
     assert values["y:Alt"] == "&c;"
     assert (number(values, "y:Height"), number(values, "z:Roll"), number(values, "y:Alt")) == (39.8, -2.5, None)
@@ -282,7 +283,7 @@ def test_pairs_are_sorted_and_none_is_of_one_photograph(count, following, doubli
     order = list(np.random.default_rng(count).permutation(count))
     chosen = pairs.in_order(order, following, doublings) | pairs.near(np.random.default_rng(0).random((count, 3)), 4)
     assert all(0 <= i < j < count for i, j in chosen)
-    assert {tuple(sorted(pair)) for pair in zip(order, order[1:], strict=False)} <= chosen
+    assert {tuple(sorted(pair)) for pair in pairwise(order)} <= chosen
 
 
 def test_near_ones_are_matched_and_those_without_a_place_are_not():
