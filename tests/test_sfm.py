@@ -68,6 +68,11 @@ def files(folder: Path) -> dict[str, tuple[int, int]]:
     return {str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.stat().st_size) for path in sorted(found)}
 
 
+def size(file: Path) -> tuple[int, int]:
+    with Image.open(file) as image:
+        return image.size
+
+
 def test_all_photographs_are_placed_where_they_were_taken(made, flight):
     capture = load_capture(made)
     assert [view.name for view in capture.views] == flight.names
@@ -84,8 +89,8 @@ def test_all_photographs_are_placed_where_they_were_taken(made, flight):
 
 def test_photographs_come_in_exact_sizes_and_stay_as_they_were(made, flight):
     for name in flight.names:
-        whole, half, quarter = (Image.open(made / f"images{suffix}" / name) for suffix in ("", "_2", "_4"))
-        assert whole.size == tuple(2 * side for side in half.size) == tuple(4 * side for side in quarter.size)
+        whole, half, quarter = (size(made / f"images{suffix}" / name) for suffix in ("", "_2", "_4"))
+        assert whole == tuple(2 * side for side in half) == tuple(4 * side for side in quarter)
     small = load_capture(made, CaptureOptions(images="images_4")).views[0].camera
     assert small.fx == pytest.approx(load_capture(made).views[0].camera.fx / 4)
 
@@ -152,7 +157,8 @@ def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
     card = tmp_path / "card"
     card.mkdir()
     for k, name in enumerate(flight.names[:6]):
-        pixels = np.array(Image.open(flight.folder / name))
+        with Image.open(flight.folder / name) as image:
+            pixels = np.array(image)
         turned = k == 2  # a photograph that lies on its side, as EXIF says
         write_photograph(card / name, np.rot90(pixels).copy() if turned else pixels, k, None, 6 if turned else 1)
     before = files(card)
@@ -162,7 +168,7 @@ def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
     assert "scale of the scene is arbitrary" in said.file.getvalue()
     assert not (tmp_path / "capture/georef.json").exists()
     assert not load_capture(tmp_path / "capture").ground.metric
-    sizes = {Image.open(tmp_path / "capture/images" / name).size for name in flight.names[:6]}
+    sizes = {size(tmp_path / "capture/images" / name) for name in flight.names[:6]}
     assert len(sizes) == 1  # all stand upright
     assert files(card) == before
 

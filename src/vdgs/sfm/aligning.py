@@ -15,6 +15,8 @@ from vdgs.sfm.positions import LEAST_POSITIONS, Positions
 
 #: Attitudes that agree on which way a world lies, at least.
 LEAST_ATTITUDES = 3
+#: Positions fix a turn about a line if they spread across it this many times their standard deviation.
+WRONG_TIMES = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +44,7 @@ def place(model: pycolmap.Reconstruction, photographs: Sequence[Photograph], pos
     names = [photographs[int(positions.index[row])].name for row in rows]
     centres = np.array([images[name].projection_center() for name in names])
     targets = positions.enu[rows]
-    if not is_collinear(targets) and not is_collinear(centres):
+    if not is_collinear(centres) and not is_line(targets, positions.deviations[rows]):
         similarity, inliers = fit_similarity_robust(centres, targets)
         how = f"positions of {int(inliers.sum())} photographs ({positions.source})"
     else:
@@ -50,6 +52,14 @@ def place(model: pycolmap.Reconstruction, photographs: Sequence[Photograph], pos
         similarity, inliers = _scaled(rotation, centres, targets), np.ones(len(rows), bool)
         how = f"positions of {len(rows)} photographs along one line ({positions.source}), up by {by}"
     return Placed(similarity, how, rows, similarity.apply(centres) - targets, inliers)
+
+
+def is_line(places: np.ndarray, deviations: np.ndarray) -> bool:
+    """Whether places [n, 3] leave a turn about a line open: they spread across it no more than they may be wrong."""
+    if is_collinear(places):
+        return True
+    spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(places))
+    return bool(spread < WRONG_TIMES * np.sqrt(np.median((deviations**2).mean(axis=1))))
 
 
 def move(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
@@ -65,11 +75,11 @@ def points_of(model: pycolmap.Reconstruction) -> np.ndarray:
 
 def tilt_against_attitudes(model: pycolmap.Reconstruction, photographs: Sequence[Photograph]) -> float | None:
     """Median angle in degrees between down as the placed model has it and as the drone recorded it."""
-    by_name = {photo.name: photo for photo in photographs if photo.attitude}
+    gravity = {photo.name: photo.attitude.gravity for photo in photographs if photo.attitude}
     angles = [
-        np.degrees(np.arccos(np.clip(_rotation(image) @ [0, 0, -1] @ by_name[image.name].attitude.gravity, -1, 1)))
+        np.degrees(np.arccos(np.clip(_rotation(image) @ [0, 0, -1] @ gravity[image.name], -1, 1)))
         for image in model.images.values()
-        if image.has_pose and image.name in by_name
+        if image.has_pose and image.name in gravity
     ]
     return float(np.median(angles)) if angles else None
 

@@ -42,7 +42,7 @@ def draw_residuals(points: np.ndarray, positions: Positions, placed: Placed | No
     figure, axes = _axes(title, metric=placed is not None)
     few = points[:: max(1, len(points) // 20_000)]
     low, high = np.quantile(few[:, :2], [0.01, 0.99], axis=0)
-    axes.plot(few[:, 0], few[:, 1], ",", color="#b9c0c6", zorder=1)
+    axes.plot(few[:, 0], few[:, 1], "o", markersize=1.2, markeredgewidth=0, color=FAINT, alpha=0.6, zorder=1)
     if placed is not None:
         at, move = positions.enu[placed.rows, :2], factor * placed.residuals[:, :2]
         low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))

@@ -12,6 +12,7 @@ import numpy as np
 from shapely import MultiPoint
 
 from vdgs.sfm.collection import Collection
+from vdgs.sfm.features import is_searched_finely
 from vdgs.sfm.photograph import Photograph
 from vdgs.sfm.positions import Positions
 
@@ -24,8 +25,9 @@ LEAST_VIEWS = 4.0
 #: Views farther from straight down than this are oblique (degrees).
 OBLIQUE_DEG = 20.0
 #: Seconds of one core: a megapixel searched for features, a pair of photographs matched, a photograph placed.
-#: Measured on a Xeon without GPU; another machine may take half or twice as long.
-FEATURE_SECONDS, PAIR_SECONDS, MAPPING_SECONDS, WRITING_SECONDS = 0.6, 0.45, 1.5, 0.35
+#: Measured on a Xeon without GPU; another machine may take half or twice as long. Features searched
+#: finely take three times as long.
+FEATURE_SECONDS, PAIR_SECONDS, MAPPING_SECONDS, WRITING_SECONDS = 0.5, 0.45, 1.5, 0.35
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def look_at(collection: Collection, positions: Positions) -> Look:
 
 def seconds(photographs: Sequence[Photograph], pairs: int, feature_size: int, threads: int) -> float:
     """About how long the work takes, from what one core was measured to take."""
-    pixels = sum(_searched(photo, feature_size) for photo in photographs) / 1e6
+    pixels = sum(_searched(photo, feature_size, len(photographs)) for photo in photographs) / 1e6
     written = sum(photo.width * photo.height for photo in photographs) / 1e6
     shared = FEATURE_SECONDS * pixels + PAIR_SECONDS * pairs + WRITING_SECONDS * written
     return shared / max(1, threads) + MAPPING_SECONDS * len(photographs)
@@ -97,9 +99,11 @@ def flying_height(photographs: Sequence[Photograph]) -> tuple[float | None, str]
     return statistics.median(heights), "above the take-off, by XMP"
 
 
-def _searched(photo: Photograph, feature_size: int) -> float:
-    shrunk = min(1.0, feature_size / max(photo.width, photo.height))
-    return photo.width * photo.height * shrunk**2
+def _searched(photo: Photograph, feature_size: int, count: int) -> float:
+    """Pixels to search, three times as many where that is done finely."""
+    longer = max(photo.width, photo.height)
+    times = 3 if is_searched_finely(longer, feature_size, count) else 1
+    return times * photo.width * photo.height * min(1.0, feature_size / longer) ** 2
 
 
 def _median(values: object) -> float | None:

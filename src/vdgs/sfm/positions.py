@@ -89,9 +89,11 @@ def find_positions(
             "north; not used."
         )
         index, enu = index[:0], enu[:0]
-    deviations = np.array([_deviation(photographs[i], table, deviation_m) for i in index]).reshape(-1, 3)
+    deviations = np.array([_deviation(photographs[i], table, deviation_m) for i in index.tolist()]).reshape(-1, 3)
     kinds = (
-        list(dict.fromkeys(photographs[i].altitude_type for i in index)) if table is None else [f"as in {table.name}"]
+        list(dict.fromkeys(photographs[i].altitude_type for i in index.tolist()))
+        if table is None
+        else [f"as in {table.name}"]
     )
     if len(kinds) > 1:
         notes.append(f"altitudes are of several kinds ({'; '.join(kinds)}): heights may not fit together.")
