@@ -25,7 +25,7 @@ from vdgs.sfm.look import look_at
 from vdgs.sfm.mapping import holds_focal
 from vdgs.sfm.photograph import Photograph, Unusable, read_photograph
 from vdgs.sfm.positions import find_positions
-from vdgs.sfm.reconstruct import prepare
+from vdgs.sfm.preparing import prepare
 from vdgs.sfm.xmp import LONGEST_PACKET, number, read_xmp
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)

@@ -31,7 +31,7 @@ from vdgs.settings.method import MethodConfig, TrainConfig, block_limit, block_t
 from vdgs.settings.plain import differences
 from vdgs.settings.requests import RunRequest
 from vdgs.sfm.collection import only_photographs
-from vdgs.sfm.reconstruct import prepare, tell
+from vdgs.sfm.preparing import prepare, tell
 from vdgs.sfm.request import sfm_request
 from vdgs.stages.coarse import open_stage, start
 from vdgs.storage.files import read_json

@@ -127,12 +127,10 @@ def find_features(
             there = feature_counts(work)
             done += sum(name in there for name in missing)
             missing = [name for name in missing if name not in there]
-            size = max(kind.width, kind.height)
+            octave = -1 if is_searched_finely(max(kind.width, kind.height), feature_size, len(names)) else 0
             for start in range(0, len(missing), AT_ONCE * threads):
                 chunk = missing[start : start + AT_ONCE * threads]
-                _extract(
-                    work, chunk, number, -1 if min(size, feature_size) < SMALL_PX else 0, feature_size, most, threads
-                )
+                _extract(work, chunk, number, octave, feature_size, most, threads)
                 done += len(chunk)
                 tell(done)
     return feature_counts(work)

@@ -38,7 +38,8 @@ class SfmArguments:
 def sfm(arguments: list[str]) -> None:
     asked = tyro.cli(SfmArguments, args=arguments, prog="vdgs sfm")
     from vdgs.errors import VdgsError
-    from vdgs.sfm.reconstruct import prepare, reconstruct, tell
+    from vdgs.sfm.preparing import prepare, tell
+    from vdgs.sfm.reconstruct import reconstruct
 
     if not asked.photographs:
         raise VdgsError("name the folder of the photographs: vdgs sfm PHOTOGRAPHS --output CAPTURE")
