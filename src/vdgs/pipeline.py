@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,8 +18,12 @@ from vdgs.report import write_report
 from vdgs.report.terminal import next_step, whole_standing
 from vdgs.runs.beginning import begin_run
 from vdgs.runs.folder import RunFolder
+from vdgs.settings.checks import validate
 from vdgs.settings.ranges import refuse
 from vdgs.settings.requests import MapRequest, RunRequest
+from vdgs.sfm.collection import only_photographs
+from vdgs.sfm.reconstruct import reconstruct
+from vdgs.sfm.request import sfm_request
 from vdgs.stages.coarse import train_coarse
 from vdgs.stages.evaluate import evaluate_stage, is_measured
 from vdgs.stages.merge import merge_run
@@ -38,12 +43,28 @@ def run_all(asked: RunRequest, console: Console, command: str | None = None) -> 
     """
     refuse(asked)
     refuse_missing(asked.lpips_weights)
+    asked = with_capture(asked, console)
     run, capture = begin_run(
         asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo, command=command
     )
     with run.driven():
         _stages(run, capture, asked, console)
     console.print(escape(f"next: {next_step(whole_standing(run))}"), highlight=False)
+
+
+def with_capture(asked: RunRequest, console: Console) -> RunRequest:
+    """The request about a capture: where it is about photographs alone, they become one in RUN/capture first.
+
+    Raises what `reconstruct` raises, and VdgsError for settings that do not work, before the long work.
+    """
+    if not only_photographs(asked.capture):
+        return asked
+    if problems := validate(asked.method()):
+        raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
+    _title(console, "photographs")
+    request = sfm_request(asked)
+    reconstruct(request, console)
+    return replace(asked, capture=request.output, options=replace(asked.options, gps=None))
 
 
 def _stages(run: RunFolder, capture: Capture, asked: RunRequest, console: Console) -> None:

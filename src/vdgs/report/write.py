@@ -11,6 +11,7 @@ import yaml
 from vdgs.errors import RunError
 from vdgs.report.costs import costs_section, settings_section
 from vdgs.report.page import Html, contents, document, escaped, joined, paragraph
+from vdgs.report.photographs import photographs_section
 from vdgs.report.reading import Record, Shown, Source
 from vdgs.report.results import by_visibility_section, metrics_of, result_table, seams_section, verdict, views_section
 from vdgs.report.scene import assignment_section, blocks_section, maps_section, visibility_section
@@ -40,7 +41,9 @@ def write_report(run: RunFolder) -> Path:
     if not run.path.is_dir():
         raise RunError(f"{run.path}: is not a run folder. Train first: vdgs run CAPTURE --output RUN")
     shown = Shown(run, standing_of(run))
+    photographs = photographs_section(shown)
     sections = [
+        *([photographs] if photographs else []),
         visibility_section(shown),
         blocks_section(shown),
         assignment_section(shown),
@@ -52,9 +55,10 @@ def write_report(run: RunFolder) -> Path:
         costs_section(shown),
         settings_section(shown),
     ]
+    links = [*([("photographs", "photographs")] if photographs else []), *CONTENTS]
     header, title = _header(shown)
     path = run.path / FILE
-    write_text(path, document(title, [header, contents(CONTENTS), *sections], {STANDING: shown.standing.digest}))
+    write_text(path, document(title, [header, contents(links), *sections], {STANDING: shown.standing.digest}))
     return path
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import yaml
 
 from vdgs import __version__
+from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.errors import RunError, VdgsError
 from vdgs.partition.records import PartitionRecord
 from vdgs.runs.keys import StageKeys, stage_keys
@@ -155,6 +156,11 @@ class RunFolder:
     path: Path
 
     @property
+    def own_capture(self) -> Path:
+        """The capture that a run of photographs alone makes of them."""
+        return self.path / "capture"
+
+    @property
     def config_file(self) -> Path:
         return self.path / "config.yaml"
 
@@ -225,10 +231,18 @@ class RunFolder:
                     + "\nGive the old settings to continue it, or another --output to start a new run."
                 )
             return
+        self.refuse_strangers()
+        self._write(settings, command)
+
+    def refuse_strangers(self) -> None:
+        """Raise RunError where a new run would be begun among other files."""
+        if self.config_file.exists():
+            return
+        known = {".lock", *([self.own_capture.name] if is_reconstruction(self.own_capture) else [])}
         if self.path.exists() and not self.path.is_dir():
             raise RunError(f"{self.path}: is a file. Choose a folder for --output.")
         strangers = (
-            [p.name for p in self.path.iterdir() if p.name != ".lock" and p.suffix != ".tmp"]
+            [p.name for p in self.path.iterdir() if p.name not in known and p.suffix != ".tmp"]
             if self.path.exists()
             else []
         )
@@ -237,7 +251,6 @@ class RunFolder:
                 f"{self.path}: holds other files ({', '.join(sorted(strangers)[:3])}) and no config.yaml. "
                 "Choose an empty or a new folder for --output."
             )
-        self._write(settings, command)
 
     def change_settings(self, settings: dict[str, Any], redo: bool, command: str | None = None) -> list[str]:
         """Give a run other settings; returns what changed, one line each. `command` as in `begin`.

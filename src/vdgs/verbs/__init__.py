@@ -12,13 +12,14 @@ from vdgs.verbs.captures import inspect, synth
 from vdgs.verbs.exporting import export
 from vdgs.verbs.machine import doctor
 from vdgs.verbs.mapping import map
+from vdgs.verbs.photographs import sfm
 from vdgs.verbs.results import eval, render, report, status
 from vdgs.verbs.stages import merge, partition, train, visibility
 from vdgs.verbs.starting import coarse, run
 
 __all__ = [
     "bench", "coarse", "doctor", "eval", "export", "inspect", "map", "merge", "partition", "render", "report", "run",
-    "status", "synth", "train", "visibility",
+    "sfm", "status", "synth", "train", "visibility",
 ]  # fmt: skip
 
 # torch's OpenMP threads must block, not spin, beside the kernels' own pool; read once, when torch is imported.
