@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import shutil
+import signal
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -37,6 +40,7 @@ from vdgs.sfm.collection import collect
 from vdgs.sfm.positions import find_positions
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.sfm.work import call
+from vdgs.watching.interrupts import stop_requests
 
 pytestmark = pytest.mark.xdist_group("sfm")
 
@@ -249,3 +253,18 @@ def test_a_run_among_other_files_is_refused_before_the_work(flight, tmp_path):
     (tmp_path / "thesis.txt").write_text("three years")
     with pytest.raises(RunError, match="holds other files"):
         with_capture(asked(flight, tmp_path), console())
+
+
+def test_an_interrupted_call_is_waited_for():
+    """What still runs while Python ends would abort the process."""
+    ended = []
+
+    def long(cancellation_token):
+        os.kill(os.getpid(), signal.SIGINT)
+        while not cancellation_token.is_cancelled():
+            Event().wait(0.001)
+        ended.append(True)
+
+    with pytest.raises(KeyboardInterrupt), stop_requests(interrupts=True):
+        call(long)
+    assert ended

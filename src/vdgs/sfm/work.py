@@ -83,24 +83,30 @@ def call(function: Callable[..., Result], *arguments: Any, **named: Any) -> Resu
 
     Raises VdgsError for what COLMAP cannot do, and what asked to stop.
     """
-    token, ended = pycolmap.CancellationToken(), dict[str, Any]()
+    token, ended, over = pycolmap.CancellationToken(), dict[str, Any](), threading.Event()
 
     def work() -> None:
         try:
             ended["result"] = function(*arguments, **named, cancellation_token=token)
         except BaseException as error:
             ended["error"] = error
+        finally:
+            over.set()
 
-    thread = threading.Thread(target=work, name="colmap", daemon=True)
+    thread = threading.Thread(target=work, name="colmap")
     thread.start()
     try:
-        while thread.is_alive():
-            thread.join(_GLANCE)
+        # Not by joining the thread: a join that is interrupted takes the thread for ended.
+        while not over.wait(_GLANCE):
+            pass
         stop_if_asked()
     except BaseException:
         token.cancel()
-        thread.join()
+        while not over.wait(_GLANCE):
+            pass
         raise
+    finally:
+        thread.join()
     error = ended.get("error")
     if isinstance(error, (MemoryError, KeyboardInterrupt)):
         raise error
