@@ -23,6 +23,7 @@ from vdgs.verbs.benching import BenchArguments
 from vdgs.verbs.captures import InspectArguments, SynthArguments
 from vdgs.verbs.exporting import ExportArguments
 from vdgs.verbs.mapping import MapArguments
+from vdgs.verbs.photographs import SfmArguments
 from vdgs.verbs.results import EvalArguments, RenderArguments
 from vdgs.verbs.stages import MergeArguments, PartitionArguments, TrainArguments
 from vdgs.verbs.starting import CoarseArguments, RunArguments
@@ -31,7 +32,7 @@ HERE = Path("here")
 ARGUMENTS: tuple[Any, ...] = (
     BenchArguments("toy", HERE), InspectArguments(HERE, HERE), SynthArguments(HERE), EvalArguments(HERE),
     RenderArguments(HERE, HERE), PartitionArguments(HERE), TrainArguments(HERE), MergeArguments(HERE),
-    MapArguments(HERE), ExportArguments(HERE),
+    MapArguments(HERE), ExportArguments(HERE), SfmArguments((HERE,), HERE),
     CoarseArguments(HERE, HERE), RunArguments(HERE, HERE), MethodConfig(), *PRESETS.values(),
 )  # fmt: skip
 

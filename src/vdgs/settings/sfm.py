@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from vdgs.settings.ranges import MANY, WORKERS, Range
+from vdgs.settings.ranges import MANY, WORKERS, Named, Range
 
 
 @dataclass(frozen=True)
@@ -40,4 +40,4 @@ class SfmRequest:
     gps: Path | None = None
     threads: Annotated[int, WORKERS] = 0
     keep_work: bool = False
-    options: SfmOptions = field(default_factory=SfmOptions)
+    options: Annotated[SfmOptions, Named("")] = field(default_factory=SfmOptions)

@@ -6,12 +6,12 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 
 from vdgs.captures.outputs import refuse_in_a_capture
 from vdgs.errors import VdgsError
 from vdgs.kernels import threads as threads_available
+from vdgs.settings.ranges import refuse
 from vdgs.settings.sfm import SfmRequest
 from vdgs.sfm import mapping, matching
 from vdgs.sfm.collection import Collection, collect
@@ -37,7 +37,7 @@ class Prepared:
 
 def prepare(request: SfmRequest) -> Prepared:
     """The look before the work; nothing is written. Raises CaptureError for photographs that cannot become one."""
-    _check(request)
+    refuse(request)
     collection = collect(request.photographs)
     refuse_among_photographs(request.output, collection)
     positions = find_positions(collection.photographs, request.gps, request.options.gps_deviation_m)
@@ -74,20 +74,6 @@ def refuse_among_photographs(output: Path, collection: Collection) -> None:
                 f"{output}: lies among the photographs in {folder}, where it would be taken for more of them. Choose a "
                 "folder beside it."
             )
-
-
-def _check(request: SfmRequest) -> None:
-    options = request.options
-    limits = (
-        ("--neighbours", options.neighbours, 2), ("--exhaustive", options.exhaustive, 0),
-        ("--feature-size", options.feature_size, 200), ("--features", options.features, 200),
-        ("--max-size", options.max_size, 0), ("--threads", request.threads, 0),
-    )  # fmt: skip
-    for name, value, least in limits:
-        if value < least:
-            raise VdgsError(f"{name} {value}: must be at least {least}")
-    if not all(np.isfinite(value) and value > 0 for value in options.gps_deviation_m):
-        raise VdgsError("--gps-deviation-m: two positive numbers of metres, such as 1 2")
 
 
 def check_disk(prepared: Prepared) -> None:
