@@ -261,7 +261,7 @@ def test_an_interrupted_call_is_waited_for():
 
     def long(cancellation_token):
         os.kill(os.getpid(), signal.SIGINT)
-        while not cancellation_token.is_cancelled():
+        while not cancellation_token.is_cancelled:
             Event().wait(0.001)
         ended.append(True)
 

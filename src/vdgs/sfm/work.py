@@ -94,19 +94,18 @@ def call(function: Callable[..., Result], *arguments: Any, **named: Any) -> Resu
             over.set()
 
     thread = threading.Thread(target=work, name="colmap")
-    thread.start()
     try:
+        thread.start()
         # Not by joining the thread: a join that is interrupted takes the thread for ended.
         while not over.wait(_GLANCE):
             pass
         stop_if_asked()
     except BaseException:
         token.cancel()
-        while not over.wait(_GLANCE):
+        while not over.wait(_GLANCE) and thread.ident is not None:  # None: stopped before it began
             pass
         raise
-    finally:
-        thread.join()
+    thread.join()
     error = ended.get("error")
     if isinstance(error, (MemoryError, KeyboardInterrupt)):
         raise error
