@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -66,7 +67,7 @@ class PlacePanel:
             self._things.append(go)
             go.on_click(lambda _: self._go(go.value))
             for sight in place.sights[:_THUMBNAILS]:
-                picture = visitor.errand(lambda sight=sight: thumbnail(visitor.scene, sight))
+                picture = visitor.errand(partial(thumbnail, visitor.scene, sight))
                 if picture is None:
                     continue
                 label = sight.name + ("" if sight.free else " (hidden there)")

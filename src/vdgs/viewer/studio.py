@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -25,13 +25,14 @@ from vdgs.viewer.layers import Shown
 #: A camera that has not moved for so long rests, seconds.
 REST = 0.12
 #: A quick picture takes so long, and never has fewer pixels nor more than these.
-QUICK, FEWEST_PX, MOST_PX = 0.04, 120 * 90, 640 * 480
+QUICK, FEWEST_PX, MOST_PX = 0.045, 240 * 160, 640 * 480
 #: Rows of a full picture are drawn for so long before others have their turn.
 TURN = 0.1
 
 _Result = TypeVar("_Result")
 
 
+@runtime_checkable
 class Paints(Protocol):
     """Draws what one visitor asks for (`layers.Painter`)."""
 

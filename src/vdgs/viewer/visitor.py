@@ -245,9 +245,10 @@ class Visitor:
                 drawn.append(handle)
 
     def _add_borders(self) -> Any:
-        return self._lines("borders", overlays.borders, 3.0) or self.notify(
-            "No borders", "The scene is not cut into blocks."
-        )
+        lines = self._lines("borders", overlays.borders, 3.0)
+        if lines is None:
+            self.notify("No borders", "The scene is not cut into blocks.")
+        return lines
 
     def _add_cameras(self) -> Any:
         return self._lines("cameras", overlays.frusta, 1.5)
