@@ -132,14 +132,14 @@ def frame(pose: np.ndarray, path: str = "images/frame_000.png") -> dict:
         ({"frames": []}, "none"),
         ({"frames": [{"file_path": "images/frame_000.png"}]}, "4x4 matrix"),
         ({"frames": [frame(2 * np.eye(4))]}, "orthonormal"),
-        ({"frames": [frame(np.eye(4), "../frame_000.png")]}, "inside the image folder"),
+        ({"frames": [frame(np.eye(4), "../frame_000.png")]}, "inside the capture"),
         ({"frames": [frame(np.eye(4), "images/no.png")]}, "no such image"),
         ({"fl_x": "wide"}, "finite number"),
         ({"fl_x": -3.0, "fl_y": -3.0}, "focal length"),
         ({"k1": 0.2}, "lens distortion"),
         ({"camera_model": "OPENCV_FISHEYE"}, "lens distortion"),
         ({"camera_model": "EQUIRECTANGULAR"}, "not supported"),
-        ({"ply_file_path": "../../cloud.ply"}, "inside the image folder"),
+        ({"ply_file_path": "../../cloud.ply"}, "inside the capture"),
         ({"ply_file_path": None}, None),
         ({"applied_transform": (3 * np.eye(4)[:3]).tolist()}, "orthonormal"),
     ],
@@ -308,3 +308,22 @@ def test_matrixcity_blocks(tmp_path, scene):
     both |= {f"test/block_1_test/rgb/{n}": c for n, c in test.cameras.items()}
     assert_sees_the_scene(capture, TinyScene(both, scene.points, scene.colours))
     np.testing.assert_allclose(np.ptp(capture.points, axis=0), np.ptp(scene.points, axis=0), rtol=1e-9)
+
+
+def test_absolute_paths_inside_the_capture_are_those_of_its_files(tmp_path, scene):
+    content = write_transforms(tmp_path / "place", scene)
+    for each in content["frames"]:
+        each["file_path"] = str(tmp_path / "place" / each["file_path"])
+    content["ply_file_path"] = str(tmp_path / "place" / "sparse_pc.ply")
+    (tmp_path / "place" / "transforms.json").write_text(json.dumps(content), encoding="utf-8-sig")
+    (tmp_path / "link").symlink_to(tmp_path / "place")
+    for root in (tmp_path / "place", tmp_path / "link"):
+        capture = load_capture(root)
+        assert capture.images == "images"
+        assert_sees_the_scene(capture, scene)
+
+
+def test_a_path_outside_the_capture_is_called_what_it_is(tmp_path, scene):
+    write_transforms(tmp_path, scene, ply_file_path="/elsewhere/cloud.ply")
+    with pytest.raises(CaptureError, match=r"the ply_file_path '/elsewhere/cloud\.ply' is not a path inside"):
+        load_capture(tmp_path)

@@ -160,6 +160,7 @@ def test_gps_along_one_line_falls_back_to_the_estimate(tmp_path):
     [
         ("name,lat,lon\na,1,2\n", "columns name,lat,lon,alt"),
         ("", "columns name,lat,lon,alt"),
+        ("name,lat,lon,alt\n", "names its columns but holds no rows"),
         ("name,lat,lon,alt\nother,1,2,3\n", "none of its 1 rows"),
         ("name,lat,lon,alt\nframe_000,x,2,3\n", "not numbers"),
         ("name,lat,lon,alt\nframe_000,91,2,3\n", "no place on Earth"),

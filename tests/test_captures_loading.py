@@ -265,8 +265,32 @@ def test_options_that_cannot_be_met_are_named(folder, options, message):
 
 def test_no_view_left_to_test_on(folder, tmp_path):
     (tmp_path / "none.txt").write_text("")
-    with pytest.raises(CaptureError, match="no photograph is left to test on"):
+    with pytest.raises(CaptureError, match=r"none\.txt: names no photograph"):
         load_capture(folder, up(test_list=tmp_path / "none.txt"))
+    (folder / "test.txt").write_text("# to come\n\n")
+    with pytest.raises(CaptureError, match=r"/test\.txt: names no photograph"):
+        load_capture(folder, UP)
+    (tmp_path / "all.txt").write_text("\n".join(path.name for path in (folder / "images").iterdir()))
+    with pytest.raises(CaptureError, match="no photograph is left to train on"):
+        load_capture(folder, up(test_list=tmp_path / "all.txt"))
+
+
+def test_a_list_saved_with_a_byte_order_mark_is_the_same_list(folder, scene):
+    name = sorted(scene.cameras)[3]
+    (folder / "test.txt").write_text(name + "\n", encoding="utf-8-sig")
+    assert [view.name for view in load_capture(folder, UP).test_views] == [name]
+
+
+@pytest.mark.parametrize("downscale", [1.5, 2, 5, 6])
+def test_photographs_are_shrunk_by_any_factor(folder, downscale):
+    """Sides are rounded down, so that they are not those of the camera to the last digit."""
+    for view in load_capture(folder, up(downscale=downscale)).views:
+        assert load_picture(view).image.shape == (view.camera.height, view.camera.width, 3)
+
+
+def test_photographs_are_not_shrunk_to_nothing(folder):
+    with pytest.raises(CaptureError, match=r"--downscale 7: photographs of 64x48 would be 9x6 .*Give at most 6"):
+        load_capture(folder, up(downscale=7))
 
 
 def test_max_images_keeps_a_compact_patch_and_what_it_sees(folder):

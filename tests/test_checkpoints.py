@@ -1,13 +1,17 @@
 """States are whole or absent; a damaged one is noticed and the one before it used."""
 
+import errno
 import json
 import resource
+from pathlib import Path
 
 import pytest
 import torch
+from safetensors import SafetensorError
 
 from vdgs.errors import VdgsError
 from vdgs.storage.checkpoints import SavedState, load_newest, remove_leftovers, save_state
+from vdgs.storage.files import write_atomically
 
 
 def state(iteration: int) -> SavedState:
@@ -87,3 +91,22 @@ def test_a_refusing_disk_is_reported_and_loses_nothing(tmp_path):
     loaded, _ = load_newest(tmp_path)
     assert loaded is not None
     assert same(loaded, state(1))
+
+
+@pytest.mark.parametrize(
+    ("error", "advice"),
+    [
+        (OSError(errno.ENOSPC, "full"), "Free some space"),
+        (OSError(errno.EROFS, "read-only"), "Allow writing"),
+        (PermissionError(errno.EACCES, "denied"), "Allow writing"),
+        (NotADirectoryError(errno.ENOTDIR, "no folder"), "Move away"),
+        (SafetensorError("I/O error: Permission denied (os error 13)"), "Allow writing"),
+        (SafetensorError("I/O error: No space left on device (os error 28)"), "Free some space"),
+    ],
+)
+def test_the_remedy_fits_what_the_disk_refused(tmp_path, error, advice):
+    def write(_: Path) -> None:
+        raise error
+
+    with pytest.raises(VdgsError, match=rf"a\.json: cannot be written .*\. {advice}"):
+        write_atomically(tmp_path / "a.json", write)

@@ -130,7 +130,7 @@ def test_a_truncated_state_falls_back_and_says_so(capture, unbroken, tmp_path):
 def test_other_settings_are_refused_with_the_difference(capture, unbroken):
     done = finish(capture, unbroken, "--seed", "3")
     assert done.returncode == 1
-    assert "training.seed: 0 -> 3" in done.stderr
+    assert "--seed: 0 -> 3" in done.stderr
     assert "Traceback" not in done.stderr
 
 
@@ -268,7 +268,9 @@ def test_evaluation_and_renders_of_a_run(unbroken, tmp_path):
         assert min(float(picture.std()) for picture in pictures) > 3
     again = vdgs("render", run, "--output", tmp_path / "depth", "--kind", "depth", "--raw", "--views", "train")
     assert again.returncode == 0, again.stderr
-    assert "10 views, each with its numbers as .npy in place of 2 files of an earlier render" in again.stdout
+    assert (
+        "10 frames of 64x48 px, each with its numbers as .npy, in place of 2 files of an earlier render" in again.stdout
+    )
     assert len(list((tmp_path / "depth").glob("*.png"))) == len(list((tmp_path / "depth").glob("*.npy"))) == 10
     for numbers in (np.load(file) for file in (tmp_path / "depth").glob("*.npy")):
         assert (numbers.dtype, numbers.shape) == (np.float32, (48, 64))

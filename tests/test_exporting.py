@@ -61,7 +61,7 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     ) -> dict[str, Any]:
         file, shown = tmp_path / "run" / "merged" / "model.safetensors", model or scattered()
         shown.save(file)
-        opened = TrainedRun(RunFolder(tmp_path / "run"), capture_at(origin), shown, file, "merged", Status(), "k")
+        opened = TrainedRun(RunFolder(tmp_path / "run"), shown, file, "merged", Status(), "k", "", capture_at(origin))
         monkeypatch.setattr(exporting, "open_run", lambda *_: opened)
         request = ExportRequest(
             tmp_path / "run", tuple(tmp_path / name for name in names), measure=False, device="cpu", **asked

@@ -200,7 +200,7 @@ def test_other_settings_are_refused_where_they_cost_training(capture, copied):
     before = moments(copied)
     refused = vdgs("run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0")
     assert refused.returncode == 1
-    assert "partition.lambda_vis: 1.0 -> 0.0" in refused.stderr
+    assert "--lambda-vis: 1.0 -> 0.0" in refused.stderr
     assert "--redo" in refused.stderr
     assert changed_files(copied, before) == set()
 
@@ -288,8 +288,11 @@ def test_a_dry_run_says_what_it_takes_and_writes_nothing(capture, copied, tmp_pa
         assert f"2 blocks: about {BLOCK_ITERATIONS} iterations each, 2 at once" in planned.stdout
         assert planned.stdout.count("done already") == 2 * done
     changed = vdgs("run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0", "--dry-run")
-    assert "partition.lambda_vis: 1.0 -> 0.0" in changed.stdout
+    assert "changed --lambda-vis: 1.0 -> 0.0" in changed.stdout
     assert changed.stdout.count("done already") == 1
+    shrunk = vdgs("run", capture, "--output", copied, *SETTINGS, "--downscale", "2", "--dry-run")
+    assert "changed --downscale: 1.0 -> 2.0" in shrunk.stdout, shrunk.stderr
+    assert "done already" not in shrunk.stdout
     assert changed_files(copied, before) == set()
     assert not (tmp_path / "new").exists()
 

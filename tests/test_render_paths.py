@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from vdgs.cameras import Camera
 from vdgs.captures.capture import GroundFrame
 from vdgs.errors import VdgsError
-from vdgs.films.paths import flyover, interpolate, load_path, look_at, orbit
+from vdgs.films.path_files import load_path
+from vdgs.films.paths import flyover, frame_count, interpolate, look_at, orbit
 from vdgs.films.video import VideoWriter, best_encoder
 
 TEMPLATE = Camera(np.eye(4), 400.0, 410.0, 160.0, 90.0, 320, 180)
@@ -192,7 +193,19 @@ def test_a_path_of_nerfstudio(tmp_path: Path):
         ({"frame": "moon", "keyframes": [{}]}, "ground or source"),
         ({"camera_path": [{}]}, "camera_to_world"),
         ("path", "list of key frames"),
-        ({"keyframes": [{"position": [0, 0, 1], "look_at": [0, 0, 0]}], "fps": -3}, "positive"),
+        ({"keyframes": [{"position": [0, 0, 1], "look_at": [0, 0, 0]}], "fps": -3}, "fps is -3; it must be"),
+        ({"keyframes": [{"position": [0, 0, 1], "look_at": [0, 0, 0]}], "second": 3}, "did you mean 'seconds'"),
+        ([{"position": [0, 0, 1], "look_at": [0, 0, 0], "fovdeg": 60}], "key frame 0: there is no 'fovdeg'; did you"),
+        ([{"position": [0, 0, 1], "look_at": [0, 0, 0], "fov_deg": float("nan")}], "fov_deg is nan; it must be"),
+        ([{"position": [0, 0, 1], "look_at": [0, 0, 0], "width": 100_000_000}], "width is 100000000; it must be"),
+        ([{"position": [0, 0, 1], "look_at": [0, 0, 0], "fx": "wide"}], "fx is 'wide'; it must be a number"),
+        ([{"position": [0, 0, 1], "look_at": [0, 0, 0], "fx": 100, "fov_deg": 50}], "fov_deg or fx and fy"),
+        ([{"position": [0, 0, 1e300], "look_at": [0, 0, 0]}], "position must be three numbers"),
+        ([{"position": "here", "look_at": [0, 0, 0]}], "position must be three numbers"),
+        ([{"camera_from_world": np.eye(4).tolist(), "up": [0, 0, 1]}], "leave out up"),
+        ({"keyframes": [{"position": [0, 0, 1], "look_at": [0, 0, 0]}], "closed": "no"}, "closed is 'no'; it must be"),
+        ({"camera_path": [[1, 2]]}, "frame 0 of camera_path: it must be an object"),
+        ({"camera_path": [{"camera_to_world": np.eye(4).tolist(), "fov": 400}]}, "fov is 400"),
     ],
 )
 def test_what_is_wrong_is_named(content, says: str, tmp_path: Path):
@@ -200,6 +213,21 @@ def test_what_is_wrong_is_named(content, says: str, tmp_path: Path):
     with pytest.raises(VdgsError, match=says) as caught:
         load_path(file, TEMPLATE)
     assert str(file) in str(caught.value)
+
+
+def test_a_film_has_no_more_frames_than_can_be_drawn(tmp_path: Path):
+    file = write(tmp_path, [{"position": [0, 0, z], "look_at": [0, 9, 0]} for z in (1, 2)])
+    with pytest.raises(VdgsError, match=r"86,400,000 frames.*fewer --seconds"):
+        load_path(file, TEMPLATE, seconds=86_400.0, fps=1000.0)
+    with pytest.raises(VdgsError, match="nan frames"):
+        frame_count(float("nan"), 30.0)
+    assert frame_count(0.001, 1.0) == 1
+
+
+def test_a_path_saved_with_a_byte_order_mark(tmp_path: Path):
+    file = write(tmp_path, [{"position": [0, 0, 1], "look_at": [0, 0, 0]}])
+    file.write_text(file.read_text(), encoding="utf-8-sig")
+    assert len(load_path(file, TEMPLATE).cameras) == 1
 
 
 def test_a_file_that_is_not_json(tmp_path: Path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -58,9 +59,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"vdgs {__version__}")
         return
     if arguments[0] not in VERBS:
-        print(f"vdgs: there is no verb {arguments[0]!r}\n\n{HELP}", end="", file=sys.stderr)
+        print(f"{HELP}\nvdgs: there is no verb {arguments[0]!r}{_like(arguments[0])}", file=sys.stderr)
         sys.exit(2)
     sys.exit(_run(arguments[0], arguments[1:]))
+
+
+def _like(word: str) -> str:
+    """A question about the verb that may be meant."""
+    import difflib
+
+    like = difflib.get_close_matches(word.lower().lstrip("-"), [*VERBS, "help"], n=1)
+    return f"; did you mean {like[0]!r}?" if like else ""
 
 
 def _run(verb: str, arguments: list[str]) -> int:
@@ -82,7 +91,7 @@ def _run(verb: str, arguments: list[str]) -> int:
     except BrokenPipeError:
         return 1
     except OSError as error:  # a disk that is full, a folder that cannot be written: no news from a traceback
-        print(f"vdgs {verb}: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        print(f"vdgs {verb}: {error.filename or 'a file'}: {error.strerror or error}{_remedy(error)}", file=sys.stderr)
         return 1
     except (MemoryError, RuntimeError) as error:
         from vdgs.memory.process import is_out_of_memory
@@ -95,6 +104,17 @@ def _run(verb: str, arguments: list[str]) -> int:
             file=sys.stderr,
         )
         return 1
+
+
+def _remedy(error: OSError) -> str:
+    """What to do about a file that the system refuses, where that is plain."""
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return ". See whose it is and who may use it (ls -l, chmod), or choose another."
+    if error.errno in (errno.EROFS, errno.ENOSPC, errno.EDQUOT):
+        from vdgs.storage.files import remedy
+
+        return f". {remedy(error)}."
+    return ""
 
 
 if __name__ == "__main__":

@@ -9,12 +9,14 @@ from rich.console import Console
 from rich.markup import escape
 
 from vdgs.captures.capture import Capture
-from vdgs.errors import RunError, VdgsError
+from vdgs.errors import RunError
+from vdgs.evaluation.lpips import refuse_missing
 from vdgs.evaluation.of_run import evaluation_folder
 from vdgs.report import write_report
 from vdgs.report.terminal import next_step, whole_standing
 from vdgs.runs.beginning import begin_run
 from vdgs.runs.folder import RunFolder
+from vdgs.settings.ranges import refuse
 from vdgs.settings.requests import RunRequest
 from vdgs.stages.coarse import train_coarse
 from vdgs.stages.evaluate import evaluate_stage, is_measured
@@ -33,9 +35,8 @@ def run_all(asked: RunRequest, console: Console, command: str | None = None) -> 
 
     Raises what the stages raise; all that was finished before stays, and the same command continues.
     """
-    asked.watching.check()
-    if asked.jobs < 0 or asked.bins < 1:
-        raise VdgsError("--jobs must not be negative and --bins must be at least 1")
+    refuse(asked)
+    refuse_missing(asked.lpips_weights)
     run, capture = begin_run(
         asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo, command=command
     )

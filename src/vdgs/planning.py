@@ -22,12 +22,12 @@ from vdgs.kernels import threads as threads_available
 from vdgs.memory.estimate import GROWTH, Need, estimate, in_gb
 from vdgs.memory.process import available_bytes
 from vdgs.partition.cut import SEEN, choose_block_count
-from vdgs.runs.beginning import run_settings
-from vdgs.runs.folder import RunFolder
+from vdgs.runs.beginning import reads_otherwise, run_settings
+from vdgs.runs.folder import RunFolder, changed_options
 from vdgs.runs.standing import RunStanding, standing_of
 from vdgs.settings.checks import validate
 from vdgs.settings.method import MethodConfig, TrainConfig, block_limit, block_training, with_iterations
-from vdgs.settings.plain import differences
+from vdgs.settings.ranges import refuse
 from vdgs.settings.requests import RunRequest
 from vdgs.stages.coarse import open_stage, start
 from vdgs.storage.files import read_json
@@ -58,6 +58,7 @@ class Plan:
 
 def plan_run(asked: RunRequest, console: Console) -> Plan:
     """Say what `vdgs run` would do and take. Raises what reading the capture raises, VdgsError for bad settings."""
+    refuse(asked)
     method = asked.method()
     if problems := validate(method):
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
@@ -78,10 +79,10 @@ def _standing(asked: RunRequest, capture: Capture, method: MethodConfig, console
     run = RunFolder(asked.output)
     if not run.config_file.exists():
         return None
-    if run.capture_file.exists():
-        refuse_another_capture(run.capture_file, read_json(run.capture_file), capture)
     settings = run_settings(asked.capture, asked.options, method)
-    for line in differences(run.settings(), settings):
+    if run.capture_file.exists() and not reads_otherwise(run, settings):
+        refuse_another_capture(run.capture_file, read_json(run.capture_file), capture)
+    for line in changed_options(run.settings(), settings):
         console.print(f"[yellow]changed[/] {line}", highlight=False)
     return standing_of(run, settings)
 

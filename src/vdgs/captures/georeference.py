@@ -18,7 +18,7 @@ def read_georef(file: Path) -> tuple[float, float, float]:
     Raises `CaptureError` if the file is missing, is not JSON, or does not promise an ENU frame in metres.
     """
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(file.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror}).") from error
     except (ValueError, RecursionError) as error:
@@ -44,17 +44,18 @@ def read_gps(file: Path) -> dict[str, tuple[float, float, float]]:
     """
     try:
         with file.open(encoding="utf-8-sig", newline="") as stream:
-            rows = list(csv.DictReader(stream))
+            table = csv.DictReader(stream)
+            present, rows = set(table.fieldnames or ()), list(table)
     except OSError as error:
         raise CaptureError(f"{file}: cannot be read ({error.strerror}).") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise CaptureError(f"{file}: is not a CSV table ({error}).") from None
     needed = {"name", "lat", "lon", "alt"}
-    present = {key for row in rows[:1] for key in row if key is not None}
     if not needed <= present:
-        raise CaptureError(
-            f"{file}: needs a header and rows with the columns name,lat,lon,alt (found: {sorted(present)})."
-        )
+        found = ", ".join(sorted(present)) or "nothing"
+        raise CaptureError(f"{file}: needs a first line that names the columns name,lat,lon,alt (found: {found}).")
+    if not rows:
+        raise CaptureError(f"{file}: names its columns but holds no rows. Write one for each photograph.")
     positions: dict[str, tuple[float, float, float]] = {}
     for number, row in enumerate(rows, 2):
         words = [(row[key] or "").strip() for key in ("lat", "lon", "alt")]

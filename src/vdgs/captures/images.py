@@ -15,7 +15,7 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import View
-from vdgs.captures.photographs import decode_mask, decode_photograph
+from vdgs.captures.photographs import decode_mask, decode_photograph, same_shape
 from vdgs.errors import CaptureError
 
 #: Prefetches beyond this many are dropped: a hint, not a promise.
@@ -180,7 +180,7 @@ def load_picture(view: View) -> Picture:
         None if keep is None else torch.from_numpy(keep.astype(np.uint8)),
     )
     camera = view.camera
-    if abs(width / camera.width - height / camera.height) * min(camera.width, camera.height) > 2:
+    if not same_shape((camera.width, camera.height), (width, height)):
         raise CaptureError(
             f"{view.image_path}: is {width}x{height} now, but was another shape when the capture was read "
             f"(camera {camera.width}x{camera.height}). Do not change images while they are in use."

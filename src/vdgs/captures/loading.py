@@ -21,9 +21,10 @@ from vdgs.captures.photographs import LEAST_SIDE_PX
 from vdgs.captures.precision import rounding_of
 from vdgs.captures.sightings import Sightings
 from vdgs.captures.splits import choose_splits, nearest_to_middle
-from vdgs.captures.undistortion import undistort
+from vdgs.captures.undistortion import ImageFile, undistort
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.ranges import problems
 
 #: Points farther from the cameras than this many times their spread are strays of the matching.
 FAR_POINT = 100.0
@@ -45,6 +46,7 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     source = _without_bad_points(source, warnings)
     photographs = find_photographs(root, source, options, warnings)
     photographs = _undistorted(root, photographs, options, warnings)
+    _refuse_tiny(photographs, options)
     ground, ground_warnings = find_ground_frame(source, root, options)
     views = [_view(photo, options, ground) for photo in photographs]
     points, colours = ground.to_ground(source.points), source.colours
@@ -66,17 +68,12 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
 
 
 def _check_options(options: CaptureOptions) -> None:
-    if not (np.isfinite(options.downscale) and options.downscale >= 1):
-        raise CaptureError(f"--downscale {options.downscale}: must be at least 1.")
+    found = problems(options)
+    if found:
+        raise CaptureError("\n  ".join(found))
     for flag, folder in (("--images", options.images), ("--masks", options.masks)):
         if folder is not None and (Path(folder).is_absolute() or ".." in Path(folder).parts or not folder):
             raise CaptureError(f"{flag} {folder}: must be a folder inside the capture, such as images_4.")
-    if options.test_every < 2:
-        raise CaptureError(
-            f"--test-every {options.test_every}: must be at least 2 (1 would leave nothing to train on)."
-        )
-    if options.max_images is not None and options.max_images < 2:
-        raise CaptureError(f"--max-images {options.max_images}: must be at least 2.")
 
 
 # ------------------------------------------------------------------------------------------- reading
@@ -194,6 +191,22 @@ def _undistorted(
     return [FoundView(photo.view, file) for photo, file in zip(photographs, straight, strict=True)]
 
 
+def _refuse_tiny(photographs: list[FoundView], options: CaptureOptions) -> None:
+    """Raise CaptureError where so little is left of a photograph by --downscale that it shows nothing."""
+    smallest = min((photo.file for photo in photographs), key=lambda file: min(_size(file)))
+    (width, height), factor = _size(smallest), options.downscale
+    if factor > 1 and min(width, height) / factor < LEAST_SIDE_PX:
+        raise CaptureError(
+            f"--downscale {factor:g}: photographs of {width}x{height} would be {int(width / factor)}x"
+            f"{int(height / factor)} ({smallest.path}), too few pixels to show anything. Give at most "
+            f"{max(1, min(width, height) // LEAST_SIDE_PX)}."
+        )
+
+
+def _size(file: ImageFile) -> tuple[int, int]:
+    return file.intrinsics.width, file.intrinsics.height
+
+
 def _view(photo: FoundView, options: CaptureOptions, ground: GroundFrame) -> View:
     intrinsics = photo.file.intrinsics
     (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.principal_point
@@ -202,11 +215,6 @@ def _view(photo: FoundView, options: CaptureOptions, ground: GroundFrame) -> Vie
     camera = Camera(pose, fx, fy, cx, cy, width, height)
     if options.downscale != 1:
         width, height = int(width / options.downscale), int(height / options.downscale)
-        if min(width, height) < LEAST_SIDE_PX:
-            raise CaptureError(
-                f"--downscale {options.downscale:g}: leaves {width}x{height} pixels of {photo.file.path}, too few to "
-                "show anything."
-            )
         camera = camera.resized(width, height)
     seen = photo.view.sightings
     sightings = None if seen is None else Sightings(ground.to_ground(seen.points), seen.rays)

@@ -37,24 +37,37 @@ def refuse_in_a_capture(output: Path) -> None:
 def refuse_among_inputs(output: Path, capture: Capture) -> None:
     """Raise VdgsError where `output` lies among the photographs or masks of this capture, wherever they are, or among
     the inputs of any other (`refuse_in_a_capture`)."""
+    refuse_among_folders(output, capture.root, folders_of_inputs(capture))
+
+
+def folders_of_inputs(capture: Capture) -> list[Path]:
+    """The folders that hold photographs or masks of a capture, wherever they are."""
     files = [view.image_path for view in capture.views]
     files += [view.mask_path for view in capture.views if view.mask_path is not None]
     if Path(capture.images) != Path():
         files.append(capture.root / capture.images / "any")
-    refuse_among_files(output, capture.root, files)
+    return _folders_of(files)
 
 
 def refuse_among_files(output: Path, root: Path, files: Sequence[Path]) -> None:
     """Raise VdgsError where `output` lies in, or is, a folder that holds one of the `files` of the capture in `root`.
 
-    What the files are links to counts too. Where they lie in the root itself, folders beside them are free.
+    What the files are links to counts too.
+    """
+    refuse_among_folders(output, root, _folders_of(files))
+
+
+def refuse_among_folders(output: Path, root: Path, folders: Sequence[Path]) -> None:
+    """Raise VdgsError where `output` lies in, or is, one of the `folders` with inputs of the capture in `root`.
+
+    Where inputs lie in the root itself, folders beside them are free.
     """
     refuse_in_a_capture(output)
     real = Path(os.path.realpath(output))
     around = {_identity(folder) for folder in (real, *real.parents)} - {None}
     whole_capture = Path(os.path.realpath(root))
     above_root = {_identity(folder) for folder in (whole_capture, *whole_capture.parents)}
-    for folder in _folders_of(files):
+    for folder in folders:
         known = _identity(folder)
         if known in around and (known not in above_root or known == _identity(real)):
             raise _error(output, folder, root)

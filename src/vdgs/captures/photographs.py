@@ -22,7 +22,8 @@ from vdgs.memory.process import is_out_of_memory
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp"}
 #: Headers that announce more pixels than this are refused rather than decoded.
 LARGEST_IMAGE_PX = 1_000_000_000
-#: A photograph or mask with a shorter side than this shows nothing: a thumbnail, or what is left of a file (choice).
+#: A photograph or mask with a shorter side than this (pixels) shows nothing: a thumbnail, what is left of a file, or
+#: what --downscale leaves (choice).
 LEAST_SIDE_PX = 8
 #: Two sizes are of one shape if one is the other shrunk evenly, each side rounded by less than this (pixels).
 ROUNDING_PX = 1.0

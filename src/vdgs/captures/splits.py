@@ -44,7 +44,7 @@ def choose_splits(
     chosen = [replace(view, split=split) for view, split in zip(views, splits, strict=True)]
     own = root / VALIDATION_LIST
     if own.is_file() and options.split != "every":
-        chosen = _with_validation_list(chosen, _listed(own, names), options.validation)
+        chosen = _with_validation_list(chosen, _listed(own, names, some=options.validation), options.validation)
     elif options.validation:
         kept = [view for view in chosen if view.split == "train"]
         chosen = [replace(v, split="train" if i % options.test_every else "test") for i, v in enumerate(kept)]
@@ -66,7 +66,7 @@ def _splits(
         listed = root / TEST_LIST
     if options.split != "every":
         if listed is not None:
-            tests = _listed(listed, names)
+            tests = _listed(listed, names, some=True)
             return ["test" if view.name in tests else "train" for view in views]
         if all(explicit.get(view.name) is not None for view in views):
             return ["test" if explicit[view.name] == "test" else "train" for view in views]
@@ -87,13 +87,20 @@ def _with_validation_list(views: list[View], listed: set[str], validation: bool)
     return [replace(view, split="test" if view.name in listed else "train") for view in kept]
 
 
-def _listed(file: Path, names: Names) -> set[str]:
-    """The photographs named in a text file, one a line; extensions and case may differ."""
+def _listed(file: Path, names: Names, some: bool) -> set[str]:
+    """The photographs named in a text file, one a line; extensions and case may differ. CaptureError for a list that
+    cannot be read, names what is no photograph, or names nothing where `some` are needed."""
     try:
-        lines = file.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{file}: cannot be read ({error}).") from None
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise CaptureError(f"{file}: is not UTF-8 text ({error}). Save it as UTF-8.") from None
+    except OSError as error:
+        raise CaptureError(f"{file}: cannot be read ({error.strerror or error}).") from None
     wanted = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if some and not wanted:
+        raise CaptureError(
+            f"{file}: names no photograph. Write one image name a line, or ignore lists with --split every."
+        )
     found = {name: names.find(name) for name in wanted}
     unknown = [name for name, match in found.items() if match is None]
     if unknown:

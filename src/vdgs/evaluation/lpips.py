@@ -97,6 +97,7 @@ def load_lpips(weights: Path | None = None, heads: Path | None = None) -> tuple[
     `weights` is torchvision's VGG16 state dict (.pth or .safetensors); without it torch's own download
     folder is looked at. Raises VdgsError where a file that was named, or found, cannot be used.
     """
+    refuse_missing(weights)
     cached = cached_weights()
     source = weights or (cached if cached.is_file() else None)
     if source is None:
@@ -116,6 +117,12 @@ def load_lpips(weights: Path | None = None, heads: Path | None = None) -> tuple[
             f"({VGG16_URL}), the heads vgg.pth of torchmetrics or lpips."
         ) from error
     return metric, f"LPIPS from {source.name} ({_origin(source)})"
+
+
+def refuse_missing(weights: Path | None) -> None:
+    """Raise VdgsError where weights are named and no such file is there."""
+    if weights is not None and not weights.is_file():
+        raise VdgsError(f"--lpips-weights {weights}: no such file; it should hold the VGG16 weights.")
 
 
 def cached_weights() -> Path:

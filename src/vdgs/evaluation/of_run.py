@@ -99,7 +99,7 @@ def visibility_map(coarse: TrainedRun) -> Callable[[Camera], np.ndarray]:
 
     So the same pixels are compared between the models of a run.
     """
-    visibility = visibility_of_run(coarse).float()
+    visibility = visibility_of_run(coarse, [view.camera for view in coarse.capture.train_views]).float()
     return lambda camera: render_values(coarse.model, visibility, camera).cpu().numpy()
 
 

@@ -16,6 +16,8 @@ from vdgs.placing.placement import Placement
 
 #: Coordinates up to here (m or units) keep a millimetre in float32: they need no origin of their own.
 FAR = 10_000.0
+#: A similarity that is taken from a map of space onto itself is off by rounding.
+STILL = 1e-9
 #: Origins are whole multiples of this, so that people can type them.
 ROUND = 100.0
 
@@ -29,14 +31,24 @@ class Frame:
     translation: Float[np.ndarray, "3"]
     facts: Facts
 
+    @property
+    def still(self) -> bool:
+        """Nothing moves: local coordinates are those of the ground frame, to the last bit."""
+        apart = np.abs(self.rotation - np.eye(3)).max(), abs(self.scale - 1), np.abs(self.translation).max()
+        return bool(max(apart) < STILL)
+
     def place(self, gaussians: Gaussians) -> Gaussians:
         """Gaussians of the ground frame in local coordinates."""
-        return transformed(gaussians, self.scale, self.rotation, self.translation)
+        return gaussians if self.still else transformed(gaussians, self.scale, self.rotation, self.translation)
 
     def to_ground(self, gaussians: Gaussians) -> Gaussians:
         """The inverse of `place`."""
         back = self.rotation.T
-        return transformed(gaussians, 1 / self.scale, back, -back @ self.translation / self.scale)
+        return (
+            gaussians
+            if self.still
+            else transformed(gaussians, 1 / self.scale, back, -back @ self.translation / self.scale)
+        )
 
 
 def frame_of(ground: GroundFrame, crs: str | None, centre: Float[np.ndarray, "3"]) -> Frame:

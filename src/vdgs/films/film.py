@@ -12,30 +12,38 @@ from rich.console import Console
 from rich.progress import track
 
 from vdgs.cameras import Camera
-from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
+from vdgs.captures.facts import refuse_another_capture
+from vdgs.captures.outputs import refuse_among_folders, refuse_in_a_capture
 from vdgs.errors import VdgsError
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.evaluation.saving import file_stems, write_png
 from vdgs.films import folder, paths
 from vdgs.films.legend import legend, with_legend
 from vdgs.films.maps import Map, map_of
+from vdgs.films.path_files import load_path
 from vdgs.films.video import VideoWriter
+from vdgs.memory.process import available_bytes
 from vdgs.model.render import render
-from vdgs.runs.opening import TrainedRun, open_run
-from vdgs.settings.requests import RenderRequest
+from vdgs.runs.flight import Flight, flight_of, kept_flight
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import OpenedModel, open_capture, open_model
+from vdgs.settings.ranges import refuse
+from vdgs.settings.requests import LARGEST_SIDE_PX, RenderRequest
 from vdgs.storage.files import write_array
 from vdgs.watching.interrupts import stop_if_asked
 
 #: Pace of a film of separate views.
 SLIDES_PER_SECOND = 2.0
+#: What drawing takes at most of memory for each pixel: the raster, its depth, pictures made of it.
+BYTES_PER_PIXEL = 100
 
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """One picture with its name, and the numbers that it shows."""
+    """One picture, with its legend or without, its name, and the numbers that it shows."""
 
     name: str
-    picture: UInt8[np.ndarray, "h w 3"]
+    picture: UInt8[np.ndarray, "_ w 3"]
     values: Float[np.ndarray, "h w"] | None
 
 
@@ -48,23 +56,24 @@ def render_run(asked: RenderRequest, console: Console) -> None:
     began = time.monotonic()
     _check(asked)
     refuse_in_a_capture(asked.output)
-    run = open_run(asked.run, asked.model, asked.device)
-    refuse_among_inputs(asked.output, run.capture)
+    run = open_model(RunFolder(asked.run), asked.model, asked.device)
+    flight = _flight(asked, run)
+    refuse_among_folders(asked.output, flight.root, flight.inputs)
     if run.caution:
         console.print(f"[yellow]warning[/] {run.caution}", highlight=False)
-    named, fps = _cameras(asked, run)
+    named, fps = _cameras(asked, flight)
     if asked.width:
         named = [(name, camera.resized(asked.width, _height(camera, asked.width))) for name, camera in named]
+    _refuse_large(asked, [camera for _, camera in named])
     if asked.output.suffix:
-        said = _write_film(asked, run, named, fps, console)
+        said = _write_film(asked, run, flight, named, fps, console)
     else:
-        said = _write_pictures(asked, run, named, console)
+        said = _write_pictures(asked, run, flight, named, console)
     console.print(f"{run.line}: {said}, drawn in {time.monotonic() - began:.1f} s: {asked.output}", highlight=False)
 
 
 def _check(asked: RenderRequest) -> None:
-    if min(asked.width, asked.fps, asked.seconds) < 0:
-        raise VdgsError("--width, --fps and --seconds must not be negative")
+    refuse(asked)
     if asked.raw and asked.kind == "image":
         raise VdgsError("--raw writes the numbers of a map: it needs --kind depth, visibility or alpha.")
     if asked.raw and asked.output.suffix:
@@ -72,7 +81,12 @@ def _check(asked: RenderRequest) -> None:
 
 
 def _write_film(
-    asked: RenderRequest, run: TrainedRun, named: list[tuple[str, Camera]], fps: float, console: Console
+    asked: RenderRequest,
+    run: OpenedModel,
+    flight: Flight,
+    named: list[tuple[str, Camera]],
+    fps: float,
+    console: Console,
 ) -> str:
     """Draw the frames of a film; returns what to say of it."""
     if asked.output.is_dir():
@@ -83,7 +97,7 @@ def _write_film(
             f"{asked.output}: a film needs frames of one size, and these views have {len(sizes)}. Give a folder."
         )
     with VideoWriter(asked.output, fps) as film:
-        drawn = _map(asked, run, named)
+        drawn = _map(asked, run, flight, named)
         for frame in _frames(asked, run, named, drawn, console):
             film.write(frame.picture)
     (width, height), strip = sizes.pop(), ""
@@ -96,12 +110,14 @@ def _write_film(
     )
 
 
-def _write_pictures(asked: RenderRequest, run: TrainedRun, named: list[tuple[str, Camera]], console: Console) -> str:
+def _write_pictures(
+    asked: RenderRequest, run: OpenedModel, flight: Flight, named: list[tuple[str, Camera]], console: Console
+) -> str:
     """Draw pictures into a folder; returns what to say of them."""
     kinds = (".png", ".npy") if asked.raw else (".png",)
     names = [name + kind for name, _ in named for kind in kinds]
     earlier = folder.begin(asked.output, names)
-    drawn = _map(asked, run, named)
+    drawn = _map(asked, run, flight, named)
     for frame in _frames(asked, run, named, drawn, console):
         write_png(asked.output / f"{frame.name}.png", frame.picture)
         if asked.raw and frame.values is not None:
@@ -117,12 +133,12 @@ def _frames_of(count: int) -> str:
     return f"{count:,} frame{'' if count == 1 else 's'}"
 
 
-def _map(asked: RenderRequest, run: TrainedRun, named: list[tuple[str, Camera]]) -> Map | None:
+def _map(asked: RenderRequest, run: OpenedModel, flight: Flight, named: list[tuple[str, Camera]]) -> Map | None:
     """The map that all views are drawn as; None for plain pictures."""
-    return None if asked.kind == "image" else map_of(asked.kind, run, [camera for _, camera in named])
+    return None if asked.kind == "image" else map_of(asked.kind, run, flight, [camera for _, camera in named])
 
 
-def _facts(asked: RenderRequest, run: TrainedRun, drawn: Map | None) -> dict[str, object]:
+def _facts(asked: RenderRequest, run: OpenedModel, drawn: Map | None) -> dict[str, object]:
     """What render.json says of the pictures beside it."""
     facts: dict[str, object] = {
         "run": str(asked.run.resolve()), "model": run.name, "kind": asked.kind,
@@ -134,23 +150,49 @@ def _facts(asked: RenderRequest, run: TrainedRun, drawn: Map | None) -> dict[str
     return facts
 
 
-def _cameras(asked: RenderRequest, run: TrainedRun) -> tuple[list[tuple[str, Camera]], float]:
+def _flight(asked: RenderRequest, run: OpenedModel) -> Flight:
+    """The cameras of the run: as it keeps them, else of its capture, which is asked too where it is named."""
+    facts = run.model.facts.get("capture", {})
+    kept = kept_flight(run.folder, facts) if asked.capture is None else None
+    if kept is not None:
+        return kept
+    capture = open_capture(run.folder, asked.capture)
+    refuse_another_capture(run.model_path, facts, capture)
+    return flight_of(capture)
+
+
+def _cameras(asked: RenderRequest, flight: Flight) -> tuple[list[tuple[str, Camera]], float]:
     """The cameras with their names, and the frames per second for a film of them."""
-    capture = run.capture
     if asked.path is None and asked.views in ("test", "train"):
-        views = capture.test_views if asked.views == "test" else capture.train_views
-        stems = file_stems([view.name for view in views])
-        cameras, fps = [view.camera for view in views], asked.fps or SLIDES_PER_SECOND
-        return list(zip(stems, cameras, strict=True)), fps
-    flown, template = [view.camera for view in capture.train_views], capture.train_views[0].camera
+        names, cameras = zip(*(flight.test if asked.views == "test" else flight.train), strict=True)
+        return list(zip(file_stems(list(names)), cameras, strict=True)), asked.fps or SLIDES_PER_SECOND
+    template = flight.cameras[0]
     length, rate = asked.seconds or paths.SECONDS, asked.fps or paths.FPS
     if asked.path is not None:
-        path = paths.load_path(asked.path, template, capture.ground, asked.seconds or None, asked.fps or None)
+        path = load_path(asked.path, template, flight.ground, asked.seconds or None, asked.fps or None)
     elif asked.views == "orbit":
-        path = paths.orbit(capture.points, flown, template, length, rate)
+        path = paths.orbit(flight.middle[None], flight.cameras, template, length, rate)
     else:
-        path = paths.flyover(flown, template, length, rate)
+        path = paths.flyover(flight.cameras, template, length, rate)
     return [(f"{i:05d}", camera) for i, camera in enumerate(path.cameras)], path.fps
+
+
+def _refuse_large(asked: RenderRequest, cameras: list[Camera]) -> None:
+    """Raise VdgsError, before anything is drawn, for pictures that memory does not hold or nothing can show."""
+    largest = max(cameras, key=lambda camera: camera.width * camera.height)
+    size = f"{largest.width}x{largest.height}"
+    where = f"{asked.path}: " if asked.path is not None and not asked.width else ""
+    if max(largest.width, largest.height) > LARGEST_SIDE_PX:
+        raise VdgsError(
+            f"{where}pictures of {size} are too large: at most {LARGEST_SIDE_PX} pixels a side can be drawn. "
+            "Give a smaller --width."
+        )
+    need, free = largest.width * largest.height * BYTES_PER_PIXEL, available_bytes()
+    if need > free:
+        raise VdgsError(
+            f"{where}a picture of {size} takes about {need / 1e9:.1f} GB to draw, and {free / 1e9:.1f} GB are free. "
+            "Give a smaller --width."
+        )
 
 
 def _height(camera: Camera, width: int) -> int:
@@ -158,7 +200,7 @@ def _height(camera: Camera, width: int) -> int:
 
 
 def _frames(
-    asked: RenderRequest, run: TrainedRun, named: list[tuple[str, Camera]], drawn: Map | None, console: Console
+    asked: RenderRequest, run: OpenedModel, named: list[tuple[str, Camera]], drawn: Map | None, console: Console
 ) -> Iterator[_Frame]:
     """One picture per camera, in order."""
     for name, camera in track(named, "rendering", console=console, disable=not console.is_terminal):

@@ -13,11 +13,11 @@ from matplotlib.colors import Normalize
 from matplotlib.ticker import MaxNLocator
 
 from vdgs.cameras import Camera
-from vdgs.captures.heights import camera_height
 from vdgs.figures.seen_map import steps
 from vdgs.figures.style import SEEN
 from vdgs.model.render import render, render_values
-from vdgs.runs.opening import TrainedRun
+from vdgs.runs.flight import Flight
+from vdgs.runs.opening import OpenedModel
 from vdgs.runs.visibility import visibility_of_run
 
 MapKind = Literal["depth", "visibility", "alpha"]
@@ -63,24 +63,24 @@ class Map:
     meaning: str
 
 
-def map_of(kind: MapKind, run: TrainedRun, cameras: Sequence[Camera]) -> Map:
-    """The map to be drawn in all of `cameras`."""
-    return {"depth": _depth, "visibility": _visibility, "alpha": _alpha}[kind](run, cameras)
+def map_of(kind: MapKind, run: OpenedModel, flight: Flight, cameras: Sequence[Camera]) -> Map:
+    """The map of a model to be drawn in all of `cameras`; `flight` is that of its run."""
+    return {"depth": _depth, "visibility": _visibility, "alpha": _alpha}[kind](run, flight, cameras)
 
 
-def _depth(run: TrainedRun, cameras: Sequence[Camera]) -> Map:
+def _depth(run: OpenedModel, flight: Flight, cameras: Sequence[Camera]) -> Map:
     def values(camera: Camera) -> Float[np.ndarray, "h w"]:
         raster = render(run.model, camera, depth=True)
         assert raster.median_depth is not None
         depth, alpha = raster.median_depth.cpu().numpy(), raster.alpha.cpu().numpy()
         return np.where(alpha > 0.5, depth, np.nan).astype(np.float32)
 
-    unit = run.capture.ground.unit
+    unit = flight.ground.unit
     meaning = (
         f"Median depth: z along the view, in {unit} of the ground frame, at which a pixel becomes half opaque; NaN "
         "where it never does."
     )
-    span = depth_span((values(camera.within(_PREVIEW_PX)) for camera in _spread(cameras)), camera_height(run.capture))
+    span = depth_span((values(camera.within(_PREVIEW_PX)) for camera in _spread(cameras)), flight.height)
     return Map(values, depth_scale(span, unit), meaning)
 
 
@@ -114,8 +114,8 @@ def depth_scale(span: tuple[float, float], unit: str) -> Scale:
     )  # fmt: skip
 
 
-def _visibility(run: TrainedRun, cameras: Sequence[Camera]) -> Map:
-    counts = visibility_of_run(run)
+def _visibility(run: OpenedModel, flight: Flight, cameras: Sequence[Camera]) -> Map:
+    counts = visibility_of_run(run, flight.cameras)
     meaning = (
         "V: how many training cameras see the place, the mean over the anchors that a pixel shows; NaN where alpha is "
         "at most 0.5."
@@ -140,7 +140,7 @@ def seen_scale(counts: Shaped[np.ndarray, " n"]) -> Scale:
     )  # fmt: skip
 
 
-def _alpha(run: TrainedRun, cameras: Sequence[Camera]) -> Map:
+def _alpha(run: OpenedModel, flight: Flight, cameras: Sequence[Camera]) -> Map:
     def values(camera: Camera) -> Float[np.ndarray, "h w"]:
         return render(run.model, camera).alpha.cpu().numpy().astype(np.float32)
 

@@ -1,32 +1,12 @@
-"""Camera paths for films: from a file, through key frames, around a scene, along a flight.
+"""Camera paths for films: through key frames, around a scene, along a flight. `path_files` reads them.
 
-The file is JSON, either our own:
-
-    {
-      "frame": "ground",              // or "source": the frame of the capture's own cameras
-      "seconds": 10, "fps": 30,       // optional
-      "closed": false,                // optional: come back to the first key frame
-      "interpolate": true,            // optional: false shows the key frames as they are, one a frame
-      "keyframes": [
-        {"position": [0, 0, 30], "look_at": [0, 20, 0], "up": [0, 0, 1], "fov_deg": 60},
-        {"camera_from_world": [[...], [...], [...], [0, 0, 0, 1]],
-         "fx": 800, "fy": 800, "cx": 480, "cy": 270, "width": 960, "height": 540}
-      ]
-    }
-
-or a camera path exported by nerfstudio's viewer (`camera_path`, OpenGL cameras). `fov_deg` is the
-vertical angle of view. What a key frame leaves out of the intrinsics comes from the camera that the
-caller gives. Cameras come back in the ground frame (z up).
+All in the ground frame (z up).
 """
 
 from __future__ import annotations
 
-import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -35,8 +15,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from vdgs.cameras import Camera
-from vdgs.captures.capture import GroundFrame
 from vdgs.errors import VdgsError
+from vdgs.settings.requests import MOST_FRAMES
 
 FPS = 30.0
 SECONDS = 12.0
@@ -54,43 +34,14 @@ class CameraPath:
     fps: float
 
 
-def load_path(
-    file: Path,
-    default: Camera,
-    ground: GroundFrame | None = None,
-    seconds: float | None = None,
-    fps: float | None = None,
-) -> CameraPath:
-    """Read a camera path (module docstring); `default` gives the size and intrinsics left out.
-
-    `ground` brings paths in the source frame (and nerfstudio's) into the ground frame; `seconds` and
-    `fps` go before what the file says. Raises VdgsError naming the file, the key frame and the field.
-    """
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise VdgsError(f"{file}: no such camera path.") from error
-    except (OSError, ValueError) as error:
-        raise VdgsError(f"{file} is not a camera path in JSON: {error}") from error
-    if isinstance(content, list):
-        content = {"keyframes": content}
-    if not isinstance(content, Mapping):
-        raise VdgsError(f"{file}: a camera path is a list of key frames, or an object with `keyframes`.")
-    try:
-        if "camera_path" in content:
-            cameras, interpolated, source = _from_nerfstudio(content, default), False, True
-        else:
-            cameras, interpolated, source = _from_keyframes(content, default)
-        rate = float(fps or content.get("fps") or FPS)
-        length = float(seconds or content.get("seconds") or SECONDS)
-        _require(rate > 0 and length > 0, "fps and seconds must be positive")
-    except (TypeError, ValueError) as error:
-        raise VdgsError(f"{file}: {error}. See `vdgs render --help` for what a camera path holds.") from error
-    if source and ground is not None:
-        cameras = [_to_ground(camera, ground) for camera in cameras]
-    if interpolated or (seconds is not None and len(cameras) > 1):
-        cameras = interpolate(cameras, max(1, round(rate * length)), closed=bool(content.get("closed", False)))
-    return CameraPath(tuple(_one_size(cameras)), rate)
+def frame_count(seconds: float, fps: float) -> int:
+    """Frames of a film, at least one. Raises VdgsError for more than can be drawn."""
+    if not seconds * fps <= MOST_FRAMES:
+        raise VdgsError(
+            f"a film of {seconds:g} seconds at {fps:g} frames a second has {seconds * fps:,.0f} frames, more than "
+            f"{MOST_FRAMES:,}. Give fewer --seconds or less --fps."
+        )
+    return max(1, round(seconds * fps))
 
 
 def interpolate(keyframes: Sequence[Camera], n_frames: int, closed: bool = False) -> list[Camera]:
@@ -116,7 +67,7 @@ def interpolate(keyframes: Sequence[Camera], n_frames: int, closed: bool = False
     intrinsics = np.array([[camera.fx, camera.fy, camera.cx, camera.cy] for camera in resized])
     values = np.stack([np.interp(times, knots, column) for column in intrinsics.T], axis=1)
     return [
-        replace(first, camera_from_world=_rigid(rotation, position), fx=fx, fy=fy, cx=cx, cy=cy)
+        replace(first, camera_from_world=rigid_at(rotation, position), fx=fx, fy=fy, cx=cx, cy=cy)
         for rotation, position, (fx, fy, cx, cy) in zip(turned, spline(times), values.tolist(), strict=True)
     ]
 
@@ -142,7 +93,7 @@ def orbit(
     reach = np.quantile(np.abs(offsets @ axes.T), 0.9, axis=0)
     radii = np.maximum(2.0 / 3.0 * reach, 0.25 * height)
     frames = []
-    for angle in np.linspace(0.0, 2.0 * np.pi, max(1, round(seconds * fps)), endpoint=False):
+    for angle in np.linspace(0.0, 2.0 * np.pi, frame_count(seconds, fps), endpoint=False):
         level = (radii * [np.cos(angle), np.sin(angle)]) @ axes
         pose = look_at(centre + np.append(level, height), centre)
         frames.append(replace(template, camera_from_world=pose))
@@ -167,7 +118,7 @@ def flyover(
     if tilt_deg is None:
         downwards = np.clip([-camera.forward[2] for camera in cameras], -1.0, 1.0)
         tilt_deg = max(FLYOVER_TILT_DEG, float(np.degrees(np.arccos(np.median(downwards)))))
-    n_frames = max(1, round(seconds * fps))
+    n_frames = frame_count(seconds, fps)
     track = _smooth_track(np.stack([camera.position for camera in cameras]), n_frames)
     # Turns take a second: where one strip ends and the next begins, the track folds back on itself.
     step = gaussian_filter1d(np.gradient(track[:, :2], axis=0), max(fps / 2.0, 1.0), axis=0, mode="nearest") \
@@ -191,107 +142,17 @@ def look_at(position: np.ndarray, target: np.ndarray, up: Sequence[float] | np.n
     """
     forward = np.asarray(target, dtype=np.float64) - position
     length = np.linalg.norm(forward)
-    _require(bool(length > 1e-12), "`position` and `look_at` are the same point")
+    if length <= 1e-12:
+        raise ValueError("`position` and `look_at` are the same point")
     forward = forward / length
     right = np.cross(forward, np.asarray(up, dtype=np.float64))
     if np.linalg.norm(right) < 1e-6:
         right = np.cross(forward, [0.0, 1.0, 0.0] if abs(forward[1]) < 0.9 else [1.0, 0.0, 0.0])
     right /= np.linalg.norm(right)
-    return _rigid(np.stack([right, np.cross(forward, right), forward]), np.asarray(position, dtype=np.float64))
+    return rigid_at(np.stack([right, np.cross(forward, right), forward]), np.asarray(position, dtype=np.float64))
 
 
-def _from_keyframes(content: Mapping[str, Any], default: Camera) -> tuple[list[Camera], bool, bool]:
-    frames, frame = content.get("keyframes"), content.get("frame", "ground")
-    _require(isinstance(frames, list) and len(frames) > 0, "`keyframes` must be a list of at least one")
-    _require(frame in ("ground", "source"), f"`frame` is {frame!r}; it must be ground or source")
-    cameras = []
-    for number, entry in enumerate(frames or []):
-        try:
-            _require(isinstance(entry, Mapping), "it must be an object")
-            cameras.append(_keyframe(entry, default))
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"key frame {number}: {error}") from error
-    return cameras, bool(content.get("interpolate", True)) and len(cameras) > 1, frame == "source"
-
-
-def _keyframe(entry: Mapping[str, Any], default: Camera) -> Camera:
-    if "camera_from_world" in entry:
-        pose = _matrix(entry["camera_from_world"], "camera_from_world")
-    else:
-        _require("position" in entry and "look_at" in entry, "give camera_from_world, or position and look_at")
-        pose = look_at(
-            _vector(entry["position"], "position"),
-            _vector(entry["look_at"], "look_at"),
-            _vector(entry.get("up", (0, 0, 1)), "up"),
-        )
-    camera = replace(default, camera_from_world=pose)
-    if "width" in entry or "height" in entry:
-        camera = camera.resized(int(entry.get("width", camera.width)), int(entry.get("height", camera.height)))
-    _require(camera.width > 0 and camera.height > 0, "width and height must be positive")
-    if "fov_deg" in entry:
-        camera = _with_fov(camera, float(entry["fov_deg"]))
-    given = {name: float(entry[name]) for name in ("fx", "fy", "cx", "cy") if name in entry}
-    camera = replace(camera, **given)  # type: ignore[arg-type]
-    _require(min(camera.fx, camera.fy) > 0, "fx and fy must be positive")
-    return camera
-
-
-def _from_nerfstudio(content: Mapping[str, Any], default: Camera) -> list[Camera]:
-    """nerfstudio: camera_to_world of OpenGL cameras (+y up, +z backward), 16 numbers, vertical `fov`."""
-    size = int(content.get("render_width", default.width)), int(content.get("render_height", default.height))
-    entries = content["camera_path"]
-    _require(isinstance(entries, list) and len(entries) > 0, "`camera_path` must be a list of at least one")
-    cameras = []
-    for number, entry in enumerate(entries):
-        try:
-            world_from_camera = _matrix(entry["camera_to_world"], "camera_to_world") @ np.diag([1.0, -1.0, -1.0, 1.0])
-            camera = replace(default.resized(*size), camera_from_world=np.linalg.inv(world_from_camera))
-            cameras.append(_with_fov(camera, float(entry.get("fov", 50.0))))
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"frame {number} of camera_path: {error}") from error
-    return cameras
-
-
-def _with_fov(camera: Camera, fov_deg: float) -> Camera:
-    _require(0.0 < fov_deg < 180.0, "fov_deg must lie between 0 and 180")
-    focal = 0.5 * camera.height / math.tan(0.5 * math.radians(fov_deg))
-    return replace(camera, fx=focal, fy=focal, cx=camera.width / 2.0, cy=camera.height / 2.0)
-
-
-def _matrix(value: Any, name: str) -> Float[np.ndarray, "4 4"]:
-    matrix = np.asarray(value, dtype=np.float64)
-    if matrix.size == 12:
-        matrix = np.concatenate([matrix.reshape(3, 4), [[0.0, 0.0, 0.0, 1.0]]])
-    _require(matrix.size == 16, f"{name} must be 4 x 4")
-    matrix = matrix.reshape(4, 4)
-    rotation = matrix[:3, :3]
-    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0
-    _require(bool(rigid and np.isfinite(matrix).all()), f"{name} must be a rotation and a translation")
-    return matrix
-
-
-def _vector(value: Any, name: str) -> Float[np.ndarray, "3"]:
-    vector = np.asarray(value, dtype=np.float64)
-    _require(vector.shape == (3,) and bool(np.isfinite(vector).all()), f"{name} must be three numbers")
-    return vector
-
-
-def _require(condition: bool, message: str) -> None:
-    if not condition:
-        raise ValueError(message)
-
-
-def _to_ground(camera: Camera, ground: GroundFrame) -> Camera:
-    position = ground.to_ground(camera.position[None])[0]
-    return replace(camera, camera_from_world=_rigid(camera.camera_from_world[:3, :3] @ ground.rotation.T, position))
-
-
-def _one_size(cameras: Sequence[Camera]) -> list[Camera]:
-    """A film has one size: the first camera's."""
-    return [camera.resized(cameras[0].width, cameras[0].height) for camera in cameras]
-
-
-def _rigid(rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+def rigid_at(rotation: Float[np.ndarray, "3 3"], position: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     """`camera_from_world` of a camera with this rotation standing at this place."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation

@@ -90,7 +90,7 @@ class VideoWriter:
         else:
             writer = cv2.VideoWriter(str(self._partial), cv2.VideoWriter.fourcc(*"mp4v"), self.fps, (width, height))
             if not writer.isOpened():
-                raise self._failure("OpenCV has no MPEG-4 encoder here, or the folder cannot be written")
+                raise self._failure(f"OpenCV encodes no MPEG-4 of {width}x{height} at {self.fps:g} a second")
             self._opencv = writer
         self._shape = shape
 

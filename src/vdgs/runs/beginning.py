@@ -12,6 +12,7 @@ from vdgs.captures.loading import load_capture
 from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
 from vdgs.errors import VdgsError
 from vdgs.runs.folder import RunFolder
+from vdgs.runs.keys import counted
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.checks import validate
 from vdgs.settings.method import MethodConfig, with_iterations
@@ -43,15 +44,25 @@ def begin_run(
     refuse_among_inputs(output, capture)
     method = replace(method, training=with_iterations(method.training, len(capture.train_views)))
     run = RunFolder(output)
+    settings = run_settings(capture_path, capture_options, method)
     with run.locked():
-        if run.capture_file.exists():
+        read_anew = run.config_file.exists() and reads_otherwise(run, settings)
+        if run.capture_file.exists() and not read_anew:
             refuse_another_capture(run.capture_file, read_json(run.capture_file), capture)
-        settings = run_settings(capture_path, capture_options, method)
         if redo is None or not run.config_file.exists():
             run.begin(settings, ("capture", "training"), command)
+            run.move_capture(capture_path)
         else:
             run.change_settings(settings, redo, command)
+            if read_anew:  # nothing is left that was made of it; what the coarse stage writes takes its place
+                run.capture_file.unlink(missing_ok=True)
     return run, capture
+
+
+def reads_otherwise(run: RunFolder, settings: dict[str, Any]) -> bool:
+    """Whether the run reads its capture with other options: it is their change then that has to be spoken of."""
+    before, now = (counted("capture", each["capture"]) for each in (run.settings(), settings))
+    return before != now
 
 
 def run_settings(capture_path: Path, capture_options: CaptureOptions, method: MethodConfig) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -21,11 +22,26 @@ from vdgs.runs.locks import hold, is_locked
 from vdgs.runs.status import Status
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import differences, from_dict, to_dict
+from vdgs.settings.ranges import numbers, option
 from vdgs.storage.files import read_json, write_json, write_text
 from vdgs.storage.records import known, record_of
 
 #: The parts of config.yaml.
 SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
+#: Those whose options have no prefix on the command line.
+PLAIN_SECTIONS = ("capture", "training", "partition")
+
+
+def option_of(setting: str) -> str:
+    """`--lambda-vis` for partition.lambda_vis: how `vdgs run` calls a setting of config.yaml."""
+    section, _, name = setting.partition(".")
+    return option((name,) if section in PLAIN_SECTIONS else (section, name))
+
+
+def changed_options(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    """Lines that say which options differ between the settings of two runs; where the capture lies is none."""
+    paths = [line.partition(": ") for line in differences(old, new) if not line.startswith("capture.path: ")]
+    return [f"{option_of(path)}: {values}" for path, _, values in paths]
 
 
 @dataclass(frozen=True)
@@ -145,6 +161,10 @@ class RunFolder:
         return self.path / "capture.json"
 
     @property
+    def cameras_file(self) -> Path:
+        return self.path / "cameras.json"
+
+    @property
     def coarse(self) -> StageFolder:
         return StageFolder(self.path / "coarse")
 
@@ -195,7 +215,7 @@ class RunFolder:
         """
         if self.config_file.exists():
             old = self.settings()
-            changed = differences({s: old[s] for s in checked}, {s: settings[s] for s in checked})
+            changed = changed_options({s: old[s] for s in checked}, {s: settings[s] for s in checked})
             if changed:
                 raise RunError(
                     f"{self.config_file}: this run was started with other settings:\n  "
@@ -224,9 +244,9 @@ class RunFolder:
         lose it. Stages delete what was made for other settings when they next run (`StageFolder.discard_unless`).
         """
         old = self.settings()
-        changed = differences(old, settings)
-        if not changed:
+        if old == settings:
             return []
+        changed = changed_options(old, settings)
         after = stage_keys(settings, self.coarse_identity())
         lost = []
         if self.coarse.holds_work() and self.coarse.key() != after.coarse:
@@ -245,6 +265,17 @@ class RunFolder:
             self.coarse.discard_unless(after.coarse)
         return changed
 
+    def move_capture(self, to: Path) -> None:
+        """Remember that the capture of the run lies elsewhere now. That it is the same one is for the caller to see."""
+        settings, command = self.settings(), self.command()
+        before, now = settings["capture"]["path"], str(to.resolve())
+        if before == now:
+            return
+        words = shlex.split(command) if command else []
+        moved = shlex.join([now if word == before else word for word in words]) if before in words else None
+        settings["capture"]["path"] = now
+        self._write(settings, moved)
+
     def _write(self, settings: dict[str, Any], command: str | None = None) -> None:
         header = {"vdgs": {"version": __version__, "commit": _commit()} | ({"command": command} if command else {})}
         write_text(self.config_file, yaml.safe_dump(header | settings, sort_keys=False, allow_unicode=True))
@@ -252,7 +283,7 @@ class RunFolder:
     def command(self) -> str | None:
         """The command that gave the run the settings that it has; None where several did, or nothing says it."""
         try:
-            header = yaml.safe_load(self.config_file.read_text(encoding="utf-8"))["vdgs"]
+            header = yaml.safe_load(self.config_file.read_text(encoding="utf-8-sig"))["vdgs"]
         except (OSError, yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError):
             return None
         command = header.get("command") if isinstance(header, dict) else None
@@ -265,17 +296,29 @@ class RunFolder:
                 f"{self.path}: is not a run folder (no config.yaml). Train first: vdgs run CAPTURE --output RUN"
             )
         try:
-            settings = yaml.safe_load(self.config_file.read_text(encoding="utf-8"))
+            settings = yaml.safe_load(self.config_file.read_text(encoding="utf-8-sig"))
         except (yaml.YAMLError, UnicodeDecodeError) as error:
             raise RunError(f"{self.config_file}: is damaged, not valid YAML ({error})") from error
         if not isinstance(settings, dict) or not {"capture", "training"} <= settings.keys():
             raise RunError(f"{self.config_file}: is damaged or not of a vdgs run (no `capture` and `training`)")
         settings.pop("vdgs", None)
         capture = settings.pop("capture")
+        if not isinstance(capture, dict) or not isinstance(capture.get("path"), str):
+            raise RunError(f"{self.config_file}: is damaged: `capture` must be a group of settings with a path")
         try:
-            return {"capture": capture} | to_dict(from_dict(MethodConfig, settings))
+            return {"capture": capture} | to_dict(self._read(settings))
         except (ValueError, TypeError) as error:
-            raise RunError(f"{self.config_file}: holds settings that this version does not know ({error})") from error
+            raise RunError(f"{self.config_file}: {error}. Write it as it was, or start a new --output.") from error
+
+    @staticmethod
+    def _read(settings: dict[str, Any]) -> MethodConfig:
+        """Raises ValueError for a setting that there is not, of another kind or out of its range."""
+        method = from_dict(MethodConfig, settings, "")
+        for section in SECTIONS[1:]:
+            for each in numbers(getattr(method, section), (section,)):
+                if each.value is not None and each.range is not None and not each.range.holds(each.value):
+                    raise ValueError(f"{'.'.join(each.path)} is {each.value}; it must be {each.range}")
+        return method
 
     def method(self) -> MethodConfig:
         """The settings of the run but for the capture."""

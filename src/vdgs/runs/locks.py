@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from vdgs.errors import RunError
+from vdgs.storage.files import remedy
 
 #: A lock that is taken is tried so often, with so many seconds between: one who only looks (`is_locked`) holds it too,
 #: for a moment.
@@ -40,7 +41,7 @@ def hold(folder: Path, shared: bool = False) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         handle = (folder / ".lock").open("w")
     except OSError as error:
-        raise RunError(f"{folder}: cannot be written ({error.strerror}). Choose another --output.") from error
+        raise RunError(f"{folder}: cannot be written ({error.strerror}). {remedy(error)}.") from error
     with handle:
         for attempt in range(LOCK_ATTEMPTS):
             try:

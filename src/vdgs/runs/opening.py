@@ -12,31 +12,32 @@ import torch
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import refuse_another_capture
 from vdgs.captures.loading import load_capture
-from vdgs.errors import RunError
+from vdgs.errors import CaptureError, RunError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.standing import standing_of
 from vdgs.runs.status import Status
 from vdgs.runs.vouching import load_vouched
 from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.plain import from_dict
 from vdgs.settings.requests import ModelName
+from vdgs.storage.files import read_json
 
 
 @dataclass(frozen=True)
-class TrainedRun:
-    """A run opened for looking at it: its capture as it was trained on, and its model."""
+class OpenedModel:
+    """One of the models of a run."""
 
     folder: RunFolder
-    capture: Capture
     model: AnchorModel
     model_path: Path
     #: Which model it is, "coarse" or "merged", and the status of the stage that made it.
     name: str
     status: Status
     #: Of the settings that it was made with (`runs.keys`).
-    key: str | None = None
+    key: str
     #: Why it is not the model that one would expect (no merged one, or one that is out of date); empty where it is.
-    caution: str = ""
+    caution: str
 
     @property
     def line(self) -> str:
@@ -50,23 +51,36 @@ class TrainedRun:
         return self.model.anchors.positions.device
 
 
+@dataclass(frozen=True)
+class TrainedRun(OpenedModel):
+    """A run opened for looking at it: one of its models, and its capture as it was trained on."""
+
+    capture: Capture
+
+
 def open_run(path: Path, which: ModelName = "best", device: torch.device | str = "cpu") -> TrainedRun:
     """Open a run, its model on a device.
 
     Raises RunError if it is none or not trained, CaptureError if its photographs are gone.
     """
     folder = RunFolder(path)
-    capture, keys = open_capture(folder), folder.keys()
-    name = which
+    capture = open_capture(folder)
+    opened = open_model(folder, which, device)
+    refuse_another_capture(opened.model_path, opened.model.facts.get("capture", {}), capture)
+    return TrainedRun(**vars(opened), capture=capture)
+
+
+def open_model(folder: RunFolder, which: ModelName = "best", device: torch.device | str = "cpu") -> OpenedModel:
+    """Open a model of a run on a device, without the capture. Raises RunError if it is not trained."""
+    keys, name = folder.keys(), which
     if which == "best":
         name = "merged" if folder.merged.is_done(keys.merge) else "coarse"
     stage, key = (folder.merged, keys.merge) if name == "merged" else (folder.coarse, keys.coarse)
     if not stage.is_done(key):
         raise RunError(_not_there(folder, name))
     model = load_vouched(stage, key).to(torch.device(device))
-    refuse_another_capture(stage.model, model.facts.get("capture", {}), capture)
     caution = _caution(folder, name) if which != "coarse" else ""
-    return TrainedRun(folder, capture, model, stage.model, name, stage.status(), key, caution)
+    return OpenedModel(folder, model, stage.model, name, stage.status(), key, caution)
 
 
 def _not_there(folder: RunFolder, name: str) -> str:
@@ -98,18 +112,33 @@ def _caution(folder: RunFolder, name: str) -> str:
     return f"this is the coarse model, not the merged one: {state}. {again}"
 
 
-def open_capture(folder: RunFolder) -> Capture:
-    """The capture of a run, read as the run was started. Raises CaptureError if it is gone or changed its form."""
+def open_capture(folder: RunFolder, at: Path | None = None) -> Capture:
+    """The capture of a run, read as the run was started; `at` is where it lies if not where it lay.
+
+    Raises CaptureError if it is gone or changed its form.
+    """
     settings = dict(folder.settings()["capture"])
-    root = Path(settings.pop("path"))
-    return load_capture(root, options_from(settings, folder.config_file))
+    written = Path(settings.pop("path"))
+    if at is None and not written.is_dir():
+        raise CaptureError(
+            f"{written}: the capture of {folder.path} is not there. If it was moved, say where it lies now: "
+            "--capture PATH."
+        )
+    return load_capture(at or written, options_from(settings, folder.config_file))
+
+
+def remember_capture(folder: RunFolder, at: Path) -> None:
+    """Let a run find its capture where it lies now. Raises RunError for another capture than the run's."""
+    capture = open_capture(folder, at)
+    with folder.locked():
+        if folder.capture_file.exists():
+            refuse_another_capture(folder.capture_file, read_json(folder.capture_file), capture)
+        folder.move_capture(at)
 
 
 def options_from(settings: dict[str, Any], source: Path) -> CaptureOptions:
-    """CaptureOptions from the plain values of config.yaml. Raises RunError on unknown settings."""
-    paths = {"gps", "georef", "test_list", "undistorted_folder"}
-    values: Any = {name: Path(v) if name in paths and v is not None else v for name, v in settings.items()}
+    """CaptureOptions from the plain values of config.yaml. Raises RunError on settings that are none."""
     try:
-        return CaptureOptions(**values)
-    except TypeError as error:
-        raise RunError(f"{source}: holds capture settings that this version does not know ({error})") from error
+        return from_dict(CaptureOptions, settings, "capture")
+    except ValueError as error:
+        raise RunError(f"{source}: {error}. Write it as it was, or start a new --output.") from error

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Int32
 from torch import Tensor
 
+from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
 from vdgs.model.visibility import visibility_of
 from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import TrainedRun
+from vdgs.runs.opening import OpenedModel, TrainedRun
 from vdgs.storage.files import write_atomically
 from vdgs.storage.tensors import checksum, read_tensors, write_tensors
 
@@ -19,30 +21,29 @@ FORMAT = "vdgs-visibility-1"
 FILE = "visibility.safetensors"
 
 
-def visibility_of_run(opened: TrainedRun) -> Int32[Tensor, " n"]:
+def visibility_of_run(opened: OpenedModel, cameras: Sequence[Camera]) -> Int32[Tensor, " n"]:
     """V_i: how many training cameras hold each anchor of the opened model in their frustum.
 
-    Of the coarse model as it is kept; counted where it is not there, or not that of this model. The anchors of a
-    merged model are others: theirs is counted.
+    `cameras` are the training cameras of the run. Of the coarse model as it is kept; counted where it is not there, or
+    not that of this model. The anchors of a merged model are others: theirs is counted.
     """
     kept = _read(opened.folder) if opened.name == "coarse" else None
-    return _count(opened) if kept is None or len(kept) != len(opened.model.anchors) else kept.to(opened.device)
+    if kept is None or len(kept) != len(opened.model.anchors):
+        return visibility_of(opened.model.anchors.positions, list(cameras))
+    return kept.to(opened.device)
 
 
 def keep_visibility(opened: TrainedRun) -> Int32[Tensor, " n"]:
     """As `visibility_of_run` of a run opened with its coarse model, and kept from now on."""
+    cameras = [view.camera for view in opened.capture.train_views]
     kept = _read(opened.folder)
     if kept is not None and len(kept) == len(opened.model.anchors):
         return kept
-    tensors = {"visibility": _count(opened)}
+    tensors = {"visibility": visibility_of(opened.model.anchors.positions, cameras)}
     facts = {"key": opened.folder.keys().visibility, "crc32": checksum(tensors)}
     header = {FORMAT: json.dumps(facts)}
     write_atomically(opened.folder.visibility / FILE, lambda temporary: write_tensors(temporary, tensors, header))
     return tensors["visibility"]
-
-
-def _count(opened: TrainedRun) -> Int32[Tensor, " n"]:
-    return visibility_of(opened.model.anchors.positions, [view.camera for view in opened.capture.train_views])
 
 
 def _read(run: RunFolder) -> Int32[Tensor, " n"] | None:

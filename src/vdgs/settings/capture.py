@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from vdgs.settings.ranges import MANY, Range
 
 UpAxis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 SplitMode = Literal["auto", "explicit", "every"]
@@ -16,9 +18,9 @@ class CaptureOptions:
 
     images: str | None = None
     """Image folder to use, such as images_4. Default: images, or where absent the largest images_N."""
-    downscale: float = 1.0
+    downscale: Annotated[float, Range(1, 1000)] = 1.0
     """Extra shrink applied when images are loaded (2 = half the width and height)."""
-    test_every: int = 8
+    test_every: Annotated[int, Range(2, MANY)] = 8
     """Every n-th photograph in name order is kept for testing (0, n, 2n, ...), as in 3DGS (llffhold)."""
     test_list: Path | None = None
     """Text file with the names of the test photographs, one a line. Default: test.txt in the capture folder, if any."""
@@ -35,7 +37,7 @@ class CaptureOptions:
     """CSV with the header name,lat,lon,alt (further columns allowed): photographs' GPS positions."""
     georef: Path | None = None
     """georef.json saying that the world already is ENU metres. Default: the one in the capture folder."""
-    max_images: int | None = None
+    max_images: Annotated[int | None, Range(2, MANY)] = None
     """Use only this many photographs: those nearest to the middle of the flight."""
     undistort: bool = False
     """Undistort photographs whose camera model has lens distortion (written once, then reused)."""

@@ -7,28 +7,35 @@ The defaults are the paper's (preset `paper`); `presets.py` holds the others.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
+
+from vdgs.settings.ranges import LARGE, MANY, SHARE, Named, Range
 
 PartitionStrategy = Literal["visibility", "vastgaussian", "citygaussian", "dogs"]
+#: From which share of the iterations on images are shrunk by which factor.
+Resolutions = tuple[tuple[Annotated[float, SHARE], Annotated[int, Range(1, 1024)]], ...]
+
+RATE = Range(0, 100, above=True)
+FACTOR = Range(0, 1000, above=True)
 
 
 @dataclass(frozen=True)
 class AnchorConfig:
     """The anchor model (Scaffold-GS, section III-B of the paper)."""
 
-    offsets: int = 10
+    offsets: Annotated[int, Range(1, 32)] = 10
     """Gaussians per anchor (k)."""
-    voxel: float = 0.0
+    voxel: Annotated[float, Range(0, LARGE)] = 0.0
     """Edge of the initial voxel grid in units of the ground frame; 0 takes the median nearest-neighbour distance of the
     sparse points."""
-    outlier_distance: float = 30.0
+    outlier_distance: Annotated[float, Range(2, LARGE, or_zero=True)] = 30.0
     """Sparse points start no anchor where their fourth neighbour is this many times farther than the median one's; 0
     keeps all (choice: a few points deep below the ground become a backdrop that every camera sees through it)."""
     fill_gaps: bool = True
     """Also start anchors on ground that cameras see but that holds no sparse points: woods, water, fields (choice)."""
     distance: bool = False
     """Feed the distance between camera and anchor to the decoder too."""
-    appearance: int = 0
+    appearance: Annotated[int, Range(0, 1024)] = 0
     """Size of the appearance embedding of each training image (colour only); 0 for none."""
     colour_start: bool = False
     """Start the features from the colours of the sparse points instead of zeros."""
@@ -38,19 +45,19 @@ class AnchorConfig:
 class RateConfig:
     """Learning rates of Adam; pairs decay exponentially from the first to the second value."""
 
-    offsets: tuple[float, float] = (0.01, 1e-4)
+    offsets: Annotated[tuple[float, float], RATE] = (0.01, 1e-4)
     """Offsets, in units of the anchor's own scale (choice: not multiplied by the size of the scene)."""
-    features: tuple[float, float] = (0.0075, 0.0075)
+    features: Annotated[tuple[float, float], RATE] = (0.0075, 0.0075)
     """Anchor features."""
-    log_scales: tuple[float, float] = (0.007, 0.007)
+    log_scales: Annotated[tuple[float, float], RATE] = (0.007, 0.007)
     """Logarithms of the anchor scales."""
-    opacity: tuple[float, float] = (0.002, 2e-5)
+    opacity: Annotated[tuple[float, float], RATE] = (0.002, 2e-5)
     """Opacity decoder."""
-    covariance: tuple[float, float] = (0.004, 0.004)
+    covariance: Annotated[tuple[float, float], RATE] = (0.004, 0.004)
     """Covariance decoder."""
-    colour: tuple[float, float] = (0.008, 5e-5)
+    colour: Annotated[tuple[float, float], RATE] = (0.008, 5e-5)
     """Colour decoder."""
-    appearance: tuple[float, float] = (0.05, 5e-4)
+    appearance: Annotated[tuple[float, float], RATE] = (0.05, 5e-4)
     """Appearance embedding."""
 
 
@@ -58,27 +65,27 @@ class RateConfig:
 class GrowthConfig:
     """Where anchors are added and removed (Scaffold-GS, section 4.2 there)."""
 
-    interval: int = 100
+    interval: Annotated[int, Range(1, MANY)] = 100
     """Iterations between two growth decisions."""
-    statistics_from: int = 500
+    statistics_from: Annotated[int, Range(0, MANY)] = 500
     """Iteration from which gradients and opacities are counted."""
-    start: int = 1500
+    start: Annotated[int, Range(0, MANY)] = 1500
     """Iteration from which anchors grow and are pruned."""
-    until: float = 0.5
+    until: Annotated[float, SHARE] = 0.5
     """Share of the iterations after which growth and pruning end."""
-    threshold: float = 2e-4
+    threshold: Annotated[float, Range(0, MANY)] = 2e-4
     """Mean norm of dL/d(mean) in NDC units above which an offset asks for a new anchor."""
-    levels: int = 3
+    levels: Annotated[int, Range(0, 16)] = 3
     """Number of cell sizes tried; level i has threshold 2^i times and cells 4^i times finer."""
-    coarsest_cell: float = 16.0
+    coarsest_cell: Annotated[float, Range(0, LARGE, above=True)] = 16.0
     """Edge of the coarsest cell, in voxels."""
-    gate: float = 0.4
+    gate: Annotated[float, Range(0, MANY)] = 0.4
     """An offset is judged once it was rendered more often than this share of the interval."""
-    prune_opacity: float = 0.005
+    prune_opacity: Annotated[float, Range(0, LARGE)] = 0.005
     """An anchor goes when the opacity of its Gaussians, summed over them, averaged over the views, is below this."""
-    prune_views: float = 0.8
+    prune_views: Annotated[float, Range(0, MANY)] = 0.8
     """... and it was seen more often than this share of the interval."""
-    max_anchors: int = 0
+    max_anchors: Annotated[int, Range(0, MANY)] = 0
     """No growth beyond this many anchors; 0 for no limit. Nothing is removed to keep to it."""
 
 
@@ -88,22 +95,22 @@ class CompensationConfig:
 
     enabled: bool = True
     """Off: plain growth (the paper's "w/o Anchor Generation")."""
-    t_low: float = 0.20
+    t_low: Annotated[float, SHARE] = 0.20
     """T_low: an anchor is of low visibility (the set L) when fewer than this share of the cameras of a growth cycle
     hold it in their frustum."""
-    t_low_quantile: float = 0.0
+    t_low_quantile: Annotated[float, Range(0, 1, below=True)] = 0.0
     """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on
     a large scene nearly every anchor is below a fixed share). Anchors that tie there are in L all or none, whichever
     comes nearer to the quantile."""
-    beta_g: float = 2.0
+    beta_g: Annotated[float, Range(0, LARGE)] = 2.0
     """beta_g: weight of a cycle's mean gradient in the cache g. With the paper's 2, g is a sum that grows to twenty
     times the gradients it is made of; with 1 - gamma (the preset `laptop`) it is a mean over cycles."""
-    gamma: float = 0.9
+    gamma: Annotated[float, SHARE] = 0.9
     """gamma: decay of the cache g from cycle to cycle."""
     gate: Literal["scaled", "literal"] = "scaled"
     """Above how many draws an offset of low visibility is judged: `scaled` takes T_low times the gate of the others, at
     least 2 (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
-    cap: float = 0.0
+    cap: Annotated[float, Range(0, MANY)] = 0.0
     """Greatest value of g; 0 for none. Without it, and with beta_g = 2, a statistic that is fed steadily grows to 21
     times its size."""
 
@@ -112,18 +119,18 @@ class CompensationConfig:
 class LossConfig:
     """What training minimises."""
 
-    ssim_weight: float = 0.2
+    ssim_weight: Annotated[float, SHARE] = 0.2
     """Loss = (1 - w) L1 + w (1 - SSIM) + volume."""
-    volume_weight: float = 0.01
+    volume_weight: Annotated[float, Range(0, LARGE)] = 0.01
     """Weight of the mean product of the three scales of the Gaussians that are drawn."""
-    alpha_weight: float = 0.02
+    alpha_weight: Annotated[float, Range(0, LARGE)] = 0.02
     """Weight of the root of 1 - alpha, averaged over a picture's pixels: those below the horizon and those that show
     known ground; the sky is left alone. Without it ground stays half transparent and borrows the colour of the
     background (choice; the paper is silent on its background)."""
     background: Literal["mean", "black"] = "mean"
     """Colour behind the scene: the mean of the training photographs (choice: what no photograph shows is then drawn
     in a colour of the place), or black."""
-    background_noise: float = 0.2
+    background_noise: Annotated[float, SHARE] = 0.2
     """In training the background is up to this much brighter or darker in each channel, at random, fading to nothing at
     the end: transparent ground cannot then hide before a background of its own colour (choice)."""
 
@@ -132,25 +139,25 @@ class LossConfig:
 class TrainConfig:
     """Training of the coarse stage."""
 
-    iterations: int = 100_000
+    iterations: Annotated[int, Range(0, MANY)] = 100_000
     """Number of steps, one photograph each; 0 takes sixty for each training photograph, but at least 3000 and at
     most 30 000 (choice: with few photographs a model soon overfits, many need their time)."""
     sampling: Literal["even", "shares", "roots"] = "even"
     """How often each photograph is used. `even`: all alike (the paper). `shares`: every anchor has one vote, divided
     among the cameras that see it, and a photograph is used in proportion to its votes: most where few others look.
     `roots`: in proportion to the square root of its votes, which keeps more photographs in use (choice)."""
-    resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
+    resolutions: Resolutions = ((0.0, 1),)
     """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
-    average: float = 0.0
+    average: Annotated[float, Range(0, 1, below=True)] = 0.0
     """The stage ends with the mean of the models of this last share of its iterations, after growth and at full size; 0
     for the very last model (choice)."""
-    seed: int = 0
+    seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Everything random follows from it: on the CPU the same seed gives the same bits."""
     anchors: AnchorConfig = field(default_factory=AnchorConfig)
     """The anchor model."""
     rates: RateConfig = field(default_factory=RateConfig)
     """Learning rates."""
-    early: float = 1.0
+    early: Annotated[float, Range(1, 1000)] = 1.0
     """Up to how many times faster an anchor moves while it has had few updates: after u of them, by the least of this
     and 1 / sqrt(1 - 0.999^u), which is 3 after 118 updates and 1.3 after 900 (choice: in short trainings an anchor is
     seen a few hundred times; 1 is Adam as it is)."""
@@ -169,18 +176,18 @@ class PartitionConfig:
     strategy: PartitionStrategy = "visibility"
     """`visibility`: by place and visibility (the paper). The others are the partitions of published methods, to compare
     with; each cuts and chooses cameras in its own way, whatever the settings of the assignment say."""
-    blocks: int | Literal["auto"] = 8
+    blocks: Annotated[int | Literal["auto"], Range(1, 10_000)] = 8
     """K, the number of blocks; `auto` takes as few as --block-memory-gb allows: give more to train them at once on
     several machines."""
     blocking: bool = True
     """Off: one block that holds the whole scene (the paper's "w/o Blocking")."""
-    lambda_vis: float = 1.0
+    lambda_vis: Annotated[float, Range(0, 1000)] = 1.0
     """lambda_vis: weight of visibility beside place in the clustering (paper: 0.7 to 1.3); 0 is purely spatial."""
     balanced: bool = False
     """Blocks of about equally many anchors (choice; plain k-means leaves them several times apart)."""
-    expansion: float = 0.4
+    expansion: Annotated[float, Range(0, 1000)] = 0.4
     """A block is widened by this share of the radius of a disc of its area."""
-    block_memory_gb: float = 4.0
+    block_memory_gb: Annotated[float, Range(0, LARGE, above=True)] = 4.0
     """Memory that one block may take in training, by estimate; only `--blocks auto` looks at it."""
 
 
@@ -192,17 +199,17 @@ class AssignmentConfig:
     """`coverage`: share of the drawn pixels that the block alone draws alike (choice). `literal`: eq. 7 as printed,
     where pixels empty in both renders count too. `leave_one_out`: 1 - SSIM of the scene without the block.
     `frustum`: share of the block's anchors that the camera holds (needs no renders)."""
-    tau: float = 0.05
+    tau: Annotated[float, Range(0, 1, above=True)] = 0.05
     """tau: pixels differ when the mean absolute difference of their channels is above this (choice; not in the
     paper)."""
-    threshold: float = 0.45
+    threshold: Annotated[float, SHARE] = 0.45
     """Share of pixels (or, for `frustum`, of anchors) above which a camera is assigned."""
-    threshold_leave_one_out: float = 0.05
+    threshold_leave_one_out: Annotated[float, SHARE] = 0.05
     """The same for `leave_one_out` (peers: 0.05 to 0.12)."""
-    min_cameras: int = 100
+    min_cameras: Annotated[int, Range(0, MANY)] = 100
     """Each block is topped up with the cameras that show it best to at least this many, as far as any show it; 0 leaves
     it as it is."""
-    longest_side_px: int = 320
+    longest_side_px: Annotated[int, Range(16, 16_384)] = 320
     """Size at which the renders are compared."""
 
 
@@ -210,31 +217,31 @@ class AssignmentConfig:
 class BlockConfig:
     """Training of each block from the coarse anchors of its place. Loss and seed are those of the coarse stage."""
 
-    iterations: int = 50_000
+    iterations: Annotated[int, Range(0, MANY)] = 50_000
     """Steps for each block; 0 takes fifteen for each of its photographs, at least 500 and at most 15 000 (choice)."""
-    scale_iterations: float = 1.0
+    scale_iterations: Annotated[float, Range(0, 1000, above=True)] = 1.0
     """Factor on the steps and on the start of statistics and growth, for scenes smaller than the paper's."""
     sampling: Literal["even", "shares", "roots"] = "even"
     """As in the coarse stage, by the votes of the anchors that the block moves: photographs that show little of the
     block are used little."""
-    resolutions: tuple[tuple[float, int], ...] = ((0.0, 1),)
+    resolutions: Resolutions = ((0.0, 1),)
     """Resolution schedule, as in the coarse stage."""
-    average: float = 0.0
+    average: Annotated[float, Range(0, 1, below=True)] = 0.0
     """As in the coarse stage."""
     crop: Literal["off", "steps", "pixels"] = "off"
     """Draw only the part of each photograph in which the block has a share, and all of it in every fourth step.
     `steps`: each step costs less; `pixels`: as many pixels are drawn as without, in up to four times more steps, so
     that each place of the scene is drawn more often: `iterations` then counts photographs, whatever their size
     (choice)."""
-    offset_rate: float = 0.4
+    offset_rate: Annotated[float, FACTOR] = 0.4
     """The rates of the coarse stage start again, those of offsets times this."""
-    scale_rate: float = 0.8
+    scale_rate: Annotated[float, FACTOR] = 0.8
     """... and those of log-scales times this."""
-    feature_rate: float = 1.0
+    feature_rate: Annotated[float, FACTOR] = 1.0
     """... and those of features times this (choice; 1 is the paper's)."""
-    early: float = 1.0
+    early: Annotated[float, Range(1, 1000)] = 1.0
     """As `early` of the coarse stage, for the block's own updates: its anchors begin trained."""
-    background_noise: float = 0.0
+    background_noise: Annotated[float, SHARE] = 0.0
     """As in the loss of the coarse stage, but for blocks: there the ground is opaque already (choice)."""
     decoder: Literal["frozen", "own"] = "frozen"
     """`frozen`: as the coarse stage left it (the paper). `own`: each block trains its copy, which its anchors keep in
@@ -247,7 +254,7 @@ class BlockConfig:
     """Draw the anchors outside the block too, frozen. Off: what the block's cameras see there is empty."""
     growth: GrowthConfig = field(default_factory=lambda: GrowthConfig(start=1000))
     """Growth and pruning of anchors."""
-    max_anchors_total: int = 0
+    max_anchors_total: Annotated[int, Range(0, MANY)] = 0
     """No growth beyond this many anchors of all blocks together; 0 for no limit. Each block has a share in proportion
     to the coarse anchors it owns. A block that starts with more grows none, and none of its anchors is removed for
     it: the merged scene has at most this many, or as many as the coarse model."""
@@ -268,9 +275,9 @@ class MergeConfig:
 class MethodConfig:
     """Everything that the result of a run depends on, but for the capture."""
 
-    training: TrainConfig = field(default_factory=TrainConfig)
+    training: Annotated[TrainConfig, Named("")] = field(default_factory=TrainConfig)
     """The coarse stage."""
-    partition: PartitionConfig = field(default_factory=PartitionConfig)
+    partition: Annotated[PartitionConfig, Named("")] = field(default_factory=PartitionConfig)
     """The cut into blocks."""
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
     """Cameras of each block."""

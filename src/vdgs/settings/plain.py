@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import UnionType
 from typing import Any
 
 
@@ -38,22 +42,66 @@ def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> l
 def from_dict(kind: type, values: Mapping[str, Any], where: str = "settings") -> Any:
     """The inverse of `to_dict` for a config class: what is not named keeps its default.
 
-    Raises ValueError, naming the setting, for one that the class does not have or of another shape.
+    Raises ValueError, naming the setting, for one that the class does not have or of another kind. `where` is the group
+    that it all stands in.
     """
-    hints = typing.get_type_hints(kind)
-    unknown = sorted(values.keys() - hints.keys())
+    hints = typing.get_type_hints(kind, include_extras=True)
+    unknown = sorted(values.keys() - hints.keys(), key=str)
     if unknown:
-        raise ValueError(f"{where} has no {unknown[0]!r}")
-    taken = {}
-    for name, value in values.items():
-        hint = hints[name]
-        if dataclasses.is_dataclass(hint):
-            if not isinstance(value, Mapping):
-                raise ValueError(f"{where}.{name} is {value!r}, not a group of settings")
-            value = from_dict(typing.cast(type, hint), value, f"{where}.{name}")
-        taken[name] = _frozen(value)
-    return kind(**taken)
+        raise ValueError(f"{where or 'this file'} has no {unknown[0]!r}{suggestion(str(unknown[0]), hints)}")
+    return kind(**{name: _read(hints[name], value, f"{where}.{name}".lstrip(".")) for name, value in values.items()})
 
 
-def _frozen(value: Any) -> Any:
-    return tuple(_frozen(item) for item in value) if isinstance(value, list) else value
+def suggestion(word: str, known: Iterable[str]) -> str:
+    """`; did you mean 'threshold'?` where a known word is like this one."""
+    like = difflib.get_close_matches(word, list(known), n=1)
+    return f"; did you mean {like[0]!r}?" if like else ""
+
+
+def _read(hint: Any, value: Any, where: str) -> Any:
+    """A plain value as what its type says. Raises ValueError for one that is of no such type."""
+    kind, inner = _without_notes(hint), typing.get_args(_without_notes(hint))
+    origin = typing.get_origin(kind)
+    if dataclasses.is_dataclass(kind):
+        if not isinstance(value, Mapping):
+            raise ValueError(f"{where} is {value!r}, not a group of settings")
+        return from_dict(typing.cast(type, kind), value, where)
+    if origin is tuple and isinstance(value, (list, tuple)):
+        kinds = [inner[0]] * len(value) if inner[-1:] == (Ellipsis,) else inner
+        if len(kinds) == len(value):
+            return tuple(_read(each, item, where) for each, item in zip(kinds, value, strict=True))
+    if origin in (typing.Union, UnionType):
+        for each in inner:
+            with suppress(ValueError):
+                return _read(each, value, where)
+    if origin is typing.Literal and value in inner:
+        return value
+    if kind is Path and isinstance(value, (str, Path)):
+        return Path(value)
+    if kind is float and isinstance(value, str):  # YAML takes 1e-4 for text: it wants 1.0e-4
+        with suppress(ValueError):
+            return float(value)
+    plain = isinstance(kind, type) and isinstance(value, (int, float) if kind is float else kind)
+    if plain and (kind is bool or not isinstance(value, bool)):
+        return value
+    raise ValueError(f"{where} is {value!r}; it must be {_words(hint)}")
+
+
+def _without_notes(hint: Any) -> Any:
+    return typing.get_args(hint)[0] if typing.get_origin(hint) is typing.Annotated else hint
+
+
+def _words(hint: Any) -> str:
+    """What a value of a type looks like, for people."""
+    kind, inner = _without_notes(hint), typing.get_args(_without_notes(hint))
+    origin = typing.get_origin(kind)
+    if origin is tuple and inner[-1:] == (Ellipsis,):
+        return f"a list, each of it {_words(inner[0])}"
+    if origin is tuple:
+        return f"a list of {len(inner)}: {', '.join(map(_words, inner))}"
+    if origin in (typing.Union, UnionType):
+        return " or ".join(map(_words, inner))
+    if origin is typing.Literal:
+        return " or ".join(map(str, inner))
+    named = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
+    return named.get(kind, "null")

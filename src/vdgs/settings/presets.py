@@ -11,6 +11,7 @@ from vdgs.settings.method import (
     GrowthConfig,
     MethodConfig,
     PartitionConfig,
+    RateConfig,
     TrainConfig,
 )
 
@@ -22,7 +23,8 @@ PRESETS: dict[str, MethodConfig] = {
         training=TrainConfig(
             iterations=0,
             resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
-            early=10.0,
+            rates=RateConfig(offsets=(0.02, 2e-4), features=(0.015, 0.015), log_scales=(0.014, 0.014)),
+            early=5.0,
             growth=GrowthConfig(statistics_from=300, start=500, until=0.6, threshold=1e-4),
         ),
         partition=PartitionConfig(blocks="auto"),
@@ -33,9 +35,9 @@ PRESETS: dict[str, MethodConfig] = {
             resolutions=((0.0, 2), (0.3, 1)),
             average=0.5,
             crop="pixels",
-            offset_rate=4.0,
-            scale_rate=4.0,
-            feature_rate=4.0,
+            offset_rate=2.0,
+            scale_rate=2.0,
+            feature_rate=2.0,
             decoder="own",
             growth=GrowthConfig(statistics_from=0, start=100, threshold=1e-4),
             compensation=CompensationConfig(t_low_quantile=0.25, beta_g=0.1),

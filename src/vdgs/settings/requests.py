@@ -4,12 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.settings.presets import PresetName
+from vdgs.settings.ranges import LARGE, MANY, WORKERS, Named, Range
 from vdgs.settings.watching import WatchOptions
+
+#: Groups by visibility: with more than some dozens none holds enough pixels to say anything.
+BINS = Range(1, 100)
+#: Length and pace of a film; 0 leaves them to the path. Encoders take no more frames a second.
+SECONDS, FPS = Range(0, 86_400), Range(0, 1000)
+#: The longest side of a picture that is drawn, in pixels: more than any film and any screen holds.
+LARGEST_SIDE_PX = 16_384
+#: Frames of one film: nearly two hours at 30 a second.
+MOST_FRAMES = 200_000
+
+#: Coordinates of maps: no system on Earth has larger ones (Earth-centred metres have seven digits).
+PLACE = Range(-1e9, 1e9)
 
 #: `best` is the merged model where there is one for the run's settings, else the coarse one.
 ModelName = Literal["best", "coarse", "merged"]
@@ -27,25 +40,25 @@ class RunRequest:
     """`paper`: the paper's settings (100 000 + 50 000 iterations a block). `laptop`: a good result in minutes."""
     redo: bool = False
     """Allow other settings than the run has to discard what was trained with the old ones."""
-    jobs: int = 0
+    jobs: Annotated[int, WORKERS] = 0
     """Blocks trained at once; 0 takes what cores and memory allow."""
     incomplete: bool = False
     """Go on if a block fails: the coarse model stands in for it."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
-    bins: int = 4
+    bins: Annotated[int, BINS] = 4
     """Number of visibility quantiles by which metrics are reported."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
-    options: CaptureOptions = field(default_factory=CaptureOptions)
-    training: TrainConfig = field(default_factory=TrainConfig)
-    partition: PartitionConfig = field(default_factory=PartitionConfig)
+    options: Annotated[CaptureOptions, Named("")] = field(default_factory=CaptureOptions)
+    training: Annotated[TrainConfig, Named("")] = field(default_factory=TrainConfig)
+    partition: Annotated[PartitionConfig, Named("")] = field(default_factory=PartitionConfig)
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
     block: BlockConfig = field(default_factory=BlockConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
-    watching: WatchOptions = field(default_factory=WatchOptions)
+    watching: Annotated[WatchOptions, Named("")] = field(default_factory=WatchOptions)
 
     def method(self) -> MethodConfig:
         """The settings that the result depends on."""
@@ -64,13 +77,19 @@ class RenderRequest:
     views: Literal["test", "train", "orbit", "flyover"] = "test"
     """Which cameras; `orbit` and `flyover` are paths made from the capture."""
     path: Path | None = None
-    """JSON file with a camera path (docs/conventions.md); overrides --views."""
-    seconds: float = 0.0
+    """JSON file with a camera path; overrides --views. Either one exported by nerfstudio's viewer, or
+    {"keyframes": [{"position": [x, y, z], "look_at": [x, y, z], "fov_deg": 60}, ...]} in the ground frame; beside it,
+    as you like, "frame": "source" (that of the capture's own cameras), "seconds", "fps", "closed", "interpolate". A key
+    frame may also have "up", "width", "height", "fx", "fy", "cx", "cy", or in place of position and look_at a matrix
+    "camera_from_world" (docs/conventions.md)."""
+    seconds: Annotated[float, SECONDS] = 0.0
     """Length of a camera path; 0: what its file says, or 12 seconds."""
-    fps: float = 0.0
+    fps: Annotated[float, FPS] = 0.0
     """Frames per second of a camera path and of the video; 0: what its file says, or 30 (2 for separate views)."""
-    width: int = 0
+    width: Annotated[int, Range(0, LARGEST_SIDE_PX)] = 0
     """Image width; 0 takes that of the training views."""
+    capture: Path | None = None
+    """Where the capture lies now. Only runs that do not keep their cameras (of an older version) need it."""
     kind: Literal["image", "depth", "visibility", "alpha"] = "image"
     """What to draw: the picture; the median depth, at which a pixel becomes half opaque (grey where it never does); the
     number of training cameras that see each place, V; or alpha, how opaque the scene is."""
@@ -81,7 +100,7 @@ class RenderRequest:
     units of the ground frame (metres where known); depth and V are NaN where nothing is drawn."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
@@ -95,10 +114,10 @@ class MapRequest:
     """Run folder."""
     output: Path | None = None
     """Folder for the maps; by default RUN/maps."""
-    gsd: float | None = None
+    gsd: Annotated[float | None, Range(0, LARGE, above=True)] = None
     """Side of a pixel in units of the map (metres, mostly); by default the median that a pixel of the training
     photographs shows of the ground, at the size at which they were used."""
-    bbox: tuple[float, float, float, float] | None = None
+    bbox: Annotated[tuple[float, float, float, float] | None, PLACE] = None
     """X0 Y0 X1 Y1 in coordinates of the map; by default what the training photographs show."""
     crs: str | None = None
     """Coordinates of the map: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source` (those
@@ -107,7 +126,7 @@ class MapRequest:
     """Take the fine detail of the orthophoto from the photographs, where they truly see a place."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
@@ -124,11 +143,11 @@ class ExportRequest:
     .points.ply, .laz, .las (point clouds). Give --to again for more: the scene is baked once (docs/export.md)."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
-    block: int | None = None
+    block: Annotated[int | None, Range(0, 10_000)] = None
     """Only what this block of the merged scene owns."""
-    bbox: tuple[float, float, float, float] | None = None
+    bbox: Annotated[tuple[float, float, float, float] | None, PLACE] = None
     """Only Gaussians whose centres lie within X0 Y0 X1 Y1, in coordinates of --crs."""
-    max_gaussians: int = 0
+    max_gaussians: Annotated[int, Range(0, MANY)] = 0
     """Only so many Gaussians, those that make most of the training photographs; 0 for all."""
     sh_degree: Literal[0, 1, 2, 3] = 3
     """How colours change with the direction: spherical harmonics up to this degree. 0: not at all, and a fifth of the
@@ -139,7 +158,7 @@ class ExportRequest:
     for .laz and .las; else `local`."""
     measure: bool = True
     """Read a file back, draw the test views and say what was lost against the model itself."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""

@@ -17,6 +17,7 @@ from vdgs.model.decoder import Decoder
 from vdgs.model.ground import solid_cells
 from vdgs.model.sizes import largest_log_scales
 from vdgs.model.start import initial_anchors
+from vdgs.runs.flight import keep_flight
 from vdgs.runs.folder import RunFolder
 from vdgs.settings.method import TrainConfig
 from vdgs.settings.watching import WatchOptions
@@ -45,6 +46,7 @@ def train_coarse(
         config = run.method().training
         note_without_growth(config, console)
         write_json(run.capture_file, capture_facts(capture))
+        keep_flight(run, capture)
         folder.discard_unless(key)
         _train(run, capture, config, options, console, torch.device(device))
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -36,12 +38,29 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
             temporary.unlink(missing_ok=True)
         why = getattr(error, "strerror", None) or error
         raise VdgsError(
-            f"{path}: cannot be written ({why}). Free some space or choose another folder, then run the same "
-            "command again: it continues from the last good state."
+            f"{path}: cannot be written ({why}). {remedy(error)}, then run the same command again: it continues from "
+            "the last good state."
         ) from error
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def remedy(error: BaseException) -> str:
+    """What to do about a file or folder that the system does not let us write: the beginning of a sentence."""
+    number = getattr(error, "errno", None)
+    if number is None:  # of safetensors: "I/O error: No space left on device (os error 28)"
+        found = re.search(r"os error (\d+)", str(error))
+        number = int(found[1]) if found else None
+    if number in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return "Allow writing there (chmod u+w, or another mount) or choose another folder"
+    if number in (errno.ENOTDIR, errno.EISDIR, errno.EEXIST):
+        return "Move away what stands there under this name, or choose another"
+    if number == errno.ENAMETOOLONG:
+        return "Choose a shorter name"
+    if number in (errno.ENOSPC, errno.EDQUOT):
+        return "Free some space or choose another folder"
+    return "Free some space, see that the folder can be written, or choose another"
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -6,11 +6,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from tyro.conf import Positional, arg
 
 from vdgs.settings.capture import CaptureOptions
-from vdgs.verbs.shared import open_console
+from vdgs.settings.ranges import MANY, Range
+from vdgs.settings.requests import BINS
+from vdgs.verbs.shared import open_console, parse
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class BenchArguments:
     long; choices: one choice of ours changed at a time; toy: a small one in a minute or two."""
     output: Path
     """Folder for runs and results; new, or the one to continue."""
-    seeds: int | None = None
+    seeds: Annotated[int | None, Range(1, 1000)] = None
     """How many seeds (0, 1, ...); by default as many as the table has."""
     scenes: tuple[str, ...] = ()
     """Other scenes than the table's, by name: tiny, lab-uneven, town-even, copr, residence, sci-art, ... Or captures of
@@ -37,19 +38,19 @@ class BenchArguments:
     FOLDER/SCENE/VIEW.png or FOLDER/SCENE/SEED/VIEW.png. Measured as all others (docs/bench.md)."""
     data: Path | None = None
     """Folder that holds the scenes with names which are not generated: residence-pixsfm, copr, ..."""
-    scale_iterations: float = 1.0
+    scale_iterations: Annotated[float, Range(0, 1000, above=True)] = 1.0
     """Factor on the iterations of every scene."""
-    iterations_total: int | None = None
+    iterations_total: Annotated[int | None, Range(1, MANY)] = None
     """Iterations that every method may spend on a scene, shared out as the scene's own; overrides the factor."""
-    max_anchors: int = 0
+    max_anchors: Annotated[int, Range(0, MANY)] = 0
     """No growth beyond this many anchors, of the scene or of all blocks together; 0 for no limit."""
-    jobs: int = 1
+    jobs: Annotated[int, Range(1, 1024)] = 1
     """Runs at once; cores are shared among them."""
     redo: bool = False
     """Allow other settings than those of the runs that are there to discard what they trained."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
-    bins: int = 4
+    bins: Annotated[int, BINS] = 4
     """Number of groups by visibility."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
@@ -58,7 +59,7 @@ class BenchArguments:
 
 
 def bench(arguments: list[str]) -> None:
-    asked = tyro.cli(BenchArguments, args=arguments, prog="vdgs bench")
+    asked = parse(BenchArguments, arguments, "vdgs bench")
     from vdgs.bench.bench import BenchSettings, run_bench
     from vdgs.bench.plan import Choices
 

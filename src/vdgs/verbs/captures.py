@@ -6,12 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from tyro.conf import Positional, arg
 
 from vdgs.settings.capture import CaptureOptions
 from vdgs.synth.options import SynthOptions
-from vdgs.verbs.shared import open_console
+from vdgs.verbs.shared import open_console, parse
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class InspectArguments:
 
 
 def inspect(arguments: list[str]) -> None:
-    asked = tyro.cli(InspectArguments, args=arguments, prog="vdgs inspect")
+    asked = parse(InspectArguments, arguments, "vdgs inspect")
     from vdgs.captures.checks import check_images
     from vdgs.captures.loading import load_capture
     from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
@@ -58,7 +57,7 @@ class SynthArguments:
 
 
 def synth(arguments: list[str]) -> None:
-    asked = tyro.cli(SynthArguments, args=arguments, prog="vdgs synth")
+    asked = parse(SynthArguments, arguments, "vdgs synth")
     from rich.progress import Progress, TaskID
 
     from vdgs.synth import generate

@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-import tyro
 from tyro.conf import Positional, UseAppendAction
 
 from vdgs.settings.requests import ExportRequest
-from vdgs.verbs.shared import open_console, use_device, use_threads
+from vdgs.verbs.shared import open_console, parse, use_device, use_threads
 
 
 @dataclass(frozen=True)
@@ -27,7 +26,7 @@ class ExportArguments(ExportRequest):
 
 
 def export(arguments: list[str]) -> None:
-    asked = tyro.cli(ExportArguments, args=arguments, prog="vdgs export")
+    asked = parse(ExportArguments, arguments, "vdgs export")
     from vdgs.export.exporting import export_run
 
     device = use_device(asked.device)

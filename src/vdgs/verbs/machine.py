@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import tyro
+from vdgs.verbs.shared import parse
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,7 @@ class DoctorArguments:
 
 
 def doctor(arguments: list[str]) -> int:
-    asked = tyro.cli(DoctorArguments, args=arguments, prog="vdgs doctor")
+    asked = parse(DoctorArguments, arguments, "vdgs doctor")
     from vdgs.doctor.report import print_report
 
     return print_report(as_json=asked.json)

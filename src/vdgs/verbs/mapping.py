@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import tyro
 from tyro.conf import Positional
 
 from vdgs.settings.requests import MapRequest
-from vdgs.verbs.shared import open_console, use_device, use_threads
+from vdgs.verbs.shared import open_console, parse, use_device, use_threads
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,7 @@ class MapArguments(MapRequest):
 
 
 def map(arguments: list[str]) -> None:
-    asked = tyro.cli(MapArguments, args=arguments, prog="vdgs map")
+    asked = parse(MapArguments, arguments, "vdgs map")
     from vdgs.maps.mapping import map_run
 
     device = use_device(asked.device)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-import tyro
 from tyro.conf import Positional
 
-from vdgs.settings.requests import ModelName, RenderRequest
-from vdgs.verbs.shared import open_console, use_device, use_threads
+from vdgs.settings.ranges import WORKERS
+from vdgs.settings.requests import BINS, ModelName, RenderRequest
+from vdgs.verbs.shared import find_capture, open_console, parse, use_device, use_threads
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class StatusArguments:
 
 
 def status(arguments: list[str]) -> int:
-    asked = tyro.cli(StatusArguments, args=arguments, prog="vdgs status")
+    asked = parse(StatusArguments, arguments, "vdgs status")
     from vdgs.report.terminal import NOT_WHOLE, print_status, status_facts
     from vdgs.runs.folder import RunFolder
 
@@ -54,11 +54,13 @@ class EvalArguments:
     views: Literal["test", "training"] = "test"
     """Which views. `training` goes into evaluation_training: a model that is much better there than on test views
     overfits. Blocks and seams are measured on test views only."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
-    bins: int = 4
+    bins: Annotated[int, BINS] = 4
     """Number of visibility quantiles by which metrics are reported."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
@@ -67,10 +69,12 @@ class EvalArguments:
 
 
 def eval(arguments: list[str]) -> None:
-    asked = tyro.cli(EvalArguments, args=arguments, prog="vdgs eval")
+    asked = parse(EvalArguments, arguments, "vdgs eval")
+    from vdgs.runs.folder import RunFolder
     from vdgs.stages.evaluate import evaluate_stage
 
     device = use_device(asked.device)
+    find_capture(RunFolder(asked.run), asked.capture)
     use_threads(asked.threads)
     evaluate_stage(
         asked.run, asked.model, asked.lpips_weights, asked.bins, open_console(asked.quiet), asked.views, device
@@ -86,7 +90,7 @@ class ReportArguments:
 
 
 def report(arguments: list[str]) -> None:
-    asked = tyro.cli(ReportArguments, args=arguments, prog="vdgs report")
+    asked = parse(ReportArguments, arguments, "vdgs report")
     from vdgs.report import write_report
     from vdgs.runs.folder import RunFolder
 
@@ -104,7 +108,7 @@ class RenderArguments(RenderRequest):
 
 
 def render(arguments: list[str]) -> None:
-    asked = tyro.cli(RenderArguments, args=arguments, prog="vdgs render")
+    asked = parse(RenderArguments, arguments, "vdgs render")
     from vdgs.films.film import render_run
 
     device = use_device(asked.device)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import tyro
 
-from vdgs.settings.method import MethodConfig
+from vdgs.settings.method import MethodConfig, PartitionConfig
 from vdgs.settings.presets import PRESETS, PresetName
+from vdgs.settings.ranges import refuse
 
 #: What lines begin with that are printed even where a person asked for quiet.
 LOUD = ("[yellow]", "[red]")
@@ -18,6 +19,19 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from vdgs.runs.folder import RunFolder
+
+
+Parsed = TypeVar("Parsed")
+
+
+def parse(kind: type[Parsed], arguments: list[str], prog: str, default: Parsed | None = None) -> Parsed:
+    """The arguments of a verb. Raises VdgsError for a number that is outside its range (`settings.ranges`)."""
+    if default is None:
+        asked = tyro.cli(kind, args=arguments, prog=prog)
+    else:
+        asked = tyro.cli(kind, args=arguments, prog=prog, default=default)
+    refuse(asked)
+    return asked
 
 
 def named_preset(arguments: list[str]) -> PresetName:
@@ -38,9 +52,21 @@ def recorded_run(arguments: list[str], kind: type, prog: str) -> tuple[RunFolder
 
     if "-h" in arguments or "--help" in arguments:
         named = next((RunFolder(Path(a)) for a in arguments if (Path(a) / "config.yaml").is_file()), None)
-        return (named, named.method()) if named else tyro.cli(kind, args=arguments, prog=prog)
-    run = RunFolder(tyro.cli(kind, args=arguments, prog=prog).run)
+        return (named, named.method()) if named else parse(kind, arguments, prog)
+    run = RunFolder(parse(kind, arguments, prog).run)
     return run, run.method()
+
+
+def refuse_idle_blocks(arguments: list[str], partition: PartitionConfig) -> None:
+    """Raise VdgsError where a number of blocks is asked for and blocks are not: which of the two is meant?"""
+    asked = any(argument.partition("=")[0] == "--blocks" for argument in arguments)
+    if asked and not partition.blocking and partition.blocks != 1:
+        from vdgs.errors import VdgsError
+
+        off = "--no-blocking makes" if "--no-blocking" in arguments else "the run has --no-blocking, which makes"
+        raise VdgsError(
+            f"--blocks {partition.blocks}: {off} one block of the scene. Leave out one of them, or say --blocking."
+        )
 
 
 def change_settings(run: RunFolder, method: MethodConfig, redo: bool, quiet: bool = False) -> None:
@@ -57,6 +83,14 @@ def change_settings(run: RunFolder, method: MethodConfig, redo: bool, quiet: boo
         with run.locked():
             for line in run.change_settings(wanted, redo):
                 open_console(quiet).print(f"[yellow]changed[/] {line}", highlight=False)
+
+
+def find_capture(run: RunFolder, at: Path | None) -> None:
+    """Let the run find its capture where --capture says that it lies now, if it says so."""
+    if at is not None:
+        from vdgs.runs.opening import remember_capture
+
+        remember_capture(run, at)
 
 
 def use_threads(count: int) -> None:

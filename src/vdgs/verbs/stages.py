@@ -10,8 +10,18 @@ import tyro
 from tyro.conf import Positional, arg
 
 from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, PartitionConfig
+from vdgs.settings.ranges import WORKERS, Range
 from vdgs.settings.watching import WatchOptions
-from vdgs.verbs.shared import change_settings, open_console, recorded_run, use_device, use_threads
+from vdgs.verbs.shared import (
+    change_settings,
+    find_capture,
+    open_console,
+    parse,
+    recorded_run,
+    refuse_idle_blocks,
+    use_device,
+    use_threads,
+)
 
 
 @dataclass(frozen=True)
@@ -22,14 +32,18 @@ class VisibilityArguments:
     """Run folder with a coarse model."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
 
 
 def visibility(arguments: list[str]) -> None:
-    asked = tyro.cli(VisibilityArguments, args=arguments, prog="vdgs visibility")
+    asked = parse(VisibilityArguments, arguments, "vdgs visibility")
     from vdgs.runs.folder import RunFolder
     from vdgs.stages.visibility import measure_visibility
 
-    measure_visibility(RunFolder(asked.run), open_console(asked.quiet))
+    run = RunFolder(asked.run)
+    find_capture(run, asked.capture)
+    measure_visibility(run, open_console(asked.quiet))
 
 
 @dataclass(frozen=True)
@@ -42,9 +56,11 @@ class PartitionArguments:
     """Print nothing but notes, warnings and errors."""
     redo: bool = False
     """Allow another cut to discard blocks that are trained."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
     why: str | None = None
     """Name of a training photograph: also say how well it shows each block and why it was assigned or not."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
@@ -53,10 +69,12 @@ class PartitionArguments:
 def partition(arguments: list[str]) -> None:
     run, method = recorded_run(arguments, PartitionArguments, "vdgs partition")
     default = PartitionArguments(tyro.MISSING, partition=method.partition, assignment=method.assignment)
-    asked = tyro.cli(PartitionArguments, args=arguments, prog="vdgs partition", default=default)
+    asked = parse(PartitionArguments, arguments, "vdgs partition", default)
+    refuse_idle_blocks(arguments, asked.partition)
     from vdgs.stages.partition import explain_view, partition_run
 
     use_threads(asked.threads)
+    find_capture(run, asked.capture)
     change_settings(
         run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.redo, asked.quiet
     )
@@ -73,13 +91,15 @@ class TrainArguments:
     """Run folder that is cut into blocks."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
-    block: int | None = None
+    block: Annotated[int | None, Range(0, 10_000)] = None
     """Only this block, in this process; without it all of them, several at once."""
-    jobs: int = 0
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
+    jobs: Annotated[int, WORKERS] = 0
     """Blocks trained at once; 0 takes what cores and memory allow."""
     redo: bool = False
     """Allow other settings to discard blocks that are trained with the old ones."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels for --block; 0 for all cores. The result does not depend on it."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
@@ -90,8 +110,9 @@ class TrainArguments:
 def train(arguments: list[str]) -> None:
     run, method = recorded_run(arguments, TrainArguments, "vdgs train")
     default = TrainArguments(tyro.MISSING, settings=method.block)
-    asked = tyro.cli(TrainArguments, args=arguments, prog="vdgs train", default=default)
+    asked = parse(TrainArguments, arguments, "vdgs train", default)
     device = use_device(asked.device)
+    find_capture(run, asked.capture)
     change_settings(run, replace(method, block=asked.settings), asked.redo, asked.quiet)
     if asked.block is not None:
         from vdgs.executors.parent import stop_when_parent_dies
@@ -114,6 +135,8 @@ class MergeArguments:
     """Run folder whose blocks are trained."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
     incomplete: bool = False
     """Let the coarse model stand in for blocks that are missing or failed."""
     merge: Annotated[MergeConfig, arg(name="")] = field(default_factory=MergeConfig)
@@ -122,8 +145,9 @@ class MergeArguments:
 def merge(arguments: list[str]) -> None:
     run, method = recorded_run(arguments, MergeArguments, "vdgs merge")
     default = MergeArguments(tyro.MISSING, merge=method.merge)
-    asked = tyro.cli(MergeArguments, args=arguments, prog="vdgs merge", default=default)
+    asked = parse(MergeArguments, arguments, "vdgs merge", default)
     from vdgs.stages.merge import merge_run
 
+    find_capture(run, asked.capture)
     change_settings(run, replace(method, merge=asked.merge), redo=False, quiet=asked.quiet)
     merge_run(asked.run, asked.incomplete, open_console(asked.quiet))

@@ -12,9 +12,18 @@ from tyro.conf import Positional, arg
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.method import PartitionConfig, TrainConfig
 from vdgs.settings.presets import PRESETS, PresetName
+from vdgs.settings.ranges import WORKERS
 from vdgs.settings.requests import RunRequest
 from vdgs.settings.watching import WatchOptions
-from vdgs.verbs.shared import as_typed, named_preset, open_console, use_device, use_threads
+from vdgs.verbs.shared import (
+    as_typed,
+    named_preset,
+    open_console,
+    parse,
+    refuse_idle_blocks,
+    use_device,
+    use_threads,
+)
 
 
 @dataclass(frozen=True)
@@ -27,7 +36,7 @@ class CoarseArguments:
     """Run folder; new, or the run to continue."""
     preset: PresetName = "paper"
     """`paper`: the paper's settings (100 000 iterations). `laptop`: a good result in minutes on a CPU."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
@@ -41,7 +50,7 @@ class CoarseArguments:
 def coarse(arguments: list[str]) -> None:
     preset = named_preset(arguments)
     default = CoarseArguments(tyro.MISSING, tyro.MISSING, preset, training=PRESETS[preset].training)
-    asked = tyro.cli(CoarseArguments, args=arguments, prog="vdgs coarse", default=default)
+    asked = parse(CoarseArguments, arguments, "vdgs coarse", default)
     from vdgs.runs.beginning import begin_run
     from vdgs.stages.coarse import train_coarse
 
@@ -79,7 +88,8 @@ def run(arguments: list[str]) -> None:
         tyro.MISSING, tyro.MISSING, preset, training=settings.training, partition=settings.partition,
         assignment=settings.assignment, block=settings.block, merge=settings.merge,
     )  # fmt: skip
-    asked = tyro.cli(RunArguments, args=arguments, prog="vdgs run", default=default)
+    asked = parse(RunArguments, arguments, "vdgs run", default)
+    refuse_idle_blocks(arguments, asked.partition)
     device = use_device(asked.device)
     use_threads(asked.threads)
     if asked.dry_run:

@@ -15,7 +15,7 @@ from vdgs.errors import CaptureError
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
     """Numbered lines without the leading comments."""
     try:
-        with file.open(encoding="utf-8") as stream:
+        with file.open(encoding="utf-8-sig") as stream:
             for number, line in enumerate(stream, 1):
                 if not line.startswith("#"):
                     yield number, line.rstrip("\r\n")

@@ -122,7 +122,7 @@ def _aliases(root: Path, views: list[SourceView]) -> dict[str, str]:
         return {}
     ours = {Path(view.name).stem: view.name for view in views}
     aliases = {}
-    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in file.read_text(encoding="utf-8-sig", errors="replace").splitlines():
         original, _, metadata = line.rpartition(",")
         if original and Path(metadata).stem in ours:
             aliases[original.strip()] = ours[Path(metadata).stem]

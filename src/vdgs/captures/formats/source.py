@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -124,14 +125,22 @@ def duplicates(names: Iterable[str]) -> list[str]:
     return sorted(name for name, count in Counter(names).items() if count > 1)
 
 
-def safe_name(name: str, file: Path) -> str:
-    """The image name in posix form. Raises `CaptureError` if it leaves the image folder."""
+def safe_name(name: str, file: Path, what: str = "image name", root: Path | None = None) -> str:
+    """A name in posix form. Raises `CaptureError`, saying `what` it is, if it leaves its folder.
+
+    An absolute one may be meant too, if it lies in `root`: it is then relative to that.
+    """
+    if root is not None and Path(name).is_absolute():
+        with suppress(ValueError):
+            name = Path(name).relative_to(root.absolute()).as_posix()
+        with suppress(ValueError, OSError):
+            name = Path(name).resolve().relative_to(root.resolve()).as_posix() if Path(name).is_absolute() else name
     posix = name.replace("\\", "/")
     parts = PurePosixPath(posix).parts
     climbs = ".." in parts or posix.startswith("/") or bool(PureWindowsPath(name).drive)
     if not parts or climbs or any(ord(letter) < 32 for letter in name):
         raise CaptureError(
-            f"{file}: the image name {name!r} is not a path inside the image folder. "
+            f"{file}: the {what} {name!r} is not a path inside the {'image folder' if root is None else 'capture'}. "
             "Names must be relative, without '..'; mend the file or export the model again."
         )
     return str(PurePosixPath(posix))

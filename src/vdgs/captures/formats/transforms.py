@@ -38,10 +38,10 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     file = root / "transforms.json"
     content = read_json(file)
     frames = frames_of(content, file)
-    names = [_name(frame, file) for frame in frames]
+    names = [_name(frame, file, root) for frame in frames]
     folder = _common_folder(names)
     chosen = options.images or folder
-    splits = _splits(content, file)
+    splits = _splits(content, file, root)
     undo = _undo_applied(content, file)
     views = []
     for frame, name in zip(frames, names, strict=True):
@@ -51,7 +51,7 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
         pose = np.linalg.inv(undo(rigid(world_from_camera, file, f"frame {name!r}")))
         intrinsics = intrinsics_of(frame, content, image, file)
         mask = frame.get("mask_path")
-        mask_path = root / safe_name(str(mask), file) if mask else None
+        mask_path = root / safe_name(str(mask), file, "mask_path", root) if mask else None
         views.append(SourceView(short, pose, intrinsics, splits.get(name), image, mask_path))
     twice = duplicates(view.name for view in views)
     if twice:
@@ -65,11 +65,11 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     )
 
 
-def _name(frame: dict[str, Any], file: Path) -> str:
+def _name(frame: dict[str, Any], file: Path, root: Path) -> str:
     path = frame.get("file_path")
     if not isinstance(path, str):
         raise CaptureError(f"{file}: a frame has no 'file_path'. Export the file again.")
-    return safe_name(path, file)
+    return safe_name(path, file, "file_path", root)
 
 
 def _common_folder(names: list[str]) -> str:
@@ -90,7 +90,7 @@ def _image(path: Path) -> Path:
     raise CaptureError(f"{path}: no such image, though transforms.json names it. Copy it there, or see --images.")
 
 
-def _splits(content: dict[str, Any], file: Path) -> dict[str, Split]:
+def _splits(content: dict[str, Any], file: Path, root: Path) -> dict[str, Split]:
     """Splits by file_path where train_filenames and val_filenames or test_filenames are given."""
     splits: dict[str, Split] = {}
     sides: tuple[tuple[str, Split], ...] = (
@@ -100,7 +100,7 @@ def _splits(content: dict[str, Any], file: Path) -> dict[str, Split]:
         names = content.get(key) or []
         if not isinstance(names, list):
             raise CaptureError(f"{file}: {key!r} must be a list of names.")
-        splits.update({safe_name(str(name), file): side for name in names})
+        splits.update({safe_name(str(name), file, f"name in {key}", root): side for name in names})
     return splits
 
 
@@ -126,5 +126,5 @@ def _points(root: Path, content: dict[str, Any], file: Path, views: list[SourceV
     """Points in the world of the file (before `applied_transform` is undone)."""
     ply = content.get("ply_file_path")
     if ply is not None:
-        return read_point_cloud(root / safe_name(str(ply), file))
+        return read_point_cloud(root / safe_name(str(ply), file, "ply_file_path", root))
     return find_sparse_points(root, {view.name: view.camera_from_world for view in views}, "transforms.json")

@@ -1,0 +1,132 @@
+"""Every number that a person may give has a range, and what lies outside is said before any work."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vdgs.cli import main
+from vdgs.errors import VdgsError
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.checks import validate
+from vdgs.settings.method import MethodConfig, PartitionConfig
+from vdgs.settings.plain import from_dict, to_dict
+from vdgs.settings.presets import PRESETS
+from vdgs.settings.ranges import Number, Range, numbers, problems, refuse
+from vdgs.synth.options import SynthOptions
+from vdgs.verbs.benching import BenchArguments
+from vdgs.verbs.captures import InspectArguments, SynthArguments
+from vdgs.verbs.exporting import ExportArguments
+from vdgs.verbs.mapping import MapArguments
+from vdgs.verbs.results import EvalArguments, RenderArguments
+from vdgs.verbs.stages import MergeArguments, PartitionArguments, TrainArguments
+from vdgs.verbs.starting import CoarseArguments, RunArguments
+
+HERE = Path("here")
+ARGUMENTS: tuple[Any, ...] = (
+    BenchArguments("toy", HERE), InspectArguments(HERE, HERE), SynthArguments(HERE), EvalArguments(HERE),
+    RenderArguments(HERE, HERE), PartitionArguments(HERE), TrainArguments(HERE), MergeArguments(HERE),
+    MapArguments(HERE), ExportArguments(HERE),
+    CoarseArguments(HERE, HERE), RunArguments(HERE, HERE), MethodConfig(), *PRESETS.values(),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("asked", ARGUMENTS, ids=lambda asked: type(asked).__name__)
+def test_every_number_has_a_range_that_holds_its_default(asked):
+    assert [each.option for each in numbers(asked) if each.range is None] == []
+    assert problems(asked) == []
+    assert all(math.isfinite(each.range.most) for each in numbers(asked) if each.range is not None)
+
+
+def test_numbers_are_found_wherever_they_stand():
+    """So the test above can fail."""
+    found = {each.option: each for each in numbers(MethodConfig())}
+    assert found["--blocks"].value == 8
+    assert {"--rates.offsets", "--resolutions", "--block.growth.until"} <= found.keys()
+    assert [each.value for each in numbers(MethodConfig().training.rates)][:2] == [0.01, 1e-4]
+    auto = PartitionConfig(blocks="auto")
+    assert next(each for each in numbers(auto) if each.path == ("blocks",)) == Number(
+        ("blocks",), None, Range(1, 10_000)
+    )
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e300, -1e300])
+def test_no_range_holds_what_is_no_sensible_number(value):
+    ranges = {each.range for asked in ARGUMENTS for each in numbers(asked)}
+    assert not any(each.holds(value) for each in ranges if each is not None)
+
+
+def test_ends_belong_to_a_range_unless_it_says_otherwise():
+    assert [Range(0, 1).holds(end) for end in (0, 1)] == [True, True]
+    assert [Range(0, 1, above=True).holds(end) for end in (0, 1)] == [False, True]
+    assert [Range(0, 1, below=True).holds(end) for end in (0, 1)] == [True, False]
+    assert [Range(2, 3, or_zero=True).holds(value) for value in (0, 1, 2)] == [True, False, True]
+    assert str(Range(0, 1, above=True, or_zero=True)) == "0, or above 0 and at most 1"
+
+
+def test_each_number_out_of_range_is_named_as_the_command_line_names_it():
+    method = MethodConfig()
+    wrong = replace(
+        method,
+        partition=replace(method.partition, lambda_vis=math.nan),
+        block=replace(method.block, growth=replace(method.block.growth, until=2.0)),
+    )
+    assert validate(wrong) == [
+        "--lambda-vis nan: must be at least 0 and at most 1000",
+        "--block.growth.until 2.0: must be at least 0 and at most 1",
+    ]
+    with pytest.raises(VdgsError, match=r"--downscale 0\.5: must be at least 1"):
+        refuse(CaptureOptions(downscale=0.5))
+    with pytest.raises(VdgsError, match=r"(?s)--images 1: .*--overlap nan: "):
+        SynthOptions(images=1, overlap=math.nan).resolved()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", "C", "--output", "R", "--expansion", "nan"],
+        ["run", "C", "--output", "R", "--threads", "-3"],
+        ["coarse", "C", "--output", "R", "--downscale", "1e9"],
+        ["inspect", "C", "--output", "R", "--test-every", "0"],
+        ["render", "R", "--output", "O", "--seconds", "nan"],
+        ["render", "R", "--output", "O", "--width", "10000000"],
+        ["eval", "R", "--bins", "100000"],
+        ["synth", "O", "--noise-px", "inf"],
+        ["bench", "toy", "--output", "O", "--seeds", "0"],
+    ],
+)
+def test_the_command_line_says_so_at_once(arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 1
+    assert re.search(rf"{arguments[-2]} .*: must be ", capsys.readouterr().err)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"training": {"iterations": "many"}}, r"training\.iterations is 'many'; it must be a whole number"),
+        ({"training": {"iterations": 1.5}}, "must be a whole number"),
+        ({"training": {"rates": {"offsets": [1]}}}, "must be a list of 2: a number, a number"),
+        ({"training": {"anchors": 3}}, "not a group of settings"),
+        ({"partition": {"blocks": "most"}}, "must be a whole number or auto"),
+        ({"partition": {"blocking": 1}}, "must be true or false"),
+        ({"block": {"ring": "frozn"}}, "must be frozen or ramp or free"),
+        ({"block": {"sampeling": "even"}}, "block has no 'sampeling'; did you mean 'sampling'"),
+    ],
+)
+def test_a_value_of_another_kind_is_named(settings, says):
+    with pytest.raises(ValueError, match=says):
+        from_dict(MethodConfig, settings)
+
+
+def test_a_number_that_yaml_takes_for_text_is_still_one():
+    assert from_dict(MethodConfig, {"block": {"growth": {"threshold": "1e-4"}}}).block.growth.threshold == 1e-4
+    assert to_dict(from_dict(CaptureOptions, {"gps": "/a.csv"}))["gps"] == "/a.csv"
