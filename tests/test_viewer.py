@@ -18,7 +18,8 @@ from merging_support import opaque_plane, quadrants
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
 from vdgs.evaluation.metrics import to_8bit
-from vdgs.films.paths import load_path, look_at
+from vdgs.films.path_files import load_path
+from vdgs.films.paths import look_at
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import render
 from vdgs.partition.blocks import save_blocks
@@ -62,7 +63,7 @@ def scene(tmp_path_factory):
     points = model.anchors.positions.double().numpy()
     ground = GroundFrame(1.0, np.eye(3), np.zeros(3), True, "hand-made", PLACE)
     capture = Capture(folder, "colmap", ".", tuple(views), points, np.full((len(points), 3), 99, np.uint8), ground)
-    run = TrainedRun(RunFolder(folder / "run"), capture, model, folder / "model", "merged", Status())
+    run = TrainedRun(RunFolder(folder / "run"), model, folder / "model", "merged", Status(), "key", "", capture)
     coarse = replace(run, model=opaque_plane(), name="coarse")
     opened = Scene(run, lambda name: coarse)
     save_blocks(folder / "run/partition/blocks.geojson", quadrants(), [{}] * 4)

@@ -57,7 +57,7 @@ class Guest:
         """Click at a share of width and height."""
         self.send(
             "ScenePointerMessage", event_type="click", ray_origin=[0.0, 0.0, 0.0], ray_direction=[0.0, 0.0, 1.0],
-            screen_pos=[[x, y]], modifier=None,
+            screen_pos=[[float(x), float(y)]], modifier=None,
         )  # fmt: skip
 
     def messages(self, patience: float = PATIENCE) -> Iterator[dict[str, Any]]:
@@ -90,6 +90,13 @@ class Guest:
             if picture.shape[:2] == (camera.height, camera.width):
                 return picture
         raise AssertionError("no full picture came")
+
+    def sees(self, expected: np.ndarray) -> None:
+        """Look until a picture comes that is the expected one but for what JPEG loses."""
+        for picture in self.pictures():
+            if picture.shape == expected.shape and np.abs(picture.astype(int) - expected).mean() < 3:
+                return
+        raise AssertionError("the expected picture did not come")
 
     def control(self, label: str) -> str:
         """What tells a control of the panel, by its label."""

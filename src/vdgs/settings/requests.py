@@ -176,9 +176,9 @@ class ViewRequest:
     host: str = "127.0.0.1"
     """Address to listen at: this machine alone can open it. Another one (0.0.0.0: all) lets others in who have the
     token of the printed address."""
-    port: int | None = None
+    port: Annotated[int | None, Range(1, 65535)] = None
     """Port; by default the first free one from 8080."""
-    threads: int = 0
+    threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import tyro
 from tyro.conf import Positional
 
 from vdgs.settings.requests import ViewRequest
-from vdgs.verbs.shared import open_console, use_device, use_threads
+from vdgs.verbs.shared import open_console, parse, use_device, use_threads
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,7 @@ class ViewArguments(ViewRequest):
 
 
 def view(arguments: list[str]) -> None:
-    asked = tyro.cli(ViewArguments, args=arguments, prog="vdgs view")
+    asked = parse(ViewArguments, arguments, "vdgs view")
     from vdgs.viewer.serving import view_run
 
     device = use_device(asked.device)

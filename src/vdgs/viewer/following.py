@@ -82,9 +82,8 @@ def _unfinished_coarse(run: RunFolder, device: str) -> TrainedRun:
     anchors, decoder = _result_of(saved)
     model = AnchorModel(anchors, decoder, 1.0, background, {}).to(torch.device(device))
     why = f"this is the coarse model after {saved.iteration:,} iterations; its background is not known yet"
-    return TrainedRun(
-        run, capture, model, _file_of(run.coarse, saved), UNFINISHED, run.coarse.status(), caution=why
-    )  # fmt: skip
+    file, key = _file_of(run.coarse, saved), run.keys().coarse
+    return TrainedRun(run, model, file, UNFINISHED, run.coarse.status(), key, why, capture)
 
 
 def _with_blocks(coarse: TrainedRun) -> TrainedRun | None:
@@ -108,7 +107,7 @@ def _with_blocks(coarse: TrainedRun) -> TrainedRun | None:
     merged, _ = merge(model, trained, blocks, cameras, run.method().merge, allow_missing=True)
     shown = sum(each is not None for each in trained)
     why = f"this is the scene as {shown} of {len(blocks)} blocks have it so far; elsewhere it is the coarse model"
-    return replace(coarse, model=merged.to(coarse.device), name=UNFINISHED, key=None, caution=why)
+    return replace(coarse, model=merged.to(coarse.device), name=UNFINISHED, caution=why)
 
 
 def _block_so_far(coarse: TrainedRun, folder: StageFolder, key: str, index: int, own: bool) -> AnchorModel | None:

@@ -65,7 +65,8 @@ class Scene:
     def seen(self, name: str) -> Float[Tensor, " n"]:
         """V of every anchor of a model."""
         if name not in self._seen:
-            self._seen[name] = visibility_of_run(self.opened(name)).float()
+            cameras = [view.camera for view in self.capture.train_views]
+            self._seen[name] = visibility_of_run(self.opened(name), cameras).float()
         return self._seen[name]
 
     @cached_property

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http
 import io
+import math
 import secrets
 import socket
 import threading
@@ -15,10 +16,12 @@ from typing import Any
 
 from rich.console import Console
 
+from vdgs.captures.heights import camera_height
 from vdgs.errors import Interrupted, VdgsError
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import TrainedRun
 from vdgs.settings.requests import ViewRequest
+from vdgs.viewer import navigation
 from vdgs.viewer.door import Door, is_loopback
 from vdgs.viewer.following import newest, open_or_last_saved, standing_lines
 from vdgs.viewer.scene import Scene
@@ -38,8 +41,6 @@ def view_run(asked: ViewRequest, console: Console, opened: Callable[[str], None]
     Raises VdgsError for a run without a model, an address that cannot be used, and where viser is not installed.
     """
     _require_viser()
-    if asked.port is not None and not 1 <= asked.port <= 65535:
-        raise VdgsError(f"--port {asked.port}: ports are 1 to 65535.")
     port = free_port(asked.host, asked.port)
     run = open_or_last_saved(asked.run, asked.model, asked.device)
     if run.caution:
@@ -89,6 +90,7 @@ def serve(run: TrainedRun, host: str, port: int, console: Console) -> Iterator[V
     scene, studio = Scene(run), Studio()
     server = _start(door)
     viewer = Viewer(server, door, scene, studio, {})
+    _place_newcomers(server, run)
 
     def comes(client: Any) -> None:
         visitor = Visitor(client, scene, studio, console)
@@ -112,6 +114,15 @@ def serve(run: TrainedRun, host: str, port: int, console: Console) -> Iterator[V
             server.stop()
         worker.join(timeout=5.0)
         scene.close()
+
+
+def _place_newcomers(server: Any, run: TrainedRun) -> None:
+    """Where a browser stands when it first opens the page; one that connects again stays where it is."""
+    stand, height = navigation.whole_scene(run.capture), camera_height(run.capture)
+    start = server.initial_camera
+    start.up, start.fov = (0.0, 0.0, 1.0), math.radians(navigation.FOV_DEG)
+    start.position, start.look_at = tuple(stand.position), tuple(stand.look_at)
+    start.near, start.far = 1e-3 * height, 1000 * height
 
 
 def _until_asked(viewer: Viewer, asked: ViewRequest, console: Console) -> None:

@@ -52,8 +52,7 @@ class Visitor:
         client.scene.on_click()(lambda event: self.place.clicked(event.screen_pos))
         height = camera_height(scene.capture)
         client.camera.min_orbit_distance, client.camera.max_orbit_distance = 1e-3 * height, 200 * height
-        client.camera.near, client.camera.far = 1e-3 * height, 1000 * height
-        self.go(navigation.whole_scene(scene.capture), np.radians(navigation.FOV_DEG))
+        self._moved()
 
     # ------------------------------------------------------------------------------------- what they see
 
