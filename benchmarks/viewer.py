@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import signal
 import subprocess
 import sys
 import threading
@@ -124,7 +125,7 @@ def main() -> None:
             f"each; memory {before / 1e6:.0f} -> {server.memory_info().rss / 1e6:.0f} MB"
         )
     finally:
-        process.terminate()
+        process.send_signal(signal.SIGINT)
         process.wait()
 
 

@@ -20,7 +20,7 @@ from vdgs.captures.capture import Capture, GroundFrame, View
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.films.path_files import load_path
 from vdgs.films.paths import look_at
-from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchor_model import AnchorModel, Part
 from vdgs.model.render import render
 from vdgs.partition.blocks import save_blocks
 from vdgs.runs.folder import RunFolder
@@ -34,6 +34,7 @@ from vdgs.viewer.photographs import laid_over, nearest_view
 from vdgs.viewer.places import place_at, position_at, thumbnail
 from vdgs.viewer.scene import Scene
 from vdgs.viewer.studio import FEWEST_PX, REST, Frame, Studio, shrunk
+from vdgs.viewer.thinning import Levels
 
 PLACE = (46.95, 7.44, 560.0)
 
@@ -141,6 +142,27 @@ def test_depth_keeps_its_colours_while_the_camera_moves(scene):
     assert after is not None
     assert before is not None
     assert after.high < before.high
+
+
+@pytest.mark.parametrize("parts", [False, True])
+def test_quick_pictures_of_much_are_drawn_with_fewer_larger_gaussians(parts):
+    model = two_floors()
+    if parts:
+        counts = (300, len(model.anchors) - 300)
+        model = replace(model, parts=tuple(Part(count, model.decoder) for count in counts))
+    camera = camera_at(0.0, 0.0, 6.0)
+    levels = Levels(model, most=400)
+    assert levels.of(camera, quick=False).model is model
+    assert Levels(model).of(camera, quick=True).model is model
+    few = levels.of(camera, quick=True)
+    assert few.kept is not None
+    assert len(few.model.anchors) == int(few.kept.sum()) < len(model.anchors) / 3
+    assert sum(part.count for part in few.model.parts) == (len(few.model.anchors) if parts else 0)
+    assert torch.equal(few.of(model.anchors.positions), few.model.anchors.positions)
+    thin, whole = render(few.model, camera), render(model, camera)
+    inner = slice(14, 34), slice(20, 44)
+    assert thin.alpha[inner].mean() > 0.95
+    assert (thin.image[inner].mean((0, 1)) - whole.image[inner].mean((0, 1))).abs().max() < 0.05
 
 
 # ------------------------------------------------------------------------------------- photographs
@@ -319,7 +341,7 @@ class Slow:
     def settle(self, shown: Shown, whole: Camera) -> None:
         self.settled += 1
 
-    def paint(self, shown: Shown, camera: Camera, whole: Camera) -> np.ndarray:
+    def paint(self, shown: Shown, camera: Camera, whole: Camera, quick: bool = False) -> np.ndarray:
         self.clock.now += self.per_px * camera.width * camera.height
         return np.zeros((camera.height, camera.width, 3), np.uint8)
 
@@ -421,7 +443,7 @@ def test_one_visitors_trouble_is_theirs_alone(studio):
     studio, clock = studio
 
     class Broken(Slow):
-        def paint(self, shown, camera, whole):
+        def paint(self, shown, camera, whole, quick=False):
             raise RuntimeError("no picture")
 
     broken, _, errors = sit(studio, Broken(clock))

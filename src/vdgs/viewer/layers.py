@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.captures.heights import camera_height
 from vdgs.evaluation.metrics import to_8bit
+from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import decode_view, draw, render, render_values
 from vdgs.viewer.photographs import Comparison, laid_over
 from vdgs.viewer.scene import Scene
+from vdgs.viewer.thinning import Level
 
 if TYPE_CHECKING:
     from vdgs.films.maps import Scale
@@ -59,7 +62,7 @@ class Painter:
         if shown.layer == "depth":
             from vdgs.films.maps import depth_scale, depth_span
 
-            depth = _depth(self._scene, self._model(shown), whole.within(_PREVIEW_PX))
+            depth = _depth(self._scene.model(self._model(shown)), whole.within(_PREVIEW_PX))
             capture = self._scene.capture
             self._depth = depth_scale(depth_span([depth], camera_height(capture)), capture.ground.unit)
 
@@ -75,12 +78,12 @@ class Painter:
             return maps.alpha_scale()
         return error_scale() if shown.layer == "error" else None
 
-    def paint(self, shown: Shown, camera: Camera, whole: Camera) -> UInt8[np.ndarray, "h w 3"]:
-        """A picture, or rows of it: `camera` is `whole` or cropped from it, all columns."""
+    def paint(self, shown: Shown, camera: Camera, whole: Camera, quick: bool = False) -> UInt8[np.ndarray, "h w 3"]:
+        """A picture, or rows of it: `camera` is `whole` or cropped from it, all columns. `quick`: coarser."""
         if shown.model == "both" and len(self._scene.names) > 1:
-            picture = self._side_by_side(shown, camera, whole)
+            picture = self._side_by_side(shown, camera, whole, quick)
         else:
-            picture = self._of(self._model(shown), shown, camera, whole)
+            picture = self._of(self._model(shown), shown, camera, whole, quick)
         if shown.photograph is not None:
             picture = self._with_photograph(shown, camera, picture)
         return picture
@@ -88,33 +91,33 @@ class Painter:
     def _model(self, shown: Shown) -> str:
         return shown.model if shown.model in self._scene.names else self._scene.names[0]
 
-    def _of(self, name: str, shown: Shown, camera: Camera, whole: Camera) -> UInt8[np.ndarray, "h w 3"]:
+    def _of(self, name: str, shown: Shown, camera: Camera, whole: Camera, quick: bool) -> UInt8[np.ndarray, "h w 3"]:
+        level = self._scene.level(name, camera, quick)
         if shown.layer == "colour":
-            return to_8bit(render(self._scene.model(name), camera).image.cpu().numpy())
+            return to_8bit(render(level.model, camera).image.cpu().numpy())
         if shown.layer == "blocks":
-            return _tinted(self._scene, name, camera)
+            return _tinted(level.model, level.of(self._scene.tint(name)), camera)
         if shown.layer == "depth" and self._depth is None:
             self.settle(shown, whole)
         scale = self.scale(shown)
         assert scale is not None
-        return scale.coloured(self._values(name, shown, camera, whole))
+        return scale.coloured(self._values(name, level, shown, camera, whole))
 
-    def _values(self, name: str, shown: Shown, camera: Camera, whole: Camera) -> np.ndarray:
-        scene = self._scene
+    def _values(self, name: str, level: Level, shown: Shown, camera: Camera, whole: Camera) -> np.ndarray:
         if shown.layer == "depth":
-            return _depth(scene, name, camera)
+            return _depth(level.model, camera)
         if shown.layer == "visibility":
-            return render_values(scene.model(name), scene.seen(name), camera).cpu().numpy()
+            return render_values(level.model, level.of(self._scene.seen(name)), camera).cpu().numpy()
         if shown.layer == "alpha":
-            return render(scene.model(name), camera).alpha.cpu().numpy()
+            return render(level.model, camera).alpha.cpu().numpy()
         return self._comparison.error_in(name, camera, whole)
 
-    def _side_by_side(self, shown: Shown, camera: Camera, whole: Camera) -> UInt8[np.ndarray, "h w 3"]:
+    def _side_by_side(self, shown: Shown, camera: Camera, whole: Camera, quick: bool) -> UInt8[np.ndarray, "h w 3"]:
         edge = column(shown.split, camera.width)
         parts = []
         for name, left, right in (("coarse", 0, edge), ("merged", edge, camera.width)):
             if left < right:
-                parts.append(self._of(name, shown, camera.cropped(left, 0, right, camera.height), whole))
+                parts.append(self._of(name, shown, camera.cropped(left, 0, right, camera.height), whole, quick))
         return _lined(np.concatenate(parts, axis=1), edge)
 
     def _with_photograph(self, shown: Shown, camera: Camera, picture: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
@@ -138,20 +141,19 @@ def _lined(picture: np.ndarray, edge: int) -> UInt8[np.ndarray, "h w 3"]:
     return picture
 
 
-def _depth(scene: Scene, name: str, camera: Camera) -> np.ndarray:
-    raster = render(scene.model(name), camera, depth=True)
+def _depth(model: AnchorModel, camera: Camera) -> np.ndarray:
+    raster = render(model, camera, depth=True)
     assert raster.median_depth is not None
     depth, alpha = raster.median_depth.cpu().numpy(), raster.alpha.cpu().numpy()
     return np.where(alpha > 0.5, depth, np.nan).astype(np.float32)
 
 
 @torch.no_grad()
-def _tinted(scene: Scene, name: str, camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
+def _tinted(model: AnchorModel, tints: Tensor, camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
     """The scene with the colours of the blocks that own its anchors."""
-    model = scene.model(name)
     rows, splats = decode_view(model, camera)
     k = model.anchors.offsets.shape[1]
-    tint = scene.tint(name)[rows][splats.source.long() // k]
+    tint = tints[rows][splats.source.long() // k]
     colours = (1 - _TINTED) * splats.colours.mean(dim=1, keepdim=True) + _TINTED * tint
     background = splats.means_px.new_tensor(model.background)
     raster = draw(replace(splats, colours=colours.contiguous()), camera, background)

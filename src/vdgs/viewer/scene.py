@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vdgs.cameras import Camera
 from vdgs.captures.images import ImageCache
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
@@ -21,6 +22,7 @@ from vdgs.placing.placement import Placement
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.runs.visibility import visibility_of_run
+from vdgs.viewer.thinning import Level, Levels
 
 ModelChoice = Literal["coarse", "merged"]
 #: Photographs kept in memory, decoded (choice).
@@ -37,6 +39,7 @@ class Scene:
         self._runs: dict[str, TrainedRun] = {run.name: run}
         self._seen: dict[str, Tensor] = {}
         self._tints: dict[str, Tensor] = {}
+        self._levels: dict[str, Levels] = {}
 
     @property
     def names(self) -> Sequence[str]:
@@ -55,11 +58,17 @@ class Scene:
     def model(self, name: str) -> AnchorModel:
         return self.opened(name).model
 
+    def level(self, name: str, camera: Camera, quick: bool) -> Level:
+        """What to draw of a model: itself, or for a quick picture of much a thinner one."""
+        if name not in self._levels:
+            self._levels[name] = Levels(self.model(name))
+        return self._levels[name].of(camera, quick)
+
     def show(self, run: TrainedRun) -> None:
         """Put a newer model in place of the one of its name."""
         self.run = run
         self._runs = {run.name: run}
-        self._seen, self._tints = {}, {}
+        self._seen, self._tints, self._levels = {}, {}, {}
         self.__dict__.pop("blocks", None)
 
     def seen(self, name: str) -> Float[Tensor, " n"]:

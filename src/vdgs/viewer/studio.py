@@ -37,7 +37,7 @@ class Paints(Protocol):
     """Draws what one visitor asks for (`layers.Painter`)."""
 
     def settle(self, shown: Shown, whole: Camera) -> None: ...
-    def paint(self, shown: Shown, camera: Camera, whole: Camera) -> np.ndarray: ...
+    def paint(self, shown: Shown, camera: Camera, whole: Camera, quick: bool = False) -> np.ndarray: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +179,7 @@ class Studio:
         if small is whole and not seat.full_due:
             return
         began = self._clock()
-        seat.deliver(Frame(seat.painter.paint(shown, small, small), False, whole, shown))
+        seat.deliver(Frame(seat.painter.paint(shown, small, small, True), False, whole, shown))
         taken = max(self._clock() - began, 1e-4)
         most = min(MOST_PX, whole.width * whole.height)
         seat.quick_px = float(
