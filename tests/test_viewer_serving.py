@@ -6,6 +6,7 @@ import json
 import math
 import shutil
 import socket
+import subprocess
 import sys
 from pathlib import Path
 from urllib.error import HTTPError
@@ -236,6 +237,11 @@ def test_ports_and_hosts_that_cannot_be_used_are_said_before_any_work(run):
     with pytest.raises(VdgsError, match="no address of this machine"):
         free_port("no.such.host.invalid", None)
     assert "--port 70000" in vdgs("view", run, "--port", "70000").stderr
+
+
+def test_what_draws_charts_is_not_waited_for():
+    code = "import sys, vdgs.viewer.serving; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 def test_a_folder_without_a_run_is_said(tmp_path):

@@ -14,7 +14,6 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.partition.merging import merge
-from vdgs.report.terminal import next_step, progress_of
 from vdgs.runs.cut import blocks_of, views_of_block
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.opening import TrainedRun, open_capture, open_run
@@ -46,6 +45,8 @@ def open_or_last_saved(path: Path, which: ModelName = "best", device: str = "cpu
 
 def standing_lines(run: RunFolder) -> str:
     """How far every stage and block is, in Markdown."""
+    from vdgs.report.terminal import next_step, progress_of  # brings what draws charts: not before the first picture
+
     standing = standing_of(run)
     lines = [
         f"**{stage.name}** {stage.state}" + (f": {progress_of(stage.status)}" if progress_of(stage.status) else "")

@@ -17,7 +17,6 @@ from vdgs.captures.images import ImageCache
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.partition.blocks import Blocks, places_of
-from vdgs.partition.figures.words import block_colour
 from vdgs.placing.placement import Placement
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.opening import TrainedRun, open_run
@@ -120,6 +119,8 @@ class Scene:
 
 def rgb_of(block: int) -> tuple[int, int, int]:
     """The colour of a block in all figures, 0 to 255."""
+    from vdgs.partition.figures.words import block_colour  # brings matplotlib: not before the first picture
+
     colour = block_colour(block).lstrip("#")
     red, green, blue = (int(colour[place : place + 2], 16) for place in (0, 2, 4))
     return red, green, blue
