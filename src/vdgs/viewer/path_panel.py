@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vdgs.cameras import Camera
 from vdgs.films.paths import SECONDS
+from vdgs.viewer.host import Host
 from vdgs.viewer.keyframes import at_time, path_json
 from vdgs.viewer.navigation import Stand
-
-if TYPE_CHECKING:
-    from vdgs.viewer.visitor import Visitor
 
 #: Pictures a second while a path is played.
 _RATE = 15.0
@@ -24,7 +21,7 @@ _FILE = "path.json"
 class PathPanel:
     """The key frames of one visitor."""
 
-    def __init__(self, visitor: Visitor) -> None:
+    def __init__(self, visitor: Host) -> None:
         self._visitor = visitor
         self.keyframes: list[Camera] = []
         self._stopping: threading.Event | None = None

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vdgs.captures.heights import camera_height
 from vdgs.viewer import navigation
+from vdgs.viewer.host import Host
 from vdgs.viewer.measuring import Ruler
 from vdgs.viewer.places import Place, place_at, position_at, thumbnail
-
-if TYPE_CHECKING:
-    from vdgs.viewer.visitor import Visitor
 
 _HINT = "Click a place to see what is known of it."
 #: Photographs shown of a place.
@@ -23,7 +21,7 @@ _THUMBNAILS = 4
 class PlacePanel:
     """Answers clicks of one visitor."""
 
-    def __init__(self, visitor: Visitor) -> None:
+    def __init__(self, visitor: Host) -> None:
         self._visitor = visitor
         self._folder = visitor.client.gui.add_folder("Place")
         self._things: list[Any] = []
