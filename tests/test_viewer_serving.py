@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -237,6 +238,20 @@ def test_ports_and_hosts_that_cannot_be_used_are_said_before_any_work(run):
     with pytest.raises(VdgsError, match="no address of this machine"):
         free_port("no.such.host.invalid", None)
     assert "--port 70000" in vdgs("view", run, "--port", "70000").stderr
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_it_ends_when_asked_to(run, how):
+    command = [sys.executable, "-c", "from vdgs.cli import main; main()", "view", str(run)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        line = next(line for line in process.stdout if "http://127.0.0.1:" in line)
+        assert line.startswith("coarse model (")
+        process.stdout.readline()
+        process.send_signal(how)
+        assert process.wait(timeout=60) == 0
+        assert "Traceback" not in process.stderr.read()
 
 
 def test_what_draws_charts_is_not_waited_for():

@@ -27,7 +27,7 @@ from vdgs.viewer.following import newest, open_or_last_saved, standing_lines
 from vdgs.viewer.scene import Scene
 from vdgs.viewer.studio import Studio
 from vdgs.viewer.visitor import Visitor
-from vdgs.watching.interrupts import stop_if_asked
+from vdgs.watching.interrupts import stop_if_asked, stop_requests
 
 #: Where the search for a free port begins, and how many are tried.
 FIRST_PORT, TRIED_PORTS = 8080, 50
@@ -51,8 +51,8 @@ def view_run(asked: ViewRequest, console: Console, opened: Callable[[str], None]
             console.print("Whoever has this address can see the scene. Ctrl-C ends it.", highlight=False)
         else:
             console.print("Only this machine can open it (--host lets others in). Ctrl-C ends it.", highlight=False)
-        # Ctrl-C is how it ends, not how it fails.
-        with contextlib.suppress(KeyboardInterrupt, Interrupted):
+        # Ctrl-C is how it ends, not how it fails. Asked for anew: what reads captures has set a handler of its own.
+        with contextlib.suppress(KeyboardInterrupt, Interrupted), stop_requests(interrupts=True):
             if opened is not None:
                 opened(viewer.door.address())
             _until_asked(viewer, asked, console)
@@ -96,6 +96,8 @@ def serve(run: TrainedRun, host: str, port: int, console: Console) -> Iterator[V
         visitor = Visitor(client, scene, studio, console)
         viewer.visitors[client.client_id] = visitor
         visitor.tell(viewer.progress)
+        if client.client_id not in server.get_clients():  # gone while the panel was made
+            goes(client)
 
     def goes(client: Any) -> None:
         visitor = viewer.visitors.pop(client.client_id, None)
