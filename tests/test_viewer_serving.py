@@ -154,6 +154,25 @@ def test_visitors_that_vanish_are_forgotten(viewer):
     assert not viewer.studio._seats
 
 
+@quiet
+def test_a_photograph_lies_over_the_model_until_one_leaves(viewer, guest):
+    guest.stand(above())
+    guest.full_picture(above())
+    wait_until(lambda: len(viewer.visitors) == 1)
+    (visitor,) = viewer.visitors.values()
+    taken = viewer.scene.capture.views[0].camera
+    visitor.look_from(0)
+    assert visitor.shown.photograph == 0
+    guest.stand(above(0.2))  # was on its way when the browser was told to go
+    wait_until(lambda: visitor.camera.position[0] == pytest.approx(0.2))
+    assert visitor.shown.photograph == 0
+    guest.stand(taken)
+    wait_until(lambda: np.allclose(visitor.camera.position, taken.position))
+    guest.sees(visitor.painter.paint(visitor.shown, visitor.camera, visitor.camera))
+    guest.stand(above(0.3))
+    wait_until(lambda: visitor.shown.photograph is None)
+
+
 # ------------------------------------------------------------------------------------- the door
 
 

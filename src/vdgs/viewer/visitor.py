@@ -86,7 +86,7 @@ class Visitor:
             camera.look_at = tuple(stand.look_at)
             if fov is not None:
                 camera.fov = float(fov)
-        self._moved()
+        self._moved(theirs=False)
 
     def look_from(self, index: int) -> None:
         """Stand where a photograph was taken, with the photograph over the model."""
@@ -117,7 +117,9 @@ class Visitor:
         self.path.stop()
         self.studio.leave(self._seat)
 
-    def _moved(self) -> None:
+    def _moved(self, theirs: bool = True) -> None:
+        """Draw for where the camera is now: by the browser (`theirs`), which may still send older news after we told it
+        to go elsewhere, or by us."""
         state = self.client.camera
         try:
             camera = navigation.camera_of(
@@ -127,7 +129,8 @@ class Visitor:
             return
         with self._lock:
             self._camera = camera
-            self._leave_photograph(camera)
+            if theirs:
+                self._leave_photograph(camera)
             self.studio.ask(self._seat, camera, self._shown)
 
     def _leave_photograph(self, camera: Camera) -> None:
