@@ -38,7 +38,8 @@ demo: setup
 	@echo "report:      $(DEMO)/run/report.html"
 	@echo "test views:  $(DEMO)/run/evaluation/contact_sheet.png"
 	@echo "metrics:     $(DEMO)/run/evaluation/metrics.json"
-	@echo "model:       $(DEMO)/run/merged/model.safetensors"
+	@echo "maps:        $(DEMO)/run/maps/preview.png"
+	@echo "model:       $(DEMO)/run/merged/model.safetensors (vdgs export $(DEMO)/run --to scene.ply for other programs)"
 
 lint: setup
 	$(BIN)/ruff check .

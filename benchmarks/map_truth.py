@@ -10,6 +10,7 @@ The town is built again from the options in its capture.md; its world is that of
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -31,6 +32,11 @@ SKY_M, SAMPLES = 300.0, 4
 
 
 def main(town_folder: Path, maps: Path) -> None:
+    drawn_in = json.loads((maps / "map.json").read_text(encoding="utf-8"))["crs"]
+    if drawn_in != "source":
+        sys.exit(
+            f"{maps}: is drawn in {drawn_in}, the truth is in the capture's own coordinates: vdgs map --crs source"
+        )
     note = (town_folder / "capture.md").read_text(encoding="utf-8")
     seed, extent = (float(re.search(rf"^- {name}: (.*)$", note, re.M).group(1)) for name in ("seed", "extent_m"))
     with rasterio.open(maps / "dsm.tif") as file:

@@ -28,7 +28,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("partition", "inspection", "synth"),
     ("runs",),
     ("watching",),
-    ("executors", "evaluation"),
+    ("executors", "evaluation", "sfm"),
     ("stages", "films", "maps", "report", "comparators", "export"),
     ("pipeline", "planning", "doctor", "bench", "viewer"),
     ("verbs",),

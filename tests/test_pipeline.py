@@ -30,7 +30,7 @@ SETTINGS = (
     "--growth.start", "50", "--growth.interval", "50", "--growth.statistics-from", "25", "--growth.gate", "0.05",
     "--blocks", "2", "--jobs", "2", "--block.compensation.t-low-quantile", "0",
     "--assignment.min-cameras", "4", "--block.iterations", str(BLOCK_ITERATIONS), "--block.growth.gate", "0.05",
-    "--block.growth.start", "25", "--block.growth.statistics-from", "0", "--block.growth.interval", "25",
+    "--block.growth.start", "25", "--block.growth.statistics-from", "0", "--block.growth.interval", "25", "--no-maps",
 )  # fmt: skip
 #: What a block's model is compared by: the whole file.
 MERGED = "merged/model.safetensors"
@@ -83,12 +83,22 @@ def train_each(run: Path, *settings: str) -> None:
         assert done.returncode == 0, done.stderr
 
 
+def test_a_run_ends_with_maps_and_its_report_shows_them(copied, capture):
+    asked = ("run", capture, "--output", copied, *[each for each in SETTINGS if each != "--no-maps"])
+    done = vdgs(*asked)
+    assert done.returncode == 0, done.stderr
+    assert {"orthophoto.tif", "dsm.tif", "visibility.tif"} <= {file.name for file in (copied / "maps").iterdir()}
+    assert "The scene as maps." in (copied / "report.html").read_text()
+    assert "already drawn" in vdgs(*asked).stdout
+
+
 def test_a_scene_goes_out_and_says_what_it_loses(copied, tmp_path):
     scene = tmp_path / "out" / "scene.ply"
     done = vdgs("export", copied, "--to", scene, "--to", tmp_path / "out" / "scene.splat")
     assert done.returncode == 0, done.stderr
     assert "scene.ply, read back, on" in done.stdout
-    loss = json.loads((copied / "export.json").read_text())["loss"]
+    assert "scene.splat, read back, on" in done.stdout
+    loss = json.loads((copied / "export.json").read_text())["losses"][0]
     measured = json.loads((copied / "evaluation" / "metrics.json").read_text())
     assert loss["psnr"] == pytest.approx(measured["psnr"], abs=1e-6)
     assert loss["ssim"] == pytest.approx(measured["ssim"], abs=1e-6)

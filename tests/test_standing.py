@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
@@ -261,3 +262,16 @@ def test_the_command_that_began_a_run_is_advised_while_the_settings_are_its_own(
     assert standing_of(run).next_command() == f"vdgs merge {run.path}"
     run.change_settings(run.settings() | {"merge": asdict(MethodConfig().merge)}, redo=True, command="vdgs run anew")
     assert standing_of(run).next_command() == "vdgs run anew"
+
+
+def test_a_copy_of_a_run_is_not_continued_where_the_run_lies(run, tmp_path):
+    run._write(run.settings(), f"vdgs run place --output {run.path}")
+    assert run.command() is not None
+    copy = RunFolder(tmp_path / "a copy")
+    shutil.copytree(run.path, copy.path)
+    assert copy.command() is None
+
+
+def test_settings_that_cannot_be_read_are_to_be_mended(run):
+    run.config_file.write_text(run.config_file.read_text().replace("iterations: ", "iterations: many #", 1))
+    assert standing_of(run).next_command() == f"mend {run.config_file}"

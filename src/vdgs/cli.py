@@ -13,10 +13,12 @@ usage: vdgs VERB [options]
 vdgs turns a folder of drone photographs into one 3D Gaussian splatting scene.
 
   inspect CAPTURE --output FOLDER   what a capture holds and how well it covers the place
-  run CAPTURE --output RUN          everything: model, blocks, merge, metrics, report; the same command continues
+  run CAPTURE --output RUN          everything: model, blocks, merge, metrics, report; the same command continues.
+                                    CAPTURE may be a folder of photographs alone: `sfm` then comes first
   status RUN                        how far a run is, stage by stage, and what to type next
 
 its stages, one by one:
+  sfm PHOTOGRAPHS --output CAPTURE  photographs to a capture: poses, points, metres and north; the same command goes on
   coarse CAPTURE --output RUN       train the global model; the same command continues it
   visibility RUN                    how many cameras see each part of the scene
   partition RUN                     cut the scene into blocks and give each its cameras
@@ -35,15 +37,15 @@ more:
   doctor                            what this machine can use, and what to install for the rest
 
 vdgs VERB --help explains the options of a verb. A capture is a folder with images/ and sparse/0 (COLMAP),
-transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of MatrixCity.
+transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of MatrixCity; `sfm` makes one of photographs.
 """
 
 VERBS = (
-    "inspect", "run", "status", "coarse", "visibility", "partition", "train", "merge", "eval", "report", "view",
-    "render", "map", "export", "synth", "bench", "doctor",
+    "inspect", "run", "sfm", "status", "coarse", "visibility", "partition", "train", "merge", "eval", "report",
+    "view", "render", "map", "export", "synth", "bench", "doctor",
 )  # fmt: skip
 #: Verbs that take up what they left when they were interrupted.
-CONTINUES = ("run", "coarse", "train", "bench")
+CONTINUES = ("run", "sfm", "coarse", "train", "bench")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,15 +10,20 @@ from rich.console import Console
 from rich.markup import escape
 
 from vdgs.captures.capture import Capture
-from vdgs.errors import RunError
+from vdgs.errors import RunError, VdgsError
 from vdgs.evaluation.lpips import refuse_missing
 from vdgs.evaluation.of_run import evaluation_folder
+from vdgs.maps.mapping import can_map, is_mapped, map_run
 from vdgs.report import write_report
 from vdgs.report.terminal import next_step, whole_standing
 from vdgs.runs.beginning import begin_run
 from vdgs.runs.folder import RunFolder
+from vdgs.settings.checks import validate
 from vdgs.settings.ranges import refuse
-from vdgs.settings.requests import RunRequest
+from vdgs.settings.requests import MapRequest, RunRequest
+from vdgs.sfm.collection import only_photographs
+from vdgs.sfm.reconstruct import reconstruct
+from vdgs.sfm.request import sfm_request
 from vdgs.stages.coarse import train_coarse
 from vdgs.stages.evaluate import evaluate_stage, is_measured
 from vdgs.stages.merge import merge_run
@@ -37,12 +43,28 @@ def run_all(asked: RunRequest, console: Console, command: str | None = None) -> 
     """
     refuse(asked)
     refuse_missing(asked.lpips_weights)
+    asked = with_capture(asked, console)
     run, capture = begin_run(
         asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo, command=command
     )
     with run.driven():
         _stages(run, capture, asked, console)
     console.print(escape(f"next: {next_step(whole_standing(run))}"), highlight=False)
+
+
+def with_capture(asked: RunRequest, console: Console) -> RunRequest:
+    """The request about a capture: where it is about photographs alone, they become one in RUN/capture first.
+
+    Raises what `reconstruct` raises, and VdgsError for settings that do not work, before the long work.
+    """
+    if not only_photographs(asked.capture):
+        return asked
+    if problems := validate(asked.method()):
+        raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
+    _title(console, "photographs")
+    request = sfm_request(asked)
+    reconstruct(request, console)
+    return replace(asked, capture=request.output, options=replace(asked.options, gps=None))
 
 
 def _stages(run: RunFolder, capture: Capture, asked: RunRequest, console: Console) -> None:
@@ -64,8 +86,24 @@ def _stages(run: RunFolder, capture: Capture, asked: RunRequest, console: Consol
     merge_run(run.path, asked.incomplete, console)
     _measure(run, "merged", asked, console)
     _verdict(run, console)
+    if asked.maps:
+        _map(run, asked, console)
     stop_if_asked()
     console.print(f"report: {write_report(run)}", highlight=False)
+
+
+def _map(run: RunFolder, asked: RunRequest, console: Console) -> None:
+    """Orthophoto, surface model and visibility. What hinders a map does not spoil a run: it is said."""
+    _title(console, "maps")
+    if not can_map():
+        console.print("[yellow]note[/] no maps: they need pip install 'vdgs\\[geo]'", highlight=False)
+    elif is_mapped(run):
+        console.print(f"{run.path / 'maps'}: already drawn; nothing to do", highlight=False)
+    else:
+        try:
+            map_run(MapRequest(run.path, device=asked.device), console)
+        except VdgsError as error:
+            console.print(f"[yellow]note[/] no maps: {escape(str(error))}", highlight=False)
 
 
 def _title(console: Console, name: str) -> None:

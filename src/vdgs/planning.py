@@ -16,6 +16,7 @@ from vdgs.captures.capture import Capture
 from vdgs.captures.facts import refuse_another_capture
 from vdgs.captures.images import ImageCache
 from vdgs.captures.loading import load_capture
+from vdgs.captures.reconstruction import read_reconstruction
 from vdgs.errors import VdgsError
 from vdgs.executors.blocks import default_jobs
 from vdgs.kernels import threads as threads_available
@@ -29,6 +30,9 @@ from vdgs.settings.checks import validate
 from vdgs.settings.method import MethodConfig, TrainConfig, block_limit, block_training, with_iterations
 from vdgs.settings.ranges import refuse
 from vdgs.settings.requests import RunRequest
+from vdgs.sfm.collection import only_photographs
+from vdgs.sfm.preparing import prepare, tell
+from vdgs.sfm.request import sfm_request
 from vdgs.stages.coarse import open_stage, start
 from vdgs.storage.files import read_json
 from vdgs.training import TrainingState, train
@@ -56,14 +60,19 @@ class Plan:
     blocks_seconds: tuple[float, float]
 
 
-def plan_run(asked: RunRequest, console: Console) -> Plan:
-    """Say what `vdgs run` would do and take. Raises what reading the capture raises, VdgsError for bad settings."""
+def plan_run(asked: RunRequest, console: Console) -> Plan | None:
+    """Say what `vdgs run` would do and take; None of photographs alone, whose training nobody knows.
+
+    Raises what reading the capture raises, VdgsError for bad settings.
+    """
     refuse(asked)
     method = asked.method()
     if problems := validate(method):
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
     if asked.options.undistort:
         raise VdgsError("--dry-run writes nothing, and --undistort writes photographs: leave one of the two out.")
+    if only_photographs(asked.capture):
+        return _plan_photographs(asked, console)
     capture = load_capture(asked.capture, asked.options)
     for warning in capture.warnings:
         console.print(f"[yellow]note[/] {warning}", highlight=False)
@@ -72,6 +81,21 @@ def plan_run(asked: RunRequest, console: Console) -> Plan:
     plan = _plan(capture, method, asked)
     _say(plan, method, standing, console)
     return plan
+
+
+def _plan_photographs(asked: RunRequest, console: Console) -> Plan | None:
+    """The look at photographs; training can be estimated once they are a capture, which a run makes first."""
+    request = sfm_request(asked)
+    finished = read_reconstruction(request.output)
+    if finished is not None:
+        return plan_run(replace(asked, capture=request.output, options=replace(asked.options, gps=None)), console)
+    tell(prepare(request), console)
+    console.print(
+        f"Training can be estimated once they are a capture: vdgs sfm {asked.capture} --output CAPTURE, then the same "
+        "with CAPTURE. Nothing was written.",
+        highlight=False,
+    )
+    return None
 
 
 def _standing(asked: RunRequest, capture: Capture, method: MethodConfig, console: Console) -> RunStanding | None:

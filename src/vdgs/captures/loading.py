@@ -19,6 +19,7 @@ from vdgs.captures.matching import FoundView, find_photographs
 from vdgs.captures.outputs import refuse_among_files
 from vdgs.captures.photographs import LEAST_SIDE_PX
 from vdgs.captures.precision import rounding_of
+from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.captures.sightings import Sightings
 from vdgs.captures.splits import choose_splits, nearest_to_middle
 from vdgs.captures.undistortion import ImageFile, undistort
@@ -90,10 +91,15 @@ def _read(root: Path, options: CaptureOptions) -> SourceCapture:
         return _read_colmap(root, models, options)
     if (root / "transforms.json").is_file():
         return read_transforms(root, options)
+    if is_reconstruction(root):
+        raise CaptureError(
+            f"{root}: is not finished: vdgs sfm was stopped. The command that began it goes on "
+            f"with it (its photographs, --output {root})."
+        )
     raise CaptureError(
         f"{root}: not a capture. {partial_model(root)}Looked for a COLMAP model (sparse/0/cameras.bin and "
         "images.bin, or .txt), transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json "
-        "(MatrixCity). For photographs alone, run COLMAP first (for example: colmap automatic_reconstructor)."
+        f"(MatrixCity). Photographs alone become one first: vdgs sfm {root} --output CAPTURE"
     )
 
 

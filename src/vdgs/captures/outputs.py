@@ -28,7 +28,7 @@ def refuse_in_a_capture(output: Path) -> None:
     real = Path(os.path.realpath(output))
     for folder in (real, *real.parents):
         parent = folder.parent
-        if _USUAL.fullmatch(folder.name) and _is_capture(parent):
+        if _USUAL.fullmatch(folder.name) and is_capture(parent):
             raise _error(output, folder, parent)
         if folder.name in _MEGA_NERF and is_mega_nerf(parent.parent):
             raise _error(output, folder, parent.parent)
@@ -89,7 +89,8 @@ def _identity(folder: Path) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
-def _is_capture(root: Path) -> bool:
+def is_capture(root: Path) -> bool:
+    """Whether a folder is a capture, of any format that is read: photographs whose cameras are known."""
     try:
         known = (root / "transforms.json").is_file() or is_mega_nerf(root) or pose_files(root) or find_models(root)
     except OSError:

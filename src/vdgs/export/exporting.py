@@ -87,10 +87,10 @@ def export_run(asked: ExportRequest, console: Console) -> dict[str, Any]:
         with _baked(seen, kept, asked.sh_degree, asked.to[0].parent, bar) as baked:
             seconds = time.monotonic() - began
             files = [_write(path, frames[path], baked, console) for path in asked.to]
-            loss = _loss(run, frames, baked, asked, bar, console)
+            losses = _losses(run, frames, baked, asked, bar, console)
     record = jsonable({
         "model": run.name, "key": run.key, "gaussians": len(kept), "sh_degree": asked.sh_degree,
-        "seconds_to_bake": seconds, "files": files, "loss": loss,
+        "seconds_to_bake": seconds, "files": files, "losses": losses,
     })  # fmt: skip
     write_json(run.folder.path / RECORD, record)
     return record
@@ -204,25 +204,28 @@ def _size(path: Path) -> int:
     return path.stat().st_size
 
 
-def _loss(
+def _losses(
     run: TrainedRun, frames: dict[Path, Frame], baked: _Baked, asked: ExportRequest, bar: Progress, console: Console
-) -> dict[str, Any] | None:
-    """What the first file that can be read back loses, or, where none can, the Gaussians that were written."""
+) -> list[dict[str, Any]]:
+    """What each file that can be read back loses, or, where none can, the Gaussians that were written."""
     if not asked.measure:
-        return None
-    readable = next((path for path in asked.to if registry.format_of(path).read), None)
-    gaussians = baked.whole() if readable is None else frames[readable].to_ground(registry.read(readable))
-    task = bar.add_task("comparing with the model", total=len(run.capture.test_views))
+        return []
+    readable = [path for path in asked.to if registry.format_of(path).read]
+    task = bar.add_task("comparing with the model", total=max(1, len(readable)) * len(run.capture.test_views))
 
     def after_view() -> None:
         stop_if_asked()
         bar.advance(task)
 
-    loss = loss_of(run, gaussians, after_view)
-    what = "as baked" if readable is None else f"{readable.name}, read back"
-    console.print(
-        f"{what}, on {loss.views} {loss.of} views: PSNR {loss.psnr:.2f} → {loss.psnr_baked:.2f} dB "
-        f"({loss.psnr_baked - loss.psnr:+.2f}), SSIM {loss.ssim:.3f} → {loss.ssim_baked:.3f}",
-        highlight=False,
-    )
-    return {"file": str(readable) if readable else None, **asdict(loss)}
+    losses = []
+    for path in readable or [None]:
+        gaussians = baked.whole() if path is None else frames[path].to_ground(registry.read(path))
+        loss = loss_of(run, gaussians, after_view)
+        what = "as baked" if path is None else f"{path.name}, read back"
+        console.print(
+            f"{what}, on {loss.views} {loss.of} views: PSNR {loss.psnr:.2f} → {loss.psnr_baked:.2f} dB "
+            f"({loss.psnr_baked - loss.psnr:+.2f}), SSIM {loss.ssim:.3f} → {loss.ssim_baked:.3f}",
+            highlight=False,
+        )
+        losses.append({"file": None if path is None else str(path.resolve()), **asdict(loss)})
+    return losses

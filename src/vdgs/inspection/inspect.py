@@ -16,6 +16,7 @@ from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
 from vdgs.captures.checks import CheckedImages
 from vdgs.captures.outputs import refuse_among_inputs
+from vdgs.captures.reconstruction import ReconstructionFacts, facts_rows, left_out_lines
 from vdgs.figures.sampling import sample_points
 from vdgs.inspection.figures import draw_map, draw_visibility
 from vdgs.inspection.measure import CaptureReport, length, measure
@@ -54,19 +55,28 @@ def _visibility(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     return visibility_of(torch.from_numpy(np.ascontiguousarray(points)), cameras).numpy().astype(np.int64)
 
 
-def print_report(report: CaptureReport, console: Console | None = None) -> None:
-    """The report as a table for people."""
+def print_report(
+    report: CaptureReport, console: Console | None = None, reconstruction: ReconstructionFacts | None = None
+) -> None:
+    """The report as a table for people, with how the capture was made of photographs, where it was made here."""
     console = console or Console()
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column()
     for label, value in _rows(report):
         table.add_row(label, escape(value))
+    for label, value in facts_rows(reconstruction) if reconstruction is not None else ():
+        table.add_row(label, escape(value))
     console.print(table)
     for warning in report.warnings:
         console.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False)
     for problem in report.problems:
         console.print(f"[red]Problem:[/] {escape(problem)}", highlight=False)
+    if reconstruction is not None:
+        for line in left_out_lines(reconstruction):
+            console.print(f"[yellow]Left out:[/] {escape(line)}", highlight=False)
+        for line in reconstruction.advice:
+            console.print(f"Next flight: {escape(line)}", highlight=False)
 
 
 def _rows(report: CaptureReport) -> list[tuple[str, str]]:

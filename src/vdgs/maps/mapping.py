@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,10 @@ from vdgs.maps.pictures import Sheet, hillshade_png, preview_png
 from vdgs.maps.sharpening import Sharpener
 from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Surveyor, Tile, samples_for
 from vdgs.placing.placement import Placement
+from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.settings.requests import MapRequest
-from vdgs.storage.files import jsonable, write_json
+from vdgs.storage.files import jsonable, read_record, write_json
 
 ORTHOPHOTO, DSM, VISIBILITY = "orthophoto.tif", "dsm.tif", "visibility.tif"
 HILLSHADE, PREVIEW, FACTS = "hillshade.png", "preview.png", "map.json"
@@ -78,6 +80,17 @@ def map_run(asked: MapRequest, console: Console) -> Path:
         highlight=False,
     )
     return folder
+
+
+def is_mapped(run: RunFolder) -> bool:
+    """Whether RUN/maps shows the merged model that is there."""
+    drawn = read_record(run.path / "maps" / FACTS).get("model_identity")
+    return drawn is not None and drawn == run.merged.status().model
+
+
+def can_map() -> bool:
+    """Whether what `vdgs map` needs is installed."""
+    return all(find_spec(name) is not None for name in ("rasterio", "pyproj"))
 
 
 def layers_of(placement: Placement) -> tuple[Layer, Layer, Layer]:
@@ -151,7 +164,8 @@ def _facts(run: TrainedRun, grid: Grid, placement: Placement, surveyor: Surveyor
     from vdgs import __version__
 
     return {
-        "software": f"vdgs {__version__}", "model": run.name, "crs": placement.crs, "crs_name": placement.name,
+        "software": f"vdgs {__version__}", "model": run.name, "model_identity": run.status.model,
+        "crs": placement.crs, "crs_name": placement.name,
         "unit": placement.unit, "heights": placement.heights, "georeference": run.capture.ground.how,
         "gsd": grid.gsd, "width": grid.width, "height": grid.height, "bounds": list(grid.bounds),
         "samples_per_pixel": surveyor.samples**2, "sharpened": surveyor.sharpener is not None,

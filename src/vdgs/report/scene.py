@@ -148,3 +148,27 @@ def _total(rows: list[Record], key: str) -> str:
     values = [row.number(key) for row in rows]
     known = [value for value in values if value is not None]
     return count(sum(known)) if len(known) == len(values) else ABSENT
+
+
+def maps_section(shown: Shown) -> Html:
+    """The sheet of `vdgs map`, of the merged model that is there."""
+    source = shown.source()
+    facts = source.record("maps/map.json")
+    parts: list[Html] = []
+    if not facts:
+        parts.append(paragraph("No maps were made of this run. `vdgs map RUN` makes them."))
+    elif facts.text("model_identity") != shown.run.merged.status().model:
+        parts.append(
+            paragraph("The maps are of another model than the run has now; `vdgs map RUN` draws them anew.", "note")
+        )
+    else:
+        gsd, unit = facts.number("gsd"), facts.text("unit")
+        parts.append(
+            paragraph(
+                f"Orthophoto, surface model and visibility in {facts.text('crs_name')}"
+                + (f", pixels of {gsd:.3g} {unit}" if gsd else "")
+                + ": GeoTIFFs in maps/. Blank is what is not solid, or what no training photograph shows."
+            )
+        )
+        parts.append(figure(source.picture("maps/preview.png"), "The scene as maps.", "maps of the scene", True))
+    return section("maps", "Maps", parts, source.notes)

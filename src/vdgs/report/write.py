@@ -11,9 +11,10 @@ import yaml
 from vdgs.errors import RunError
 from vdgs.report.costs import costs_section, settings_section
 from vdgs.report.page import Html, contents, document, escaped, joined, paragraph
+from vdgs.report.photographs import photographs_section
 from vdgs.report.reading import Record, Shown, Source
 from vdgs.report.results import by_visibility_section, metrics_of, result_table, seams_section, verdict, views_section
-from vdgs.report.scene import assignment_section, blocks_section, visibility_section
+from vdgs.report.scene import assignment_section, blocks_section, maps_section, visibility_section
 from vdgs.report.training import training_section
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.standing import RunStanding, Standing, standing_of
@@ -22,7 +23,7 @@ from vdgs.storage.files import write_text
 #: name and title of the sections, for the links at the top
 CONTENTS = (
     ("visibility", "visibility"), ("blocks", "blocks"), ("cameras", "cameras"), ("training", "training"),
-    ("views", "test views"), ("by-visibility", "quality by visibility"), ("seams", "per block"),
+    ("views", "test views"), ("maps", "maps"), ("by-visibility", "quality by visibility"), ("seams", "per block"),
     ("costs", "time and memory"), ("settings", "settings"),
 )  # fmt: skip
 
@@ -40,20 +41,24 @@ def write_report(run: RunFolder) -> Path:
     if not run.path.is_dir():
         raise RunError(f"{run.path}: is not a run folder. Train first: vdgs run CAPTURE --output RUN")
     shown = Shown(run, standing_of(run))
+    photographs = photographs_section(shown)
     sections = [
+        *([photographs] if photographs else []),
         visibility_section(shown),
         blocks_section(shown),
         assignment_section(shown),
         training_section(shown),
         views_section(shown),
+        maps_section(shown),
         by_visibility_section(shown),
         seams_section(shown),
         costs_section(shown),
         settings_section(shown),
     ]
+    links = [*([("photographs", "photographs")] if photographs else []), *CONTENTS]
     header, title = _header(shown)
     path = run.path / FILE
-    write_text(path, document(title, [header, contents(CONTENTS), *sections], {STANDING: shown.standing.digest}))
+    write_text(path, document(title, [header, contents(links), *sections], {STANDING: shown.standing.digest}))
     return path
 
 

@@ -10,6 +10,8 @@ from vdgs.captures.capture import Capture
 from vdgs.captures.facts import refuse_another_capture
 from vdgs.captures.loading import load_capture
 from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
+from vdgs.captures.reconstruction import FIGURE as RECONSTRUCTION_FIGURE
+from vdgs.captures.reconstruction import FILE as RECONSTRUCTION
 from vdgs.errors import VdgsError
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.keys import counted
@@ -17,7 +19,7 @@ from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.checks import validate
 from vdgs.settings.method import MethodConfig, with_iterations
 from vdgs.settings.plain import to_dict
-from vdgs.storage.files import read_json
+from vdgs.storage.files import read_json, write_bytes
 
 
 def begin_run(
@@ -56,6 +58,7 @@ def begin_run(
             run.change_settings(settings, redo, command)
             if read_anew:  # nothing is left that was made of it; what the coarse stage writes takes its place
                 run.capture_file.unlink(missing_ok=True)
+        _keep_reconstruction(capture.root, run.path)
     return run, capture
 
 
@@ -63,6 +66,15 @@ def reads_otherwise(run: RunFolder, settings: dict[str, Any]) -> bool:
     """Whether the run reads its capture with other options: it is their change then that has to be spoken of."""
     before, now = (counted("capture", each["capture"]) for each in (run.settings(), settings))
     return before != now
+
+
+def _keep_reconstruction(root: Path, run: Path) -> None:
+    """How the capture was made of photographs, where it was made here: for the report, which reads the run alone."""
+    for name in (RECONSTRUCTION, RECONSTRUCTION_FIGURE):
+        if (root / name).is_file():
+            content = (root / name).read_bytes()
+            if not (run / name).is_file() or (run / name).read_bytes() != content:
+                write_bytes(run / name, content)
 
 
 def run_settings(capture_path: Path, capture_options: CaptureOptions, method: MethodConfig) -> dict[str, Any]:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from vdgs import __version__
+from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.errors import RunError, VdgsError
 from vdgs.partition.records import PartitionRecord
 from vdgs.runs.keys import StageKeys, stage_keys
@@ -153,6 +156,11 @@ class RunFolder:
     path: Path
 
     @property
+    def own_capture(self) -> Path:
+        """The capture that a run of photographs alone makes of them."""
+        return self.path / "capture"
+
+    @property
     def config_file(self) -> Path:
         return self.path / "config.yaml"
 
@@ -223,10 +231,18 @@ class RunFolder:
                     + "\nGive the old settings to continue it, or another --output to start a new run."
                 )
             return
+        self.refuse_strangers()
+        self._write(settings, command)
+
+    def refuse_strangers(self) -> None:
+        """Raise RunError where a new run would be begun among other files."""
+        if self.config_file.exists():
+            return
+        known = {".lock", *([self.own_capture.name] if is_reconstruction(self.own_capture) else [])}
         if self.path.exists() and not self.path.is_dir():
             raise RunError(f"{self.path}: is a file. Choose a folder for --output.")
         strangers = (
-            [p.name for p in self.path.iterdir() if p.name != ".lock" and p.suffix != ".tmp"]
+            [p.name for p in self.path.iterdir() if p.name not in known and p.suffix != ".tmp"]
             if self.path.exists()
             else []
         )
@@ -235,7 +251,6 @@ class RunFolder:
                 f"{self.path}: holds other files ({', '.join(sorted(strangers)[:3])}) and no config.yaml. "
                 "Choose an empty or a new folder for --output."
             )
-        self._write(settings, command)
 
     def change_settings(self, settings: dict[str, Any], redo: bool, command: str | None = None) -> list[str]:
         """Give a run other settings; returns what changed, one line each. `command` as in `begin`.
@@ -281,13 +296,14 @@ class RunFolder:
         write_text(self.config_file, yaml.safe_dump(header | settings, sort_keys=False, allow_unicode=True))
 
     def command(self) -> str | None:
-        """The command that gave the run the settings that it has; None where several did, or nothing says it."""
+        """The command that gave the run the settings that it has; None where several did, nothing says it, or the
+        folder is a copy of the one that the command works on."""
         try:
             header = yaml.safe_load(self.config_file.read_text(encoding="utf-8-sig"))["vdgs"]
         except (OSError, yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError):
             return None
         command = header.get("command") if isinstance(header, dict) else None
-        return command if isinstance(command, str) else None
+        return command if isinstance(command, str) and not _makes_another(command, self.path) else None
 
     def settings(self) -> dict[str, Any]:
         """The settings of the run, every section whole, without the header that says which version wrote them."""
@@ -358,6 +374,17 @@ class RunFolder:
     @property
     def _driver(self) -> Path:
         return self.path / ".run"
+
+
+def _makes_another(command: str, folder: Path) -> bool:
+    """Whether a command names the whole path of another folder as its output: this one is a copy."""
+    try:
+        words = shlex.split(command)
+    except ValueError:
+        return True
+    outputs = [after for word, after in pairwise(words) if word == "--output"]
+    outputs += [word.removeprefix("--output=") for word in words if word.startswith("--output=")]
+    return any(os.path.isabs(each) and os.path.realpath(each) != os.path.realpath(folder) for each in outputs)
 
 
 def _commit() -> str | None:

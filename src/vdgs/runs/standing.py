@@ -94,6 +94,8 @@ class RunStanding:
         if self.at_work:
             return ""
         for stage in self.stages:
+            if stage.state == "unknown":
+                return f"mend {shlex.quote(str(self.path / 'config.yaml'))}"
             if stage.state != "done":
                 if self._continues and not stage.remedy:
                     return self.command or ""

@@ -10,6 +10,7 @@ from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.settings.presets import PresetName
 from vdgs.settings.ranges import LARGE, MANY, WORKERS, Named, Range
+from vdgs.settings.sfm import SfmOptions
 from vdgs.settings.watching import WatchOptions
 
 #: Groups by visibility: with more than some dozens none holds enough pixels to say anything.
@@ -33,7 +34,7 @@ class RunRequest:
     """Everything from a capture to a report (`vdgs run`)."""
 
     capture: Path
-    """Folder of the capture."""
+    """Folder of the capture, or of photographs alone: they become one in RUN/capture first (`vdgs sfm`)."""
     output: Path
     """Run folder; new, or the run to continue."""
     preset: PresetName = "paper"
@@ -44,6 +45,8 @@ class RunRequest:
     """Blocks trained at once; 0 takes what cores and memory allow."""
     incomplete: bool = False
     """Go on if a block fails: the coarse model stands in for it."""
+    maps: bool = True
+    """End with orthophoto, surface model and visibility as GeoTIFFs in RUN/maps, where `vdgs map` can make them."""
     lpips_weights: Path | None = None
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     bins: Annotated[int, BINS] = 4
@@ -53,6 +56,7 @@ class RunRequest:
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
     options: Annotated[CaptureOptions, Named("")] = field(default_factory=CaptureOptions)
+    sfm: SfmOptions = field(default_factory=SfmOptions)
     training: Annotated[TrainConfig, Named("")] = field(default_factory=TrainConfig)
     partition: Annotated[PartitionConfig, Named("")] = field(default_factory=PartitionConfig)
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)

@@ -12,6 +12,7 @@ from vdgs.verbs.captures import inspect, synth
 from vdgs.verbs.exporting import export
 from vdgs.verbs.machine import doctor
 from vdgs.verbs.mapping import map
+from vdgs.verbs.photographs import sfm
 from vdgs.verbs.results import eval, render, report, status
 from vdgs.verbs.stages import merge, partition, train, visibility
 from vdgs.verbs.starting import coarse, run
@@ -19,7 +20,7 @@ from vdgs.verbs.viewing import view
 
 __all__ = [
     "bench", "coarse", "doctor", "eval", "export", "inspect", "map", "merge", "partition", "render", "report", "run",
-    "status", "synth", "train", "view", "visibility",
+    "sfm", "status", "synth", "train", "view", "visibility",
 ]  # fmt: skip
 
 # torch's OpenMP threads must block, not spin, beside the kernels' own pool; read once, when torch is imported.

@@ -32,6 +32,7 @@ def inspect(arguments: list[str]) -> None:
     from vdgs.captures.checks import check_images
     from vdgs.captures.loading import load_capture
     from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
+    from vdgs.captures.reconstruction import read_reconstruction
     from vdgs.errors import CaptureError
     from vdgs.inspection.inspect import inspect_capture, print_report
 
@@ -40,7 +41,7 @@ def inspect(arguments: list[str]) -> None:
     refuse_among_inputs(asked.output, capture)
     checked = check_images(capture) if asked.check else None
     report = inspect_capture(capture, asked.output, checked)
-    print_report(report)
+    print_report(report, reconstruction=read_reconstruction(capture.root))
     if report.problems:
         raise CaptureError(f"{capture.root}: cannot become a scene; see the problems above.")
 

@@ -70,7 +70,7 @@ class RunArguments(RunRequest):
     """
 
     capture: Positional[Path]
-    """Folder of the capture."""
+    """Folder of the capture, or of photographs alone: they become one in RUN/capture first (`vdgs sfm`)."""
     dry_run: bool = False
     """Only say what it would take: blocks, memory, time, by estimate and a few steps that are timed. Writes nothing."""
     quiet: bool = False

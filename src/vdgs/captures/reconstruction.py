@@ -1,0 +1,132 @@
+"""How a capture was made of photographs: `reconstruction.json`, which `vdgs sfm` writes and others show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from vdgs.errors import CaptureError
+from vdgs.storage.files import read_json
+from vdgs.storage.records import record_of
+
+FILE, FIGURE = "reconstruction.json", "reconstruction.png"
+#: The folder of one that is not finished, or whose intermediate files are kept.
+WORK = "work"
+#: What says in it, and in the capture, which steps are done.
+STEPS = "steps.json"
+
+
+@dataclass(frozen=True)
+class CameraFacts:
+    """One camera before and after; the focal length in pixels of its longer side's size."""
+
+    name: str
+    photographs: int
+    width: int
+    height: int
+    focal_before_px: float
+    focal_source: str
+    focal_after_px: float
+    radial_distortion: float
+
+
+@dataclass(frozen=True)
+class PhotographFacts:
+    """One photograph: placed minus recorded position in metres, where both are known; or why it is left out."""
+
+    name: str
+    residual_m: tuple[float, ...] | None = None
+    left_out: str | None = None
+
+
+@dataclass(frozen=True)
+class ReconstructionFacts:
+    """What a person should know about a reconstruction."""
+
+    found: int
+    registered: int
+    components: tuple[int, ...]
+    """Photographs of each part that holds together; the first is used."""
+    pairs: int
+    points: int
+    track_length: float
+    """Photographs that see a point, mean."""
+    reprojection_px: float
+    georeferenced: str
+    """How the model was brought to metres, or why it could not."""
+    altitude_reference: str
+    origin: tuple[float, ...] | None
+    residual_rms_m: tuple[float, ...] | None
+    """East, north, up."""
+    positions_left_out: int
+    focal_held: bool
+    focal_reason: str
+    height_m: float | None
+    """Median height of the cameras over the median point."""
+    recorded_height_m: float | None
+    tilt_deg: float | None
+    """Median angle of the views to straight down."""
+    attitude_difference_deg: float | None
+    """Median angle between down as the model has it and as the drone recorded it."""
+    cameras: tuple[CameraFacts, ...]
+    photographs: tuple[PhotographFacts, ...]
+    warnings: tuple[str, ...]
+    advice: tuple[str, ...]
+    seconds: float
+    """Of the last part of the work, where it was interrupted."""
+
+
+def is_reconstruction(root: Path) -> bool:
+    """Whether a folder is a capture made of photographs here, finished or not."""
+    return (root / FILE).is_file() or (root / WORK / STEPS).is_file()
+
+
+def read_reconstruction(root: Path) -> ReconstructionFacts | None:
+    """The facts of a capture that was made of photographs here; None for others. CaptureError if they are damaged."""
+    file = root / FILE
+    if not file.is_file():
+        return None
+    try:
+        return record_of(ReconstructionFacts, read_json(file))
+    except ValueError as error:
+        raise CaptureError(f"{file}: is damaged ({error}). Remove it to do without.") from error
+
+
+def facts_rows(facts: ReconstructionFacts) -> list[tuple[str, str]]:
+    """The facts as pairs of what and how much, for tables."""
+    parts = f" (parts that do not hold together: {', '.join(map(str, facts.components))})"
+    rows = [
+        ("Photographs placed", f"{facts.registered} of {facts.found}" + (parts if len(facts.components) > 1 else "")),
+        (
+            "Reconstruction",
+            f"{facts.points:,} points, seen by {facts.track_length:.1f} photographs each; reprojection error "
+            f"{facts.reprojection_px:.2f} px",
+        ),
+        ("Georeference", facts.georeferenced),
+    ]
+    if facts.residual_rms_m is not None:
+        east, north, up = facts.residual_rms_m
+        left_out = f"; {facts.positions_left_out} positions not trusted" if facts.positions_left_out else ""
+        rows.append(("Position residuals", f"RMS {east:.2f} m east, {north:.2f} m north, {up:.2f} m up{left_out}"))
+    held = "held" if facts.focal_held else "fitted"
+    for camera in facts.cameras:
+        rows.append(
+            (
+                "Lens",
+                f"{camera.name}: focal length {camera.focal_before_px:.0f} px by {camera.focal_source}, "
+                f"{camera.focal_after_px:.0f} px now ({held}: {facts.focal_reason}), k {camera.radial_distortion:+.4f}",
+            )
+        )
+    if facts.height_m is not None:
+        recorded = f", {facts.recorded_height_m:.1f} m recorded" if facts.recorded_height_m is not None else ""
+        rows.append(("Flying height", f"{facts.height_m:.1f} m over the median point{recorded}"))
+    if facts.tilt_deg is not None:
+        against = facts.attitude_difference_deg
+        recorded = f"; {against:.1f}° from the recorded attitudes" if against is not None else ""
+        rows.append(("Tilt of the views", f"{facts.tilt_deg:.1f}° (median){recorded}"))
+    return rows
+
+
+def left_out_lines(facts: ReconstructionFacts) -> list[str]:
+    """Photographs that are not used, each with the reason."""
+    return [f"{photo.name}: {photo.left_out}" for photo in facts.photographs if photo.left_out is not None]

@@ -1,0 +1,43 @@
+"""What a person may say about how photographs become a capture. Imports nothing heavy: the command line shows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from vdgs.settings.ranges import MANY, WORKERS, Range
+
+
+@dataclass(frozen=True)
+class SfmOptions:
+    """How photographs become a capture (structure from motion)."""
+
+    focal: Literal["auto", "hold", "refine"] = "auto"
+    """The focal length. hold: that of EXIF and XMP; refine: fitted; auto: fitted where the flight can tell it from the
+    height (oblique views, or several heights), or where nothing says what it is; held otherwise."""
+    neighbours: Annotated[int, Range(2, 1000)] = 16
+    """Each photograph is matched with so many that were taken near it, where positions are known."""
+    exhaustive: Annotated[int, Range(0, MANY)] = 50
+    """Without positions: up to so many photographs, all are matched with all; beyond it those next to each other in
+    order, and those that look alike."""
+    feature_size: Annotated[int, Range(200, 100_000)] = 2000
+    """Photographs are shrunk to this many pixels of their longer side to find features."""
+    features: Annotated[int, Range(200, 1_000_000)] = 8192
+    """Features of a photograph, at most about so many."""
+    max_size: Annotated[int, Range(16, 1_000_000, or_zero=True)] = 0
+    """Longer side of the photographs that are written into images/, in pixels; 0: as large as they are."""
+    gps_deviation_m: Annotated[tuple[float, float], Range(0, 100_000, above=True)] = (1.0, 2.0)
+    """Standard deviation of GPS positions across and upwards, in metres, where the photographs say none themselves."""
+
+
+@dataclass(frozen=True)
+class SfmRequest:
+    """Photographs to a capture (`vdgs sfm`)."""
+
+    photographs: tuple[Path, ...]
+    output: Path
+    gps: Path | None = None
+    threads: Annotated[int, WORKERS] = 0
+    keep_work: bool = False
+    options: SfmOptions = field(default_factory=SfmOptions)

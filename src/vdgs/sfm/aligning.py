@@ -1,0 +1,126 @@
+"""A model brought to metres, east, north and up: by positions, and by recorded attitudes where they do not do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+
+from vdgs.captures.alignment import Similarity, fit_similarity_robust, is_collinear
+from vdgs.captures.ground import estimate_up, rotation_to_z
+from vdgs.sfm.photograph import Photograph
+from vdgs.sfm.positions import LEAST_POSITIONS, Positions
+
+#: Attitudes that agree on which way a world lies, at least.
+LEAST_ATTITUDES = 3
+#: Positions fix a turn about a line if they spread across it this many times their standard deviation.
+WRONG_TIMES = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """How a model was brought to its place on Earth."""
+
+    similarity: Similarity
+    """From the model's own world to metres east, north, up of the positions' origin."""
+    how: str
+    rows: np.ndarray
+    """Which positions have a placed photograph, [m] rows of `Positions`."""
+    residuals: np.ndarray
+    """Of them, placed minus recorded, metres [m, 3]."""
+    inliers: np.ndarray
+    """Which of them the placing trusts, [m] bool."""
+
+
+def place(model: pycolmap.Reconstruction, photographs: Sequence[Photograph], positions: Positions) -> Placed | None:
+    """The similarity that brings the model to its positions; None where they are too few. Does not change the model."""
+    images = {image.name: image for image in model.images.values() if image.has_pose}
+    placed = [row for row, i in enumerate(positions.index) if photographs[int(i)].name in images]
+    if not positions.usable or len(placed) < LEAST_POSITIONS:
+        return None
+    rows = np.array(placed)
+    names = [photographs[int(positions.index[row])].name for row in rows]
+    centres = np.array([images[name].projection_center() for name in names])
+    targets = positions.enu[rows]
+    if not is_collinear(centres) and not is_line(targets, positions.deviations[rows]):
+        similarity, inliers = fit_similarity_robust(centres, targets)
+        how = f"positions of {int(inliers.sum())} photographs ({positions.source})"
+    else:
+        rotation, by = _level(model, images, photographs, centres, targets)
+        similarity, inliers = _scaled(rotation, centres, targets), np.ones(len(rows), bool)
+        how = f"positions of {len(rows)} photographs along one line ({positions.source}), up by {by}"
+    return Placed(similarity, how, rows, similarity.apply(centres) - targets, inliers)
+
+
+def is_line(places: np.ndarray, deviations: np.ndarray) -> bool:
+    """Whether places [n, 3] leave a turn about a line open: they spread across it no more than they may be wrong."""
+    if is_collinear(places):
+        return True
+    spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(places))
+    return bool(spread < WRONG_TIMES * np.sqrt(np.median((deviations**2).mean(axis=1))))
+
+
+def move(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
+    """Bring a model into another world, in place."""
+    rotation = pycolmap.Rotation3d(np.ascontiguousarray(similarity.rotation))
+    model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))
+
+
+def points_of(model: pycolmap.Reconstruction) -> np.ndarray:
+    """Places of all points, [n, 3]."""
+    return np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+
+
+def tilt_against_attitudes(model: pycolmap.Reconstruction, photographs: Sequence[Photograph]) -> float | None:
+    """Median angle in degrees between down as the placed model has it and as the drone recorded it."""
+    gravity = {photo.name: photo.attitude.gravity for photo in photographs if photo.attitude}
+    angles = [
+        np.degrees(np.arccos(np.clip(_rotation(image) @ [0, 0, -1] @ gravity[image.name], -1, 1)))
+        for image in model.images.values()
+        if image.has_pose and image.name in gravity
+    ]
+    return float(np.median(angles)) if angles else None
+
+
+def _rotation(image: pycolmap.Image) -> np.ndarray:
+    return np.asarray(image.cam_from_world().rotation.matrix())
+
+
+def _level(
+    model: pycolmap.Reconstruction,
+    images: Mapping[str, pycolmap.Image],
+    photographs: Sequence[Photograph],
+    centres: np.ndarray,
+    targets: np.ndarray,
+) -> tuple[np.ndarray, str]:
+    """The rotation into east, north, up where positions along a line leave a turn about it open."""
+    found = [
+        photo.attitude.camera_from_enu.T @ _rotation(images[photo.name])
+        for photo in photographs
+        if photo.attitude is not None and photo.name in images
+    ]
+    if len(found) >= LEAST_ATTITUDES:
+        left, _, right = np.linalg.svd(np.sum(found, axis=0))
+        mean = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+        return _along(mean, centres, targets) @ mean, "the recorded attitudes"
+    forwards = np.array([_rotation(image)[2] for image in images.values()])
+    up, _ = estimate_up(centres, forwards, points_of(model), [])
+    level = rotation_to_z(up)
+    return _along(level, centres, targets) @ level, "the views, which look down"
+
+
+def _along(rotation: np.ndarray, centres: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """The turn about up that brings the line of the cameras onto that of the positions."""
+    one, other = (centres - centres.mean(axis=0)) @ rotation.T, targets - targets.mean(axis=0)
+    angle = np.arctan2((one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]).sum(), (one[:, :2] * other[:, :2]).sum())
+    return np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+
+
+def _scaled(rotation: np.ndarray, centres: np.ndarray, targets: np.ndarray) -> Similarity:
+    """Scale and translation by least squares, the rotation as it is."""
+    turned = centres @ rotation.T
+    one, other = turned - turned.mean(axis=0), targets - targets.mean(axis=0)
+    scale = float((one * other).sum() / (one**2).sum())
+    return Similarity(scale, rotation, targets.mean(axis=0) - scale * turned.mean(axis=0))

@@ -1,0 +1,120 @@
+"""Poses and points from matches: COLMAP's incremental mapper, with positions as priors."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+
+import numpy as np
+import pycolmap
+from rich.console import Console
+
+from vdgs.errors import CaptureError
+from vdgs.settings.sfm import SfmOptions
+from vdgs.sfm.features import Kind
+from vdgs.sfm.look import OBLIQUE_DEG
+from vdgs.sfm.photograph import Photograph
+from vdgs.sfm.positions import Positions
+from vdgs.sfm.work import Work, call, progress
+
+#: Oblique views, or heights that differ by so much of the flying height, let a flight tell the focal length (choice).
+OBLIQUE_SHARE, HEIGHTS_DIFFER = 0.15, 0.2
+#: Parts of fewer photographs than this are no model.
+SMALLEST_MODEL = 3
+
+
+def holds_focal(photographs: Sequence[Photograph], options: SfmOptions) -> tuple[bool, str]:
+    """Whether the focal length is held at what EXIF says, and why: over level ground from one height, straight down, a
+    longer lens and a lower flight look the same."""
+    if options.focal != "auto":
+        return options.focal == "hold", "asked for"
+    if any(photo.lens is None for photo in photographs):
+        return False, "nothing says it for some photographs"
+    tilts = [photo.attitude.tilt_deg for photo in photographs if photo.attitude]
+    if tilts and np.mean(np.array(tilts) > OBLIQUE_DEG) >= OBLIQUE_SHARE:
+        return False, f"{np.mean(np.array(tilts) > OBLIQUE_DEG):.0%} oblique views tell it"
+    heights = np.array([photo.above_takeoff for photo in photographs if photo.above_takeoff is not None])
+    if len(heights) >= 3 and np.ptp(np.quantile(heights, [0.05, 0.95])) > HEIGHTS_DIFFER * abs(np.median(heights)):
+        return False, "flown at several heights, which tell it"
+    return True, "one height, straight down as far as known: the flight cannot tell it"
+
+
+def write_priors(work: Work, photographs: Sequence[Photograph], positions: Positions) -> None:
+    """Positions with their covariances and, where the drone says it, which way is down."""
+    row_of = {int(i): row for row, i in enumerate(positions.index)} if positions.usable else {}
+    database = pycolmap.Database.open(work.database)
+    try:
+        database.clear_pose_priors()
+        images = {image.name: image for image in database.read_all_images()}
+        for i, photo in enumerate(photographs):
+            if i not in row_of or photo.name not in images:
+                continue
+            prior = pycolmap.PosePrior(
+                corr_data_id=images[photo.name].data_id,
+                position=positions.enu[row_of[i]],
+                position_covariance=np.diag(positions.deviations[row_of[i]] ** 2),
+                coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+            )
+            if photo.attitude is not None:
+                prior.gravity = photo.attitude.gravity
+            database.write_pose_prior(prior)
+    finally:
+        database.close()
+
+
+def find_models(
+    work: Work, count: int, hold_focal: bool, with_positions: bool, threads: int, console: Console
+) -> list[pycolmap.Reconstruction]:
+    """All models that the mapper makes of the matches, that of most photographs first.
+
+    Raises CaptureError where it makes none.
+    """
+    shutil.rmtree(work.models, ignore_errors=True)
+    work.models.mkdir(parents=True)
+    options = _options(hold_focal, with_positions, threads)
+    placed = 0
+    with progress(console, "mapping, photographs", count) as tell:
+
+        def one_more() -> None:
+            nonlocal placed
+            placed += 1
+            tell(min(placed + 2, count))
+
+        models = call(
+            pycolmap.incremental_mapping, work.database, work.photographs, work.models, options,
+            next_image_callback=one_more,
+        )  # fmt: skip
+        tell(count)
+    if not models:
+        raise CaptureError(
+            "no two photographs could be joined. Either they do not overlap, or they were all taken at one place "
+            "(turning alone shows no depth), or they show nothing to hold on to: water, snow, blurred pictures. Fly "
+            "with 70 to 80 % overlap, the camera moving between photographs."
+        )
+    return _sorted(list(models.values()))
+
+
+def read_models(work: Work) -> list[pycolmap.Reconstruction]:
+    """What `find_models` found before."""
+    return _sorted([pycolmap.Reconstruction(folder) for folder in sorted(work.models.iterdir()) if folder.is_dir()])
+
+
+def _sorted(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    return sorted(models, key=lambda model: -model.num_reg_images())
+
+
+def _options(hold_focal: bool, with_positions: bool, threads: int) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = threads, 0
+    options.min_model_size = SMALLEST_MODEL
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not hold_focal
+    options.use_prior_position = options.use_robust_loss_on_prior_position = with_positions
+    # Points that two photographs see are where the edges of a flight, and few photographs, have any.
+    options.triangulation.ignore_two_view_tracks = False
+    return options
+
+
+def kinds_after(model: pycolmap.Reconstruction, kinds: Sequence[Kind]) -> list[pycolmap.Camera | None]:
+    """The fitted cameras in the order of the kinds of photographs; None for those without a placed photograph."""
+    used = {image.camera_id for image in model.images.values() if image.has_pose}
+    return [model.cameras[k] if k in used and k in model.cameras else None for k in range(1, len(kinds) + 1)]

@@ -1,0 +1,132 @@
+"""Photographs matched: pairs chosen by what is known of them, features compared, pairs verified, in the database."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pycolmap
+from rich.console import Console
+
+from vdgs.settings.sfm import SfmOptions
+from vdgs.sfm import pairs
+from vdgs.sfm.photograph import Photograph
+from vdgs.sfm.positions import Positions
+from vdgs.sfm.work import Work, call, progress
+from vdgs.storage.files import write_text
+
+#: Pairs that one call compares, for each thread.
+AT_ONCE = 12
+#: Descriptors of a photograph that are read to tell how it looks.
+_READ = 2000
+
+
+def expected_pairs(count: int, positions: Positions, options: SfmOptions) -> int:
+    """About how many pairs will be matched."""
+    if not positions.usable:
+        everyone = count * (count - 1) // 2
+        return everyone if count <= options.exhaustive else count * (pairs.NEXT + pairs.DOUBLINGS + pairs.ALIKE // 2)
+    each = 0.7 * options.neighbours + pairs.NEXT_WITH_POSITIONS / 2
+    return round(min(count * (count - 1) / 2, len(positions) * each + (count - len(positions)) * pairs.ALIKE))
+
+
+def choose_pairs(
+    work: Work, photographs: Sequence[Photograph], positions: Positions, options: SfmOptions
+) -> list[tuple[str, str]]:
+    """Names of the pairs to match, sorted."""
+    count = len(photographs)
+    order = sorted(range(count), key=lambda i: (photographs[i].taken, photographs[i].name))
+    if count <= pairs.NEXT or (not positions.usable and count <= options.exhaustive):
+        chosen = pairs.everyone(count)
+    elif not positions.usable:
+        chosen = pairs.in_order(order, pairs.NEXT, pairs.DOUBLINGS)
+        chosen |= pairs.alike(_descriptors(work, photographs), range(count))
+    else:
+        places = positions.rows(count)
+        chosen = pairs.near(places, options.neighbours) | pairs.in_order(order, pairs.NEXT_WITH_POSITIONS)
+        lost = np.flatnonzero(~np.isfinite(places).all(axis=1))
+        if len(lost):
+            chosen |= pairs.alike(_descriptors(work, photographs), lost.tolist())
+            place = {i: k for k, i in enumerate(order)}
+            chosen |= {
+                (min(i, j), max(i, j))
+                for i in lost.tolist()
+                for j in order[max(0, place[i] - pairs.NEXT) : place[i] + pairs.NEXT + 1]
+                if i != j
+            }
+    names = [photo.name for photo in photographs]
+    return [(names[i], names[j]) for i, j in sorted(chosen)]
+
+
+def match(work: Work, chosen: Sequence[tuple[str, str]], threads: int, console: Console) -> None:
+    """Match and verify pairs; those that are in the database already are kept."""
+    done = _matched(work)
+    missing = [pair for pair in chosen if frozenset(pair) not in done]
+    options, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
+    options.num_threads, options.use_gpu = threads, False
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
+    pairing.match_list_path = work.path / "pairs.txt"
+    before = len(chosen) - len(missing)
+    with progress(console, "matching, pairs", len(chosen)) as tell:
+        for start in range(0, len(missing), AT_ONCE * threads):
+            chunk = missing[start : start + AT_ONCE * threads]
+            write_text(work.path / "pairs.txt", "".join(f"{one} {other}\n" for one, other in chunk))
+            call(
+                pycolmap.match_image_pairs, work.database, matching_options=options, pairing_options=pairing,
+                verification_options=verification, device=pycolmap.Device.cpu,
+            )  # fmt: skip
+            tell(before + start + len(chunk))
+
+
+def verified_counts(work: Work, least: int = 15) -> dict[str, int]:
+    """With how many others each photograph was matched for good, by its name."""
+    database = pycolmap.Database.open(work.database)
+    try:
+        counts = {image.image_id: 0 for image in database.read_all_images()}
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        for number, inliers in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
+            if inliers >= least:
+                for image in pycolmap.pair_id_to_image_pair(number):
+                    counts[image] += 1
+        return {names[image]: count for image, count in counts.items()}
+    finally:
+        database.close()
+
+
+def _matched(work: Work) -> set[frozenset[str]]:
+    """Pairs that were compared and verified."""
+    database = pycolmap.Database.open(work.database)
+    try:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        numbers, _ = database.read_two_view_geometry_num_inliers()
+        return {frozenset(names[image] for image in pycolmap.pair_id_to_image_pair(number)) for number in numbers}
+    finally:
+        database.close()
+
+
+def forget_matches(work: Work) -> None:
+    database = pycolmap.Database.open(work.database)
+    try:
+        database.clear_matches()
+        database.clear_two_view_geometries()
+    finally:
+        database.close()
+
+
+def _descriptors(work: Work, photographs: Sequence[Photograph]) -> list[np.ndarray]:
+    """Some descriptors [m, 128] of each photograph, the same in every run."""
+    database = pycolmap.Database.open(work.database)
+    try:
+        numbers = {image.name: image.image_id for image in database.read_all_images()}
+        found = []
+        for photo in photographs:
+            number = numbers.get(photo.name)
+            if number is None or not database.exists_descriptors(number):
+                found.append(np.zeros((0, 128), np.uint8))
+                continue
+            rows = np.asarray(database.read_descriptors(number).data)
+            found.append(rows[:: max(1, len(rows) // _READ)].copy())
+        return found
+    finally:
+        database.close()

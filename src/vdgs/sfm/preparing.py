@@ -1,0 +1,115 @@
+"""Before the work: photographs collected and looked at, options checked, a plan told. Nothing is written."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from vdgs.captures.outputs import refuse_in_a_capture
+from vdgs.errors import VdgsError
+from vdgs.kernels import threads as threads_available
+from vdgs.settings.sfm import SfmRequest
+from vdgs.sfm import mapping, matching
+from vdgs.sfm.collection import Collection, collect
+from vdgs.sfm.look import Look, look_at, seconds
+from vdgs.sfm.positions import Positions, find_positions
+from vdgs.sfm.telling import tell_look
+
+#: Bytes of disk for a feature, with its descriptor and its matches; and for a pixel of a written photograph.
+FEATURE_BYTES, PIXEL_BYTES = 250, 0.9
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What is known before the work."""
+
+    request: SfmRequest
+    collection: Collection
+    positions: Positions
+    look: Look
+    threads: int
+    seconds: float
+
+
+def prepare(request: SfmRequest) -> Prepared:
+    """The look before the work; nothing is written. Raises CaptureError for photographs that cannot become one."""
+    _check(request)
+    collection = collect(request.photographs)
+    refuse_among_photographs(request.output, collection)
+    positions = find_positions(collection.photographs, request.gps, request.options.gps_deviation_m)
+    look = look_at(collection, positions)
+    threads = request.threads or threads_available()
+    pairs = matching.expected_pairs(len(collection.photographs), positions, request.options)
+    takes = seconds(collection.photographs, pairs, request.options.feature_size, threads)
+    return Prepared(request, collection, positions, look, threads, takes)
+
+
+def tell(prepared: Prepared, console: Console) -> None:
+    """Print the look, and what will be done."""
+    photographs, options = prepared.collection.photographs, prepared.request.options
+    pairs = matching.expected_pairs(len(photographs), prepared.positions, options)
+    held, why = mapping.holds_focal(photographs, options)
+    how = "near each other by their positions" if prepared.positions.usable else (
+        "all with all" if len(photographs) <= options.exhaustive else "next in order, and alike")  # fmt: skip
+    metres = "metres east, north, up, " if prepared.positions.usable else ""
+    plan = [
+        f"features, about {pairs} pairs ({how}), poses and points, {metres}photographs without distortion",
+        f"the focal length is {'held' if held else 'fitted'}: {why}",
+        f"about {max(1, round(prepared.seconds / 60))} min on {prepared.threads} threads, if they are idle",
+    ]
+    tell_look(prepared.look, prepared.collection, plan, console)
+
+
+def refuse_among_photographs(output: Path, collection: Collection) -> None:
+    """Raise VdgsError where the output would lie among the photographs, or in a capture."""
+    refuse_in_a_capture(output)
+    real = output.resolve()
+    for folder in collection.folders:
+        if real == folder.resolve() or folder.resolve() in real.parents:
+            raise VdgsError(
+                f"{output}: lies among the photographs in {folder}, where it would be taken for more of them. Choose a "
+                "folder beside it."
+            )
+
+
+def _check(request: SfmRequest) -> None:
+    options = request.options
+    limits = (
+        ("--neighbours", options.neighbours, 2), ("--exhaustive", options.exhaustive, 0),
+        ("--feature-size", options.feature_size, 200), ("--features", options.features, 200),
+        ("--max-size", options.max_size, 0), ("--threads", request.threads, 0),
+    )  # fmt: skip
+    for name, value, least in limits:
+        if value < least:
+            raise VdgsError(f"{name} {value}: must be at least {least}")
+    if not all(np.isfinite(value) and value > 0 for value in options.gps_deviation_m):
+        raise VdgsError("--gps-deviation-m: two positive numbers of metres, such as 1 2")
+
+
+def check_disk(prepared: Prepared) -> None:
+    photographs, options = prepared.collection.photographs, prepared.request.options
+    pixels = sum(photo.width * photo.height for photo in photographs)
+    needed = PIXEL_BYTES * 1.32 * pixels + FEATURE_BYTES * options.features * len(photographs)
+    parent = next(
+        folder
+        for folder in (prepared.request.output.resolve(), *prepared.request.output.resolve().parents)
+        if folder.exists()
+    )
+    free = shutil.disk_usage(parent).free
+    if free < needed:
+        raise VdgsError(
+            f"{prepared.request.output}: needs about {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free there. Free "
+            "some space, choose another --output, or write smaller photographs (--max-size 2000)."
+        )
+
+
+def in_time(prepared: Prepared) -> list[int]:
+    """Rows of the positions in the order in which the photographs were taken."""
+    photographs, index = prepared.collection.photographs, prepared.positions.index
+    return sorted(
+        range(len(index)), key=lambda row: (photographs[int(index[row])].taken, photographs[int(index[row])].name)
+    )

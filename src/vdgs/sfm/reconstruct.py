@@ -1,0 +1,224 @@
+"""`vdgs sfm`: photographs to a capture. Each step keeps what it has done; the same command goes on."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from rich.console import Console
+
+from vdgs import __version__
+from vdgs.captures.reconstruction import (
+    FIGURE,
+    FILE,
+    WORK,
+    ReconstructionFacts,
+    is_reconstruction,
+    read_reconstruction,
+)
+from vdgs.errors import VdgsError
+from vdgs.runs.locks import hold
+from vdgs.settings.plain import to_dict
+from vdgs.settings.sfm import SfmRequest
+from vdgs.sfm import aligning, features, mapping, matching, writing
+from vdgs.sfm.collection import LeftOut
+from vdgs.sfm.facts import facts_of, why_left_out
+from vdgs.sfm.figures import draw_positions, draw_residuals
+from vdgs.sfm.preparing import Prepared, check_disk, in_time, prepare, tell
+from vdgs.sfm.telling import tell_facts
+from vdgs.sfm.work import Work, key_of, quiet_colmap
+from vdgs.storage.files import jsonable, write_json
+from vdgs.storage.records import plain
+
+#: Where the positions are shown before the work, inside the output.
+MAP = "photographs.png"
+
+
+def reconstruct(request: SfmRequest, console: Console) -> ReconstructionFacts:
+    """Make a capture of photographs in `request.output`, or go on with one that was begun.
+
+    Raises CaptureError for photographs that cannot become one, VdgsError for an output that is something else and a
+    disk that is full. What was done is kept.
+    """
+    quiet_colmap()
+    prepared = prepare(request)
+    output = request.output
+    work, keys = Work(output / WORK), _keys(prepared)
+    facts = read_reconstruction(output) if _is_finished(output, keys["capture"]) else None
+    if facts is not None:
+        console.print(f"{output}: made of these photographs already; nothing to do", highlight=False)
+        return facts
+    _refuse_other_things(output)
+    tell(prepared, console)
+    check_disk(prepared)
+    with hold(output):
+        work.path.mkdir(exist_ok=True)
+        draw_positions(prepared.positions, in_time(prepared), "Where the photographs were taken", output / MAP)
+        facts = _steps(prepared, work, keys, console)
+        if not request.keep_work:
+            work.remove()
+    tell_facts(facts, console)
+    return facts
+
+
+def _keys(prepared: Prepared) -> dict[str, str]:
+    """What each step depends on, each on those before it."""
+    options, positions = prepared.request.options, prepared.positions
+    files = [
+        (photo.name, photo.bytes, photo.path.stat().st_mtime_ns, photo.width, photo.height, photo.orientation)
+        for photo in prepared.collection.photographs
+    ]
+    lenses = [photo.lens and photo.lens.focal for photo in prepared.collection.photographs]
+    found = key_of(__version__, files, lenses, options.feature_size, options.features)
+    placed = [positions.index.tolist(), positions.enu.tolist(), positions.deviations.tolist()]
+    matched = key_of(found, placed, options.neighbours, options.exhaustive)
+    mapped = key_of(matched, options.focal)
+    return {"features": found, "matches": matched, "model": mapped, "capture": key_of(mapped, options.max_size)}
+
+
+def _is_finished(output: Path, key: str) -> bool:
+    return (output / FILE).is_file() and Work(output).is_done("capture", key)
+
+
+def _refuse_other_things(output: Path) -> None:
+    """Only a new folder, an empty one, or one of an earlier reconstruction is written to."""
+    if output.is_dir() and not is_reconstruction(output) and _strangers(output):
+        raise VdgsError(f"{output}: holds other things already. Choose a new folder with --output.")
+    if output.exists() and not output.is_dir():
+        raise VdgsError(f"{output}: is a file. Choose a new folder with --output.")
+
+
+def _strangers(output: Path) -> bool:
+    """Whether a folder holds anything but what a reconstruction begins with."""
+    return any(each.name not in (".lock", MAP) and each.suffix != ".tmp" for each in output.iterdir())
+
+
+def _steps(prepared: Prepared, work: Work, keys: dict[str, str], console: Console) -> ReconstructionFacts:
+    began = time.monotonic()
+    request, output = prepared.request, prepared.request.output
+    photographs, threads = prepared.collection.photographs, prepared.threads
+    kinds = features.kinds_of(photographs)
+    lost = _features(prepared, work, kinds, keys["features"], console)
+    usable = [photo for photo in photographs if photo.name not in {each.name for each in lost}]
+    pairs = _matches(prepared, work, keys["matches"], console)
+    held = mapping.holds_focal(photographs, request.options)
+    models = _models(prepared, work, keys["model"], len(usable), held[0], console)
+    left_out = why_left_out(
+        models[0], models[1:], [photo.name for photo in photographs], matching.verified_counts(work), lost
+    )
+    placed, origin = _place(models[0], prepared)
+    _write(prepared, work, models[0], keys["capture"], threads, console)
+    facts = facts_of(
+        models[0], prepared.collection, kinds, prepared.positions, prepared.look, placed, origin, left_out=left_out,
+        components=[model.num_reg_images() for model in models], pairs=pairs, held=held,
+        seconds=time.monotonic() - began,
+    )  # fmt: skip
+    points = aligning.points_of(models[0])
+    draw_residuals(points, prepared.positions, placed, output / FIGURE)
+    if origin is not None:
+        write_json(output / "georef.json", _georef(facts, origin))
+    writing.write_model(output, models[0], _lenses(models[0], request.options.max_size))
+    write_json(output / FILE, jsonable(plain(facts)) | {"options": jsonable(to_dict(request.options))})
+    Work(output).finish("capture", keys["capture"])
+    return facts
+
+
+def _features(
+    prepared: Prepared, work: Work, kinds: Sequence[features.Kind], key: str, console: Console
+) -> list[LeftOut]:
+    options, photographs = prepared.request.options, prepared.collection.photographs
+    if not work.is_begun("features", key):
+        work.remove()
+        work.begin("features", key)
+    features.open_database(work, kinds)
+    failed = features.stand_upright(work, photographs)
+    counts = features.feature_counts(work)
+    if not work.is_done("features", key):
+        counts = features.find_features(work, kinds, options.feature_size, options.features, prepared.threads, console)
+        work.finish("features", key)
+    named = {each.name for each in failed}
+    return failed + [each for each in features.without_features(photographs, counts) if each.name not in named]
+
+
+def _matches(prepared: Prepared, work: Work, key: str, console: Console) -> int:
+    photographs = prepared.collection.photographs
+    chosen = matching.choose_pairs(work, photographs, prepared.positions, prepared.request.options)
+    there = features.feature_counts(work)
+    chosen = [pair for pair in chosen if all(there.get(name) for name in pair)]
+    if work.is_done("matches", key):
+        return len(chosen)
+    if not work.is_begun("matches", key):
+        matching.forget_matches(work)
+        work.begin("matches", key)
+    matching.match(work, chosen, prepared.threads, console)
+    work.finish("matches", key)
+    return len(chosen)
+
+
+def _models(
+    prepared: Prepared, work: Work, key: str, count: int, hold_focal: bool, console: Console
+) -> list[pycolmap.Reconstruction]:
+    if work.is_done("model", key):
+        return mapping.read_models(work)
+    work.begin("model", key)
+    mapping.write_priors(work, prepared.collection.photographs, prepared.positions)
+    models = mapping.find_models(work, count, hold_focal, prepared.positions.usable, prepared.threads, console)
+    work.finish("model", key)
+    return models
+
+
+def _place(
+    model: pycolmap.Reconstruction, prepared: Prepared
+) -> tuple[aligning.Placed | None, tuple[float, float, float] | None]:
+    """Bring the model to metres east, north, up, its median point to height 0; the origin that this has on Earth."""
+    placed = aligning.place(model, prepared.collection.photographs, prepared.positions)
+    if placed is None:
+        return None, None
+    similarity = placed.similarity
+    aligning.move(model, similarity)
+    ground = float(np.median(aligning.points_of(model)[:, 2]))
+    aligning.move(model, replace(similarity, scale=1.0, rotation=np.eye(3), translation=np.array([0.0, 0.0, -ground])))
+    latitude, longitude, altitude = prepared.positions.origin
+    return placed, (latitude, longitude, altitude + ground)
+
+
+def _lenses(model: pycolmap.Reconstruction, max_size: int) -> dict[int, writing.Straightened]:
+    used = sorted({image.camera_id for image in model.images.values() if image.has_pose})
+    return {number: writing.straighten(model.cameras[number], max_size) for number in used}
+
+
+def _write(
+    prepared: Prepared, work: Work, model: pycolmap.Reconstruction, key: str, threads: int, console: Console
+) -> None:
+    output = prepared.request.output
+    if not Work(output).is_begun("capture", key):
+        for name in (*(folder for folder, _ in writing.SIZES), "sparse"):
+            shutil.rmtree(output / name, ignore_errors=True)
+        for name in (FILE, "georef.json", FIGURE):
+            (output / name).unlink(missing_ok=True)
+        Work(output).begin("capture", key)
+    shutil.rmtree(output / "sparse", ignore_errors=True)
+    names: dict[int, list[str]] = {}
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        if image.has_pose:
+            names.setdefault(image.camera_id, []).append(image.name)
+    writing.write_images(output, work, names, _lenses(model, prepared.request.options.max_size), threads, console)
+
+
+def _georef(facts: ReconstructionFacts, origin: tuple[float, float, float]) -> dict[str, Any]:
+    latitude, longitude, altitude = origin
+    return {
+        "frame": "ENU, metres, x east y north z up",
+        "origin_lat_deg": latitude, "origin_lon_deg": longitude, "origin_alt_m": altitude,
+        "alt_reference": facts.altitude_reference,
+        "method": f"bundle adjustment with positions as priors, then a similarity to the {facts.georeferenced}",
+        "gps_outliers_left_out": facts.positions_left_out,
+        "gps_residual_rms_m_xyz": list(facts.residual_rms_m or ()),
+        "z0": "median height of the 3D points",
+    }  # fmt: skip

@@ -1,0 +1,19 @@
+"""What `vdgs run` asks of the reconstruction, where it is given photographs."""
+
+from __future__ import annotations
+
+from vdgs.errors import VdgsError
+from vdgs.runs.folder import RunFolder
+from vdgs.settings.requests import RunRequest
+from vdgs.settings.sfm import SfmRequest
+
+
+def sfm_request(asked: RunRequest) -> SfmRequest:
+    """Photographs into RUN/capture. Raises VdgsError for options that speak of cameras that are not known yet."""
+    options = asked.options
+    for flag, value in (("--georef", options.georef), ("--up", None if options.up == "auto" else options.up)):
+        if value is not None:
+            raise VdgsError(f"{flag} is about a capture's world; photographs get theirs from their positions (--gps).")
+    run = RunFolder(asked.output)
+    run.refuse_strangers()
+    return SfmRequest((asked.capture,), run.own_capture, options.gps, asked.threads, options=asked.sfm)

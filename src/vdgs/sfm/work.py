@@ -1,0 +1,134 @@
+"""The work folder of a reconstruction: which steps are done, for which photographs and settings; calls into COLMAP."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pycolmap
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from vdgs.captures.reconstruction import STEPS
+from vdgs.errors import CaptureError, VdgsError
+from vdgs.storage.files import read_record, write_json
+from vdgs.watching.interrupts import stop_if_asked
+
+Result = TypeVar("Result")
+#: Seconds between two looks whether a person asked to stop.
+_GLANCE = 0.2
+
+
+@dataclass(frozen=True)
+class Work:
+    """OUTPUT/work: links to the photographs, COLMAP's database, models, and what is done."""
+
+    path: Path
+
+    @property
+    def photographs(self) -> Path:
+        """Upright photographs by their names in the capture: links, or copies of those that lay on their side."""
+        return self.path / "photographs"
+
+    @property
+    def database(self) -> Path:
+        return self.path / "database.db"
+
+    @property
+    def models(self) -> Path:
+        return self.path / "models"
+
+    def is_done(self, step: str, key: str) -> bool:
+        return self._steps("done").get(step) == key
+
+    def is_begun(self, step: str, key: str) -> bool:
+        """Whether what there is of a step was made for these photographs and settings."""
+        return self._steps("begun").get(step) == key
+
+    def begin(self, step: str, key: str) -> None:
+        self._note("begun", step, key)
+
+    def finish(self, step: str, key: str) -> None:
+        self._note("done", step, key)
+
+    def remove(self) -> None:
+        shutil.rmtree(self.path, ignore_errors=True)
+
+    def _steps(self, which: str) -> dict[str, Any]:
+        steps = read_record(self.path / STEPS).get(which)
+        return steps if isinstance(steps, dict) else {}
+
+    def _note(self, which: str, step: str, key: str) -> None:
+        steps = {name: self._steps(name) for name in ("begun", "done")}
+        steps[which][step] = key
+        if which == "begun":
+            steps["done"].pop(step, None)
+        write_json(self.path / STEPS, steps)
+
+
+def key_of(*parts: Any) -> str:
+    """A short key of anything that JSON can hold."""
+    return blake2b(json.dumps(parts, sort_keys=True, default=str).encode(), digest_size=12).hexdigest()
+
+
+def call(function: Callable[..., Result], *arguments: Any, **named: Any) -> Result:
+    """Call a long function of COLMAP beside this thread, so that Ctrl-C is heard and ends it where it is whole.
+
+    Raises VdgsError for what COLMAP cannot do, and what asked to stop.
+    """
+    token, ended = pycolmap.CancellationToken(), dict[str, Any]()
+
+    def work() -> None:
+        try:
+            ended["result"] = function(*arguments, **named, cancellation_token=token)
+        except BaseException as error:
+            ended["error"] = error
+
+    thread = threading.Thread(target=work, name="colmap", daemon=True)
+    thread.start()
+    try:
+        while thread.is_alive():
+            thread.join(_GLANCE)
+        stop_if_asked()
+    except BaseException:
+        token.cancel()
+        thread.join()
+        raise
+    error = ended.get("error")
+    if isinstance(error, (MemoryError, KeyboardInterrupt)):
+        raise error
+    if error is not None:
+        said = " ".join(str(error).split())
+        if "full" in said or "disk I/O" in said:
+            raise VdgsError(f"the disk is full ({said}). Free some space; the same command then goes on.") from error
+        raise CaptureError(f"COLMAP could not go on ({said}). What was done is kept.") from error
+    return ended["result"]
+
+
+@contextmanager
+def progress(console: Console, title: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar with the time left where the console is a terminal, else one line; yields what tells how many are done."""
+    if not console.is_terminal:
+        console.print(f"{title}: {total}", highlight=False)
+        yield lambda done: None
+        return
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task(title, total=total)
+        yield lambda done: bar.update(task, completed=done)
+
+
+def quiet_colmap() -> None:
+    """COLMAP's own log is for its makers: errors come as exceptions, progress is shown here."""
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    pycolmap.set_random_seed(0)

@@ -1,0 +1,105 @@
+"""Photographs as a drone would bring them: ray cast, with EXIF and XMP, over a generated town."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from vdgs.cameras import Camera
+from vdgs.captures.geodesy import geodetic_from_enu
+from vdgs.synth.flight import look_from
+from vdgs.synth.lighting import sky_map
+from vdgs.synth.photography import photograph
+from vdgs.synth.town import build_town
+from vdgs.synth.tracing import Tracer
+
+#: Where the town lies: latitude, longitude in degrees, altitude in metres. South and west, where signs go wrong.
+ORIGIN = (-33.5, -70.6, 500.0)
+WIDTH, HEIGHT, FOCAL = 400, 300, 340.0
+FOCAL_MM, SENSOR_MM = 8.5, 10.0
+ALTITUDE_M = 45.0
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """Photographs in a folder, and the true cameras that took them (metres east, north, up of `ORIGIN`)."""
+
+    folder: Path
+    cameras: list[Camera]
+
+    @property
+    def names(self) -> list[str]:
+        return [f"DJI_{k + 1:04d}.JPG" for k in range(len(self.cameras))]
+
+
+def grid(strips: int, each: int, step: float) -> list[Camera]:
+    """Cameras that look about straight down from a level grid, strip by strip, each flown the other way round."""
+    rng = np.random.default_rng(5)
+    cameras = []
+    for strip in range(strips):
+        for k in range(each):
+            along = (k if strip % 2 == 0 else each - 1 - k) - (each - 1) / 2
+            place = np.array([step * along, step * (strip - (strips - 1) / 2), ALTITUDE_M + rng.normal(0, 0.5)])
+            heading = np.pi / 2 if strip % 2 == 0 else -np.pi / 2
+            pose = look_from(place, np.radians(rng.normal(0, 2)), heading, np.radians(rng.normal(0, 1)))
+            cameras.append(Camera(pose, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT))
+    return cameras
+
+
+def fly(folder: Path, cameras: Sequence[Camera], extent: float = 60.0) -> Flight:
+    """Take the photographs and write them with what a drone writes."""
+    folder.mkdir(parents=True)
+    town = build_town(3, extent)
+    tracer = Tracer(town.mesh)
+    flight = Flight(folder, list(cameras))
+    with ThreadPoolExecutor(1) as pool:
+        sky = sky_map(tracer, town.terrain, town.zones, extent / 2 + 20, pool)
+    for k, (name, camera) in enumerate(zip(flight.names, cameras, strict=True)):
+        pixels = photograph(town, tracer, sky, camera, 1, np.ones(3))
+        write_photograph(folder / name, pixels, k, camera.position)
+    return flight
+
+
+def write_photograph(
+    file: Path, pixels: np.ndarray, number: int, enu: np.ndarray | None, orientation: int = 1, xmp: str | None = None
+) -> None:
+    """A JPEG with EXIF, its place where `enu` is given, and XMP."""
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110], exif[0x0112] = "Maker", "Drone", orientation
+    details = exif.get_ifd(0x8769)
+    details[0x9003] = f"2026:06:01 10:{number // 60:02d}:{number % 60:02d}"
+    details[0x920A] = FOCAL_MM
+    shown = 4 * max(pixels.shape[:2])  # as where photographs were made smaller
+    details[0xA002], details[0xA003] = shown, shown * 3 // 4
+    details[0xA20E], details[0xA210] = shown / SENSOR_MM, 4
+    if enu is not None:
+        latitude, longitude, altitude = geodetic_from_enu(np.asarray(enu)[None], ORIGIN)[0]
+        gps = exif.get_ifd(0x8825)
+        gps[1], gps[2] = ("S" if latitude < 0 else "N"), sexagesimal(latitude)
+        gps[3], gps[4] = ("W" if longitude < 0 else "E"), sexagesimal(longitude)
+        gps[5], gps[6] = (b"\x01" if altitude < 0 else b"\x00"), abs(altitude)
+        xmp = xmp or (
+            f'drone-dji:RelativeAltitude="+{enu[2]:.2f}" drone-dji:GimbalPitchDegree="-90.0" '
+            'drone-dji:GimbalYawDegree="90.0" drone-dji:GimbalRollDegree="0.0"'
+        )
+    Image.fromarray(pixels).save(file, "JPEG", quality=95, subsampling=0, exif=exif)
+    if xmp is not None:
+        add_xmp(file, f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description {xmp}/></x:xmpmeta>'.encode())
+
+
+def add_xmp(file: Path, packet: bytes) -> None:
+    """Put an XMP segment right behind the first marker of a JPEG."""
+    content, body = file.read_bytes(), b"http://ns.adobe.com/xap/1.0/\x00" + packet
+    file.write_bytes(content[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + content[2:])
+
+
+def sexagesimal(degrees: float) -> tuple[float, float, float]:
+    whole = abs(degrees)
+    minutes = (whole - int(whole)) * 60
+    return float(int(whole)), float(int(minutes)), round((minutes - int(minutes)) * 60, 6)
