@@ -30,7 +30,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("watching",),
     ("executors", "evaluation", "sfm"),
     ("stages", "films", "maps", "report", "comparators", "export"),
-    ("pipeline", "planning", "doctor", "bench"),
+    ("pipeline", "planning", "doctor", "bench", "viewer"),
     ("verbs",),
     ("cli",),
 )

@@ -27,12 +27,13 @@ from vdgs.verbs.photographs import SfmArguments
 from vdgs.verbs.results import EvalArguments, RenderArguments
 from vdgs.verbs.stages import MergeArguments, PartitionArguments, TrainArguments
 from vdgs.verbs.starting import CoarseArguments, RunArguments
+from vdgs.verbs.viewing import ViewArguments
 
 HERE = Path("here")
 ARGUMENTS: tuple[Any, ...] = (
     BenchArguments("toy", HERE), InspectArguments(HERE, HERE), SynthArguments(HERE), EvalArguments(HERE),
     RenderArguments(HERE, HERE), PartitionArguments(HERE), TrainArguments(HERE), MergeArguments(HERE),
-    MapArguments(HERE), ExportArguments(HERE), SfmArguments((HERE,), HERE),
+    MapArguments(HERE), ExportArguments(HERE), SfmArguments((HERE,), HERE), ViewArguments(HERE),
     CoarseArguments(HERE, HERE), RunArguments(HERE, HERE), MethodConfig(), *PRESETS.values(),
 )  # fmt: skip
 

@@ -28,6 +28,7 @@ its stages, one by one:
   report RUN                        one HTML file with figures, metrics, pictures and settings
 
 more:
+  view RUN                          move through the scene in a browser: layers, places, camera paths
   render RUN                        views or a camera path, as PNG or video
   map RUN                           orthophoto, surface model and visibility as GeoTIFFs
   export RUN --to FILE              the scene for other programs: PLY, SPZ, SOG, glTF, 3D Tiles, LAZ
@@ -41,7 +42,7 @@ transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of Matri
 
 VERBS = (
     "inspect", "run", "sfm", "status", "coarse", "visibility", "partition", "train", "merge", "eval", "report",
-    "render", "map", "export", "synth", "bench", "doctor",
+    "view", "render", "map", "export", "synth", "bench", "doctor",
 )  # fmt: skip
 #: Verbs that take up what they left when they were interrupted.
 CONTINUES = ("run", "sfm", "coarse", "train", "bench")

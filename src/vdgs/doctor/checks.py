@@ -26,6 +26,7 @@ EXTRAS = {
     "lpips": "the linear heads of LPIPS",
     "tensorboard": "curves of the training in TensorBoard",
     "geo": "maps as GeoTIFFs, any EPSG system (vdgs map)",
+    "viewer": "a scene in a browser (vdgs view)",
     "gsplat": "another rasteriser on an NVIDIA GPU, to compare with",
     "test": "the test suite",
 }

@@ -166,3 +166,23 @@ class ExportRequest:
     """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """A scene in a browser (`vdgs view`)."""
+
+    run: Path
+    """Run folder."""
+    model: ModelName = "best"
+    """Which model; `best` is the merged one where there is one, else what training has saved last, followed while it
+    goes on."""
+    host: str = "127.0.0.1"
+    """Address to listen at: this machine alone can open it. Another one (0.0.0.0: all) lets others in who have the
+    token of the printed address."""
+    port: Annotated[int | None, Range(1, 65535)] = None
+    """Port; by default the first free one from 8080."""
+    threads: Annotated[int, WORKERS] = 0
+    """Threads of the kernels; 0 for all cores."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""

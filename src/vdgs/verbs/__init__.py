@@ -16,10 +16,11 @@ from vdgs.verbs.photographs import sfm
 from vdgs.verbs.results import eval, render, report, status
 from vdgs.verbs.stages import merge, partition, train, visibility
 from vdgs.verbs.starting import coarse, run
+from vdgs.verbs.viewing import view
 
 __all__ = [
     "bench", "coarse", "doctor", "eval", "export", "inspect", "map", "merge", "partition", "render", "report", "run",
-    "sfm", "status", "synth", "train", "visibility",
+    "sfm", "status", "synth", "train", "view", "visibility",
 ]  # fmt: skip
 
 # torch's OpenMP threads must block, not spin, beside the kernels' own pool; read once, when torch is imported.

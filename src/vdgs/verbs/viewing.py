@@ -1,0 +1,32 @@
+"""The verb that shows a run in a browser: `view`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from vdgs.settings.requests import ViewRequest
+from vdgs.verbs.shared import open_console, parse, use_device, use_threads
+
+
+@dataclass(frozen=True)
+class ViewArguments(ViewRequest):
+    """Show a run in a browser: move through the true model, drawn on this machine; its layers (depth, V, alpha, blocks,
+    errors), what is known of a clicked place, camera paths for `vdgs render --path`. Follows a run that still trains.
+
+    Prints the address to open; Ctrl-C ends it. Needs viser: pip install 'vdgs[viewer]'.
+    """
+
+    run: Positional[Path]
+    """Run folder."""
+
+
+def view(arguments: list[str]) -> None:
+    asked = parse(ViewArguments, arguments, "vdgs view")
+    from vdgs.viewer.serving import view_run
+
+    device = use_device(asked.device)
+    use_threads(asked.threads)
+    view_run(replace(asked, device=device), open_console())

@@ -1,0 +1,1 @@
+"""`vdgs view`: a scene in a browser, drawn by our own kernels where the run is."""

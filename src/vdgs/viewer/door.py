@@ -1,0 +1,80 @@
+"""Who may come in: nobody from elsewhere unless asked for, and then only with the token.
+
+The page and its socket are served by one port. What asks for either must come with the name of this machine (so that no
+page of another site can speak to it through the visitor's browser) and, where the server is open to others, with the
+token of the printed address, which the browser keeps as a cookie.
+"""
+
+from __future__ import annotations
+
+import hmac
+from collections.abc import Mapping
+from dataclasses import dataclass
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import parse_qs, urlsplit
+
+#: Names of the loopback address.
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+
+
+@dataclass(frozen=True)
+class Door:
+    """Decides over each request by its path and its headers."""
+
+    host: str
+    #: None: only this machine can reach the server.
+    token: str | None
+    port: int
+
+    @property
+    def cookie(self) -> str:
+        """The cookie's name: browsers do not tell ports apart."""
+        return f"vdgs_view_{self.port}"
+
+    def address(self) -> str:
+        """What to open in a browser."""
+        name = self.host if self.host not in ("", "0.0.0.0", "::") else "localhost"
+        name = f"[{name}]" if ":" in name else name
+        return f"http://{name}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+
+    def refusal(self, path: str, headers: Mapping[str, str]) -> str | None:
+        """Why a request may not come in; None if it may."""
+        host = headers.get("Host", "")
+        if self.token is None and name_of(host) not in (*LOOPBACK, self.host):
+            return "This server answers only to the name of this machine. Start it with --host to open it to others."
+        origin = headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+            return "Pages of other sites may not use this server."
+        if self.token is not None and not (self.has_token(path) or self._has_cookie(headers.get("Cookie", ""))):
+            return "The token is missing or wrong. Open the whole address that `vdgs view` printed."
+        return None
+
+    def has_token(self, path: str) -> bool:
+        """Whether the address itself holds the token."""
+        given = parse_qs(urlsplit(path).query).get("token", [""])[0]
+        return self.token is not None and hmac.compare_digest(given.encode(), self.token.encode())
+
+    def set_cookie(self) -> str:
+        """The header's value that lets the browser in from now on: for this site's own requests only."""
+        return f"{self.cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+
+    def _has_cookie(self, header: str) -> bool:
+        try:
+            found = SimpleCookie(header).get(self.cookie)
+        except CookieError:
+            return False
+        assert self.token is not None
+        return found is not None and hmac.compare_digest(found.value.encode(), self.token.encode())
+
+
+def name_of(host: str) -> str:
+    """The name in a Host header, without its port: "localhost" of "localhost:8080", "::1" of "[::1]:8080"."""
+    try:
+        return (urlsplit(f"//{host}").hostname or "").lower()
+    except ValueError:
+        return ""
+
+
+def is_loopback(host: str) -> bool:
+    """Only this machine reaches it."""
+    return host in LOOPBACK or host.startswith("127.")

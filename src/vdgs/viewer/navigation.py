@@ -1,0 +1,100 @@
+"""Where a visitor stands: the browser's camera as ours and back, and the places that buttons lead to."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from vdgs.cameras import Camera
+from vdgs.captures.capture import Capture
+from vdgs.captures.heights import camera_height
+
+#: Angle of view of a new visitor, vertical (choice).
+FOV_DEG = 50.0
+#: Nearer to straight down than this, the direction on the map no longer follows from where one looks.
+_STEEP = 0.995
+#: How far a view from straight above is tilted, so that it knows which way is north.
+_TILT = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Stand:
+    """Where a visitor stands and what they look at, ground frame; z is up."""
+
+    position: Float[np.ndarray, "3"]
+    look_at: Float[np.ndarray, "3"]
+
+    @property
+    def distance(self) -> float:
+        """From the visitor to what they look at."""
+        return float(np.linalg.norm(self.look_at - self.position))
+
+
+def camera_of(wxyz: np.ndarray, position: np.ndarray, fov: float, width: int, height: int) -> Camera:
+    """The browser's camera: `wxyz` turns camera axes (OpenCV) into the world, `fov` is vertical, in radians.
+
+    Raises ValueError for what is no camera: numbers that are not finite, an empty canvas, an impossible angle.
+    """
+    turn, place = np.asarray(wxyz, np.float64), np.asarray(position, np.float64)
+    usable = np.isfinite(turn).all() and np.isfinite(place).all() and np.linalg.norm(turn) > 1e-6
+    if not (usable and width > 0 and height > 0 and 1e-3 < fov < math.pi - 1e-3):
+        raise ValueError("this is no camera")
+    rotation = Rotation.from_quat(np.roll(turn, -1)).as_matrix().T
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ place
+    focal = 0.5 * height / math.tan(0.5 * fov)
+    return Camera(pose, focal, focal, width / 2, height / 2, width, height)
+
+
+def whole_scene(capture: Capture) -> Stand:
+    """All of the flight from the south, half from above."""
+    middle, half = _extent(capture)
+    distance = max(1.5 * camera_height(capture), 1.3 * half / math.tan(math.radians(FOV_DEG / 2)))
+    return Stand(middle + distance * np.array([0.0, -math.sqrt(0.5), math.sqrt(0.5)]), middle)
+
+
+def _extent(capture: Capture) -> tuple[Float[np.ndarray, "3"], float]:
+    """The middle of what was flown over, on the ground, and half its longer side."""
+    flown = np.stack([view.camera.position for view in capture.train_views])[:, :2]
+    low, high = np.quantile(flown, (0.05, 0.95), axis=0)
+    ground = float(np.median(capture.points[:, 2])) if len(capture.points) else 0.0
+    return np.append((low + high) / 2, ground), max(float((high - low).max()) / 2, camera_height(capture) / 2)
+
+
+def from_above(stand: Stand) -> Stand:
+    """The same place from straight above, north up."""
+    return Stand(stand.look_at + stand.distance * np.array([0.0, -_TILT, 1.0]), stand.look_at)
+
+
+def north_up(stand: Stand) -> Stand:
+    """The same place, as steeply and as far, looking north."""
+    away = stand.position - stand.look_at
+    return Stand(stand.look_at + np.array([0.0, -np.hypot(away[0], away[1]) - 1e-9, away[2]]), stand.look_at)
+
+
+def nearer(stand: Stand, place: Float[np.ndarray, "3"], share: float = 0.35) -> Stand:
+    """Looking at a place in the same direction, from a share of the present distance to it."""
+    away = stand.position - stand.look_at
+    towards = away / max(float(np.linalg.norm(away)), 1e-9)
+    return Stand(place + towards * share * float(np.linalg.norm(stand.position - place)), place)
+
+
+def stand_of(camera: Camera, distance: float) -> Stand:
+    """Where a photograph was taken, looking where it looks `distance` away. One taken straight down is tilted by a
+    hair, so that its upper edge stays up: z is up for whoever moves on from there."""
+    forward, up = camera.forward, -camera.camera_from_world[1, :3]
+    if abs(forward[2]) > _STEEP:
+        forward = forward + 3 * _TILT * up
+    forward = forward / np.linalg.norm(forward)
+    return Stand(camera.position.copy(), camera.position + distance * forward)
+
+
+def fov_for(camera: Camera, aspect: float) -> float:
+    """The vertical angle, in radians, at which a canvas (width over height) holds all of a photograph's."""
+    vertical = 0.5 * camera.height / camera.fy
+    across = 0.5 * camera.width / camera.fx / aspect
+    return 2.0 * math.atan(max(vertical, across))

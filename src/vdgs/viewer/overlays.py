@@ -1,0 +1,82 @@
+"""Lines and points that the browser draws over the picture: borders of blocks, cameras, sparse points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from jaxtyping import Float, UInt8
+from scipy.spatial import cKDTree
+
+from vdgs.cameras import Camera
+from vdgs.captures.heights import camera_height
+from vdgs.viewer.scene import Scene, rgb_of
+
+#: Borders follow the ground in steps of this share of the camera height; cameras are drawn so large (choices).
+_STEP, _SIZE = 0.1, 0.06
+#: Sparse points that a browser is sent at most.
+_MOST_POINTS = 150_000
+_GREY = (150, 150, 150)
+
+Segments = tuple[Float[np.ndarray, "s 2 3"], UInt8[np.ndarray, "s 2 3"]]
+
+
+def borders(scene: Scene) -> Segments:
+    """The cores of the blocks as segments that lie on the ground, each in its block's colour."""
+    lines: list[np.ndarray] = []
+    colours: list[tuple[int, int, int]] = []
+    step = _STEP * camera_height(scene.capture)
+    for index, block in enumerate(scene.blocks.items if scene.blocks is not None else ()):
+        ring = shapely.get_coordinates(shapely.segmentize(block.core.exterior, max(step, block.core.length / 2000)))
+        draped = np.column_stack([ring, _ground_below(scene, ring)])
+        segments = np.stack([draped[:-1], draped[1:]], axis=1)
+        lines.append(segments)
+        colours += [rgb_of(index)] * len(segments)
+    return _segments(lines, colours)
+
+
+def _ground_below(scene: Scene, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    """Heights of the sparse points about places: the median of the nearest eight."""
+    points = scene.capture.points
+    if not len(points):
+        return np.zeros(len(places))
+    _, nearest = cKDTree(points[:, :2]).query(places, k=min(8, len(points)))
+    return np.asarray(np.median(points[:, 2][np.reshape(nearest, (len(places), -1))], axis=1))
+
+
+def frusta(scene: Scene) -> Segments:
+    """All cameras as small frusta, in the colour of the block that they stand above."""
+    views = scene.capture.views
+    size = _SIZE * camera_height(scene.capture)
+    colours = [_GREY] * len(views)
+    if scene.blocks is not None:
+        owners = scene.blocks.owner(np.stack([view.camera.position[:2] for view in views]))
+        colours = [rgb_of(int(owner)) for owner in owners]
+    lines = [_frustum(view.camera, size) for view in views]
+    return _segments(lines, [colour for colour in colours for _ in range(8)])
+
+
+def _frustum(camera: Camera, size: float) -> Float[np.ndarray, "8 2 3"]:
+    """Four edges from the camera to the corners of its picture at a distance, four between these."""
+    corners = camera.resized(1, 1)
+    x = (np.array([0.0, 1.0, 1.0, 0.0]) - corners.cx) / corners.fx
+    y = (np.array([0.0, 0.0, 1.0, 1.0]) - corners.cy) / corners.fy
+    local = size * np.column_stack([x, y, np.ones(4)])
+    ring = (local - camera.camera_from_world[:3, 3]) @ camera.camera_from_world[:3, :3]
+    spokes = np.stack([np.broadcast_to(camera.position, (4, 3)), ring], axis=1)
+    return np.concatenate([spokes, np.stack([ring, np.roll(ring, -1, axis=0)], axis=1)])
+
+
+def sparse_points(scene: Scene) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """The sparse points and their colours, evenly thinned where there are many."""
+    capture = scene.capture
+    every = max(1, -(-len(capture.points) // _MOST_POINTS))
+    return capture.points[::every].astype(np.float32), capture.point_colours[::every]
+
+
+def _segments(lines: Sequence[np.ndarray], colours: Sequence[tuple[int, int, int]]) -> Segments:
+    if not lines:
+        return np.zeros((0, 2, 3), np.float32), np.zeros((0, 2, 3), np.uint8)
+    each = np.asarray(colours, np.uint8)
+    return np.concatenate(lines).astype(np.float32), np.repeat(each[:, None], 2, axis=1)

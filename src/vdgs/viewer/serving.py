@@ -1,0 +1,231 @@
+"""`vdgs view`: the server. One port, the page and pictures of the scene, nothing else of the machine."""
+
+from __future__ import annotations
+
+import contextlib
+import http
+import io
+import math
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+
+from vdgs.captures.heights import camera_height
+from vdgs.errors import Interrupted, VdgsError
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import TrainedRun
+from vdgs.settings.requests import ViewRequest
+from vdgs.viewer import navigation
+from vdgs.viewer.door import Door, is_loopback
+from vdgs.viewer.following import newest, open_or_last_saved, standing_lines
+from vdgs.viewer.scene import Scene
+from vdgs.viewer.studio import Studio
+from vdgs.viewer.visitor import Visitor
+from vdgs.watching.interrupts import stop_if_asked, stop_requests
+
+#: Where the search for a free port begins, and how many are tried.
+FIRST_PORT, TRIED_PORTS = 8080, 50
+#: How often a run that trains is looked at, seconds.
+LOOK_AGAIN = 2.0
+
+
+def view_run(asked: ViewRequest, console: Console, opened: Callable[[str], None] | None = None) -> None:
+    """Serve a run until Ctrl-C. `opened` is called with the address once it can be opened.
+
+    Raises VdgsError for a run without a model, an address that cannot be used, and where viser is not installed.
+    """
+    _require_viser()
+    port = free_port(asked.host, asked.port)
+    run = open_or_last_saved(asked.run, asked.model, asked.device)
+    if run.caution:
+        console.print(f"[yellow]warning[/] {run.caution}", highlight=False)
+    with serve(run, asked.host, port, console) as viewer:
+        console.print(f"{run.line}: {viewer.door.address()}", highlight=False, soft_wrap=True)
+        if viewer.door.token:
+            console.print("Whoever has this address can see the scene. Ctrl-C ends it.", highlight=False)
+        else:
+            console.print("Only this machine can open it (--host lets others in). Ctrl-C ends it.", highlight=False)
+        # Ctrl-C is how it ends, not how it fails. Asked for anew: what reads captures has set a handler of its own.
+        with contextlib.suppress(KeyboardInterrupt, Interrupted), stop_requests(interrupts=True):
+            if opened is not None:
+                opened(viewer.door.address())
+            _until_asked(viewer, asked, console)
+
+
+@dataclass(eq=False)
+class Viewer:
+    """A server that runs."""
+
+    server: Any
+    door: Door
+    scene: Scene
+    studio: Studio
+    visitors: dict[int, Visitor]
+    progress: str = ""
+
+    def show(self, run: TrainedRun) -> None:
+        """Let every visitor see a newer model."""
+        self.studio.errand(lambda: self.scene.show(run)).result()
+        for visitor in list(self.visitors.values()):
+            visitor.model_changed()
+
+    def tell(self, progress: str) -> None:
+        """How far training is, to every visitor who does not know it yet."""
+        if progress != self.progress:
+            self.progress = progress
+            for visitor in list(self.visitors.values()):
+                visitor.tell(progress)
+
+
+@contextlib.contextmanager
+def serve(run: TrainedRun, host: str, port: int, console: Console) -> Iterator[Viewer]:
+    """A viewer of an opened run on a port, while the context lasts."""
+    door = Door(host, None if is_loopback(host) else secrets.token_urlsafe(24), port)
+    scene, studio = Scene(run), Studio()
+    server = _start(door)
+    viewer = Viewer(server, door, scene, studio, {})
+    _place_newcomers(server, run)
+
+    def comes(client: Any) -> None:
+        visitor = Visitor(client, scene, studio, console)
+        viewer.visitors[client.client_id] = visitor
+        visitor.tell(viewer.progress)
+        if client.client_id not in server.get_clients():  # gone while the panel was made
+            goes(client)
+
+    def goes(client: Any) -> None:
+        visitor = viewer.visitors.pop(client.client_id, None)
+        if visitor is not None:
+            visitor.leave()
+
+    worker = threading.Thread(target=studio.run, name="studio", daemon=True)
+    worker.start()
+    server.on_client_connect(comes)
+    server.on_client_disconnect(goes)
+    try:
+        yield viewer
+    finally:
+        studio.close()
+        with contextlib.redirect_stdout(io.StringIO()):  # it says that it stopped
+            server.stop()
+        worker.join(timeout=5.0)
+        scene.close()
+
+
+def _place_newcomers(server: Any, run: TrainedRun) -> None:
+    """Where a browser stands when it first opens the page; one that connects again stays where it is."""
+    stand, height = navigation.whole_scene(run.capture), camera_height(run.capture)
+    start = server.initial_camera
+    start.up, start.fov = (0.0, 0.0, 1.0), math.radians(navigation.FOV_DEG)
+    start.position, start.look_at = tuple(stand.position), tuple(stand.look_at)
+    start.near, start.far = 1e-3 * height, 1000 * height
+
+
+def _until_asked(viewer: Viewer, asked: ViewRequest, console: Console) -> None:
+    """Serve, and follow a run that is not finished."""
+    folder = RunFolder(asked.run)
+    seen, follows = newest(folder), viewer.scene.run.name != "merged" and asked.model == "best"
+    looked = 0.0
+    while True:
+        stop_if_asked()
+        time.sleep(0.2)
+        if not follows or time.monotonic() - looked < LOOK_AGAIN:
+            continue
+        looked = time.monotonic()
+        viewer.tell(standing_lines(folder))
+        if (now := newest(folder)) == seen:
+            continue
+        try:
+            viewer.show(open_or_last_saved(asked.run, asked.model, asked.device))
+            seen, follows = now, viewer.scene.run.name != "merged"
+        except VdgsError as error:  # it is just being written, or training began anew
+            console.print(f"[yellow]waiting[/] {error}", highlight=False)
+            seen = now
+
+
+def _require_viser() -> None:
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise VdgsError("vdgs view needs viser. Install it: pip install 'vdgs[viewer]'") from error
+
+
+def free_port(host: str, port: int | None) -> int:
+    """The port that was asked for, else the first free one. Raises VdgsError where there is none, or no such host."""
+    tried = range(FIRST_PORT, FIRST_PORT + TRIED_PORTS) if port is None else [port]
+    why: OSError | None = None
+    for each in tried:
+        try:
+            family, kind, _, _, address = socket.getaddrinfo(host, each, type=socket.SOCK_STREAM)[0]
+            with socket.socket(family, kind) as trial:
+                trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                trial.bind(address)
+            return each
+        except (socket.gaierror, UnicodeError) as error:
+            raise VdgsError(f"--host {host}: is no address of this machine ({error}).") from error
+        except OSError as error:
+            why = error
+    if port is None:
+        raise VdgsError(f"--host {host}: none of the ports {tried[0]} to {tried[-1]} can be used ({why}). Give --port.")
+    raise VdgsError(f"--port {port}: cannot be used on {host} ({why}). Give another one.")
+
+
+def _start(door: Door) -> Any:
+    """A viser server behind a door."""
+    import viser
+    import websockets.asyncio.server as sockets
+
+    class Server(viser.ViserServer):
+        def request_share_url(self, verbose: bool = True) -> str | None:
+            """No visitor may open a tunnel to elsewhere."""
+            return None
+
+    guarded = False
+    unguarded = sockets.serve
+
+    def serve_guarded(*args: Any, process_request: Any, **options: Any) -> Any:
+        nonlocal guarded
+        guarded = True
+        return unguarded(*args, process_request=_at_the_door(door, process_request), **options)
+
+    # viser has no hook before its own answers. What it calls to listen is ours while it starts.
+    sockets.serve = serve_guarded  # type: ignore[misc, assignment]
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # it prints a table of addresses without the token
+            server = Server(host=door.host, port=door.port, verbose=False)
+    finally:
+        sockets.serve = unguarded  # type: ignore[misc]
+    if not guarded or server.get_port() != door.port:
+        server.stop()
+        raise VdgsError(f"--port {door.port}: was taken meanwhile. Give the command again.")
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+    server.gui.set_panel_label("vdgs")
+    return server
+
+
+def _at_the_door(door: Door, inner: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """What answers a request: a refusal, or what viser answers."""
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
+
+    def answer(connection: Any, request: Any) -> Any:
+        refusal = door.refusal(request.path, request.headers)
+        if refusal is not None:
+            body = (refusal + "\n").encode()
+            headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
+            return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, body)
+        response = inner(connection, request)
+        if response is not None:
+            response.headers["Referrer-Policy"] = "no-referrer"
+            response.headers["X-Frame-Options"] = "DENY"
+            if door.has_token(request.path):
+                response.headers["Set-Cookie"] = door.set_cookie()
+        return response
+
+    return answer

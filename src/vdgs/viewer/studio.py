@@ -1,0 +1,226 @@
+"""One hand that draws for all visitors: small and quick while a camera moves, at full size once it rests.
+
+All kernels run in this one thread; they take the cores themselves. Visitors take turns, a quick picture of anyone
+before the next rows of a full one of anyone. A camera that moves on leaves nothing to be finished: what it last asked
+for counts, and what was begun for it before is dropped.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from vdgs.cameras import Camera
+from vdgs.viewer.layers import Shown
+
+#: A camera that has not moved for so long rests, seconds.
+REST = 0.12
+#: A quick picture takes so long, and never has fewer pixels nor more than these.
+QUICK, FEWEST_PX, MOST_PX = 0.045, 240 * 160, 640 * 480
+#: Rows of a full picture are drawn for so long before others have their turn.
+TURN = 0.1
+
+_Result = TypeVar("_Result")
+
+
+@runtime_checkable
+class Paints(Protocol):
+    """Draws what one visitor asks for (`layers.Painter`)."""
+
+    def settle(self, shown: Shown, whole: Camera) -> None: ...
+    def paint(self, shown: Shown, camera: Camera, whole: Camera, quick: bool = False) -> np.ndarray: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A picture for a visitor."""
+
+    picture: UInt8[np.ndarray, "h w 3"]
+    #: Drawn at full size, with the camera at rest.
+    full: bool
+    #: The view that it shows, at full size.
+    camera: Camera
+    shown: Shown
+
+
+@dataclass(eq=False)
+class Seat:
+    """A visitor's place in the studio."""
+
+    painter: Paints
+    deliver: Callable[[Frame], None]
+    #: Told why a picture could not be drawn.
+    failed: Callable[[Exception], None]
+    #: What was asked for last, at full size.
+    asked: tuple[Camera, Shown] | None = None
+    quick_due: bool = False
+    full_due: bool = False
+    #: When the camera last moved.
+    moved: float = 0.0
+    #: A full picture that is being drawn.
+    work: Iterator[None] | None = None
+    #: Pixels that a quick picture may have, learned from what they take.
+    quick_px: float = 320 * 240
+    #: Seconds that a pixel of a full picture took; 0 before there was any.
+    per_px: float = field(default=0.0)
+
+
+class Studio:
+    """Draws for whoever has a seat. `step` does one piece of work; `run` does so until it is closed."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._seats: list[Seat] = []
+        self._errands: deque[Callable[[], None]] = deque()
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def seat(self, painter: Paints, deliver: Callable[[Frame], None], failed: Callable[[Exception], None]) -> Seat:
+        """A place for a new visitor."""
+        seat = Seat(painter, deliver, failed)
+        with self._changed:
+            self._seats.append(seat)
+        return seat
+
+    def leave(self, seat: Seat) -> None:
+        """The visitor is gone; nothing more is drawn for them."""
+        with self._changed:
+            if seat in self._seats:
+                self._seats.remove(seat)
+            seat.work, seat.asked = None, None
+
+    def ask(self, seat: Seat, camera: Camera, shown: Shown) -> None:
+        """What a visitor wants to see now, at full size. Replaces what they wanted before."""
+        with self._changed:
+            seat.asked, seat.moved = (camera, shown), self._clock()
+            seat.quick_due = seat.full_due = True
+            seat.work = None
+            self._changed.notify()
+
+    def errand(self, do: Callable[[], _Result]) -> Future[_Result]:
+        """Something else that needs the kernels: done next, in the thread that draws."""
+        future: Future[_Result] = Future()
+
+        def run() -> None:
+            try:
+                future.set_result(do())
+            except BaseException as error:  # raised again in whoever waits
+                future.set_exception(error)
+
+        with self._changed:
+            self._errands.append(run)
+            self._changed.notify()
+        return future
+
+    def close(self) -> None:
+        """Let `run` return."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    def run(self) -> None:
+        """Work until `close`."""
+        while True:
+            wait = self.step()
+            with self._changed:
+                if self._closed:
+                    return
+                busy = self._errands or any(seat.quick_due for seat in self._seats)
+                if wait != 0 and not busy:
+                    self._changed.wait(wait)
+
+    def step(self) -> float | None:
+        """Do one piece of work. Returns 0 if there may be more, else seconds until there will be; None: not known."""
+        with self._changed:
+            errand = self._errands.popleft() if self._errands else None
+            now = self._clock()
+            seat = None if errand else self._next(now)
+            quick = seat is not None and seat.quick_due
+            resting = [each.moved + REST - now for each in self._seats if each.full_due]
+        if errand is not None:
+            errand()
+            return 0
+        if seat is None:
+            return max(min(resting), 1e-3) if resting else None
+        try:
+            self._draw_quick(seat) if quick else self._draw_on(seat)
+        except Exception as error:  # one visitor's trouble ends no other's pictures
+            with self._changed:
+                seat.quick_due, seat.full_due, seat.work = False, False, None
+            seat.failed(error)
+        return 0
+
+    def _next(self, now: float) -> Seat | None:
+        """Whose turn it is; they go to the end of the queue."""
+        for wants in (lambda s: s.quick_due, lambda s: s.full_due and now - s.moved >= REST):
+            for seat in self._seats:
+                if seat.asked is not None and wants(seat):
+                    self._seats.remove(seat)
+                    self._seats.append(seat)
+                    return seat
+        return None
+
+    def _draw_quick(self, seat: Seat) -> None:
+        with self._changed:
+            asked, seat.quick_due = seat.asked, False
+        if asked is None:
+            return
+        whole, shown = asked
+        small = shrunk(whole, seat.quick_px)
+        if small is whole and not seat.full_due:
+            return
+        began = self._clock()
+        seat.deliver(Frame(seat.painter.paint(shown, small, small, True), False, whole, shown))
+        taken = max(self._clock() - began, 1e-4)
+        most = min(MOST_PX, whole.width * whole.height)
+        seat.quick_px = float(
+            np.clip(seat.quick_px * np.clip(QUICK / taken, 0.5, 1.5), FEWEST_PX, max(most, FEWEST_PX))
+        )
+
+    def _draw_on(self, seat: Seat) -> None:
+        """The next rows of a full picture."""
+        with self._changed:
+            asked = seat.asked
+            if asked is None:
+                return
+            if seat.work is None:
+                seat.work = self._full(seat, *asked)
+            work = seat.work
+        done = next(work, self) is self
+        with self._changed:
+            if done and seat.work is work:
+                seat.work, seat.full_due = None, False
+
+    def _full(self, seat: Seat, whole: Camera, shown: Shown) -> Iterator[None]:
+        """Draw a full picture, turn by turn, and deliver it unless something else was asked for meanwhile."""
+        seat.painter.settle(shown, whole)
+        turns = max(1, min(8, round(seat.per_px * whole.width * whole.height / TURN)))
+        edges = np.linspace(0, whole.height, turns + 1).round().astype(int).tolist()
+        parts, taken = [], 0.0
+        for top, bottom in pairwise(edges):
+            began = self._clock()
+            part = whole if turns == 1 else whole.cropped(0, top, whole.width, bottom)
+            parts.append(seat.painter.paint(shown, part, whole))
+            taken += self._clock() - began
+            if bottom != whole.height:
+                yield
+        seat.per_px = taken / (whole.width * whole.height)
+        if seat.asked == (whole, shown):
+            seat.deliver(Frame(np.concatenate(parts), True, whole, shown))
+
+
+def shrunk(camera: Camera, pixels: float) -> Camera:
+    """The same view with at most so many pixels; the very camera where it has no more."""
+    share = (pixels / (camera.width * camera.height)) ** 0.5
+    if share >= 1.0:
+        return camera
+    return camera.resized(max(1, int(camera.width * share)), max(1, int(camera.height * share)))
