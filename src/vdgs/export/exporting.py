@@ -210,7 +210,7 @@ def _losses(
     """What each file that can be read back loses, or, where none can, the Gaussians that were written."""
     if not asked.measure:
         return []
-    readable = [path for path in asked.to if registry.format_of(path).read]
+    readable: list[Path | None] = [path for path in asked.to if registry.format_of(path).read]
     task = bar.add_task("comparing with the model", total=max(1, len(readable)) * len(run.capture.test_views))
 
     def after_view() -> None:
