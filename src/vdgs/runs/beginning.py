@@ -13,6 +13,7 @@ from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
 from vdgs.captures.reconstruction import FIGURE as RECONSTRUCTION_FIGURE
 from vdgs.captures.reconstruction import FILE as RECONSTRUCTION
 from vdgs.errors import VdgsError
+from vdgs.inspection.soundness import refuse_unsound
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.keys import counted
 from vdgs.settings.capture import CaptureOptions
@@ -46,6 +47,8 @@ def begin_run(
     refuse_among_inputs(output, capture)
     method = replace(method, training=with_iterations(method.training, len(capture.train_views)))
     run = RunFolder(output)
+    if not run.config_file.exists():  # what cannot become a scene leaves no folder that other settings stumble over
+        refuse_unsound(capture)
     settings = run_settings(capture_path, capture_options, method)
     with run.locked():
         read_anew = run.config_file.exists() and reads_otherwise(run, settings)
