@@ -79,7 +79,8 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
     def run(capture: Capture, model: AnchorModel, **asked) -> Path:
         folder = SimpleNamespace(path=tmp_path / "run")
-        opened = SimpleNamespace(folder=folder, capture=capture, model=model, name="coarse")
+        status = SimpleNamespace(model="1-2")
+        opened = SimpleNamespace(folder=folder, capture=capture, model=model, name="coarse", status=status)
         monkeypatch.setattr(mapping, "open_run", lambda *_: opened)
         request = MapRequest(tmp_path / "run", device="cpu", **asked)
         return mapping.map_run(request, Console(file=sys.stderr, soft_wrap=True))

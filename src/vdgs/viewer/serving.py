@@ -45,17 +45,18 @@ def view_run(asked: ViewRequest, console: Console, opened: Callable[[str], None]
     run = open_or_last_saved(asked.run, asked.model, asked.device)
     if run.caution:
         console.print(f"[yellow]warning[/] {run.caution}", highlight=False)
-    with serve(run, asked.host, port, console) as viewer:
+    # Ctrl-C is how it ends, not how it fails, from the moment that the address is printed. Asked for anew: what reads
+    # captures has set a handler of its own.
+    ending = contextlib.suppress(KeyboardInterrupt, Interrupted)
+    with ending, stop_requests(interrupts=True), serve(run, asked.host, port, console) as viewer:
         console.print(f"{run.line}: {viewer.door.address()}", highlight=False, soft_wrap=True)
         if viewer.door.token:
             console.print("Whoever has this address can see the scene. Ctrl-C ends it.", highlight=False)
         else:
             console.print("Only this machine can open it (--host lets others in). Ctrl-C ends it.", highlight=False)
-        # Ctrl-C is how it ends, not how it fails. Asked for anew: what reads captures has set a handler of its own.
-        with contextlib.suppress(KeyboardInterrupt, Interrupted), stop_requests(interrupts=True):
-            if opened is not None:
-                opened(viewer.door.address())
-            _until_asked(viewer, asked, console)
+        if opened is not None:
+            opened(viewer.door.address())
+        _until_asked(viewer, asked, console)
 
 
 @dataclass(eq=False)
