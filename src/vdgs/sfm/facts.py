@@ -14,6 +14,7 @@ from vdgs.sfm.features import Kind
 from vdgs.sfm.look import LEAST_OVERLAP, LEAST_VIEWS, OBLIQUE_DEG, Look
 from vdgs.sfm.mapping import kinds_after
 from vdgs.sfm.positions import Positions
+from vdgs.sfm.preparing import Prepared
 
 #: A fitted focal length that left EXIF's by more than this share drifted, and so did a height over the recorded one.
 FOCAL_DRIFT, HEIGHT_DRIFT = 0.05, 0.15
@@ -23,10 +24,8 @@ TURNED_DEG = 3.0
 
 def facts_of(
     model: pycolmap.Reconstruction,
-    collection: Collection,
+    prepared: Prepared,
     kinds: Sequence[Kind],
-    positions: Positions,
-    look: Look,
     placed: Placed | None,
     origin: tuple[float, float, float] | None,
     *,
@@ -37,6 +36,7 @@ def facts_of(
     seconds: float,
 ) -> ReconstructionFacts:
     """The facts of a model that lies where it belongs."""
+    collection, positions, look = prepared.collection, prepared.positions, prepared.look
     images = [image for image in model.images.values() if image.has_pose]
     metric = placed is not None
     height = _height(model, images) if metric else None

@@ -115,7 +115,7 @@ def _steps(prepared: Prepared, work: Work, keys: dict[str, str], console: Consol
     placed, origin = _place(models[0], prepared)
     _write(prepared, work, models[0], keys["capture"], threads, console)
     facts = facts_of(
-        models[0], prepared.collection, kinds, prepared.positions, prepared.look, placed, origin, left_out=left_out,
+        models[0], prepared, kinds, placed, origin, left_out=left_out,
         components=[model.num_reg_images() for model in models], pairs=pairs, held=held,
         seconds=time.monotonic() - began,
     )  # fmt: skip
