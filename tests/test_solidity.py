@@ -137,6 +137,22 @@ def test_open_pixels_are_at_the_depth_of_their_neighbours_and_sky_is_not_seen():
     assert np.array_equal(seen, lower)
 
 
+def test_half_open_splats_beyond_what_cameras_cover_are_not_seen_by_the_depth_at_which_they_float():
+    trained, floats = [above(x, width=20) for x in (0.0, 0.1, 0.2)], above(6.0)
+    opacity = np.ones((HEIGHT, WIDTH))
+    opacity[:, 32:] = 0.6
+    deep = np.where(opacity == 1, 10.0, 40.0)
+
+    def draw(camera) -> Raster:
+        return plain_at(10.0, opacity)(camera)._replace(median_depth=torch.from_numpy(deep.astype(np.float32)))
+
+    wide = [above(0.0, width=400)] * 3
+    assert not seen_map(draw, trained)(floats)[:, 32:].any()
+    assert seen_map(draw, wide)(floats).all(), "ground that cameras hold has to be solid, however open it is"
+    ghost = plain_at(10.0, np.full((HEIGHT, WIDTH), 0.6))
+    assert seen_map(ghost, wide)(floats).all()
+
+
 def test_masks_in_an_evaluation(tmp_path: Path):
     def half_open(camera) -> Raster:
         """Opaque in the left half only."""

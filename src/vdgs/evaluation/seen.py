@@ -10,13 +10,14 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
 from vdgs.cameras import Camera
+from vdgs.evaluation.solidity import SOLID_ALPHA
 from vdgs.kernels.types import Raster
 from vdgs.model.ground import below_horizon
 from vdgs.model.visibility import visibility_of
 
 #: A pixel is seen if at least so many training cameras see the place that it shows: fewer cannot fix a depth well.
 SEEN_BY = 3
-#: At least this opaque, a pixel has a place of its own.
+#: At least this opaque, a pixel shows something that may stand before the sky.
 DRAWN_ALPHA = 0.5
 
 
@@ -26,19 +27,23 @@ def seen_map(
     """Camera of a view -> which of its pixels show a place that lies in the pictures of at least `least` of `cameras`
     (the training cameras; nothing hides anything, as in V).
 
-    The place is where the model behind `draw_depth` (a render with depth) is half opaque. Pixels that it leaves open
-    continue the depth of the nearest that are drawn, down to the ground but not up into the sky. V as it is drawn from
-    anchors would not do: at the edge of what cameras cover, splats reach far beyond the anchors that V is counted for.
+    The place is where the model behind `draw_depth` (a render with depth) is half opaque, in pixels that are solid. All
+    others continue the depth of the nearest solid ones, down to the ground but not up into the sky: beyond what cameras
+    cover, half-open splats lie at any depth, and by that depth in pictures that never saw the place (against the truth
+    of a generated town, docs/findings.md). V as it is drawn from anchors would not do: at the edge of what cameras
+    cover, splats reach far beyond the anchors that V is counted for.
     """
 
     def seen(camera: Camera) -> Bool[np.ndarray, "h w"]:
         with torch.inference_mode():
             raster = draw_depth(camera)
         assert raster.median_depth is not None
-        drawn = raster.alpha.cpu().numpy() >= DRAWN_ALPHA
+        alpha = raster.alpha.cpu().numpy()
+        drawn, solid = alpha >= DRAWN_ALPHA, alpha >= SOLID_ALPHA
         if not drawn.any():
             return drawn
-        depth = _continued(raster.median_depth.cpu().numpy(), drawn)
+        # A scene that is a ghost has no solid pixel: what it half shows has to answer for it.
+        depth = continued(raster.median_depth.cpu().numpy(), solid if solid.any() else drawn)
         places = torch.from_numpy(camera.unproject(depth).reshape(-1, 3))
         held = visibility_of(places, cameras).numpy().reshape(drawn.shape) >= least
         return held & (drawn | below_horizon(camera, *drawn.shape))
@@ -46,7 +51,7 @@ def seen_map(
     return seen
 
 
-def _continued(depth: Float[np.ndarray, "h w"], drawn: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+def continued(depth: Float[np.ndarray, "h w"], drawn: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Depth where something is drawn, elsewhere that of the nearest such pixel. At least one is drawn."""
     row, column = distance_transform_edt(~drawn, return_distances=False, return_indices=True)
     return depth[row, column]
