@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from machine import describe
 
+from machine import describe
 from vdgs.cameras import Camera
 from vdgs.evaluation.of_run import true_depth
 from vdgs.evaluation.seen import SEEN_BY, continued
