@@ -4,9 +4,10 @@
     vdgs run town --preset laptop --blocks 4 --output run
     python benchmarks/seen.py run
 
-A pixel's place is where the coarse model is half opaque; pixels less opaque than a limit continue the depth of the nearest
-others (`evaluation.seen`). Printed by limit: pixels taken for seen that are not, and the other way round, both by true
-depth, of all pixels and of those that are open (alpha below 0.95), which decide how solid a scene is said to be.
+A pixel's place is where the coarse model is half opaque; pixels less opaque than a limit continue the depth of the
+nearest others (`evaluation.seen`). Printed by limit: pixels taken for seen that are not, and the other way round,
+both by true depth, of all pixels and of those that are open (alpha below 0.95), which decide how solid
+a scene is said to be.
 """
 
 from __future__ import annotations
