@@ -19,7 +19,7 @@ SORT_FROM_CAMERAS = 8
 
 
 def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int32[Tensor, "n"]:
-    """As `reference.views.count_visibility`, to the last point: what float32 cannot decide, float64 does.
+    """As `reference.visibility.count_visibility`, to the last point: what float32 cannot decide, float64 does.
 
     O(n) memory. Fast where cameras see small parts of the scene: a block of 512 neighbours that lies inside
     or outside a frustum costs one test.
