@@ -9,8 +9,9 @@ clock, with those of the processors beside them: on a machine that does other th
 the process takes at most, its libraries and its input included, and beside it what the input took.
 
 The exponent of growth is log(t2 / t1) / log(n2 / n1) over the last two sizes: 1 is in proportion to the input.
-Stages of anchors: visibility, cut, owners, rows, figures, assignment, save, load, merge. Stages of photographs: open, facts,
-inspect, plan (vdgs run --dry-run).
+Stages of anchors: visibility, cut, owners, rows (facts of the blocks), figures, assignment (of SCORED cameras), save,
+load, merge (opened, merged and saved), start (bounds of sizes and ground of the pictures, before a step can be made).
+Stages of photographs: open, facts (fingerprint and soundness), inspect, plan (vdgs run --dry-run).
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +38,8 @@ import torch
 import made_up
 from machine import describe
 from vdgs.memory.process import forget_peak, peak_memory_bytes
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.partition.blocks import Blocks
 
 #: Blocks of a cut, of an assignment and of a merge; cameras that an assignment scores.
 BLOCKS, SCORED = 16, 30
@@ -101,8 +105,8 @@ def _owners(case: Case, folder: Path) -> Work:
     return lambda: blocks.owner(places_of(positions))
 
 
-def _cut_site(case: Case):  # type: ignore[no-untyped-def]
-    """Blocks as the method cuts them, from a tenth of the anchors at most a million."""
+def _cut_site(case: Case) -> tuple[Blocks, np.ndarray, np.ndarray]:
+    """Blocks as the method cuts them, of some of the anchors; where all anchors are, and their V."""
     from vdgs.partition.cut import cut_scene
     from vdgs.settings.method import PartitionConfig
 
@@ -136,7 +140,7 @@ def _figures(case: Case, folder: Path) -> Work:
     return draw
 
 
-def _site_model(case: Case):  # type: ignore[no-untyped-def]
+def _site_model(case: Case) -> AnchorModel:
     extent = made_up.extent_of(case.photographs)
     return made_up.model(made_up.places(case.anchors, extent), extent)
 
@@ -150,20 +154,26 @@ def _assignment(case: Case, folder: Path) -> Work:
     return lambda: score_matrix(model, blocks, cameras, AssignmentConfig())
 
 
+def _start(case: Case, folder: Path) -> Work:
+    from vdgs.model.ground import solid_cells_of_all
+    from vdgs.model.sizes import largest_log_scales
+
+    positions = torch.from_numpy(made_up.places(case.anchors, made_up.extent_of(case.photographs)))
+    cameras = made_up.flight(case.photographs)
+    return lambda: (largest_log_scales(positions, cameras), solid_cells_of_all(positions, cameras))
+
+
 def _save(case: Case, folder: Path) -> Work:
     model = _site_model(case)
     return lambda: model.save(folder / "model.safetensors")
 
 
 def _load(case: Case, folder: Path) -> Work:
-    from vdgs.model.anchor_model import AnchorModel
-
     _elsewhere(lambda: _site_model(case).save(folder / "model.safetensors"))
     return lambda: AnchorModel.load(folder / "model.safetensors")
 
 
 def _merge(case: Case, folder: Path) -> Work:
-    from vdgs.model.anchor_model import AnchorModel
     from vdgs.partition.blocks import places_of
     from vdgs.partition.merging import merge
     from vdgs.settings.method import MergeConfig
@@ -185,7 +195,7 @@ def _merge(case: Case, folder: Path) -> Work:
 
     def work() -> None:
         coarse = AnchorModel.load(folder / "coarse.safetensors")
-        trained = [AnchorModel.load(file) for file in files]
+        trained = [partial(AnchorModel.load, file) for file in files]
         merged, _ = merge(coarse, trained, blocks, of_block, MergeConfig())
         merged.save(folder / "merged.safetensors")
 
@@ -232,7 +242,7 @@ def _plan(case: Case, folder: Path) -> Work:
 
 OF_ANCHORS = {
     "visibility": _visibility, "cut": _cut, "owners": _owners, "rows": _rows, "figures": _figures,
-    "assignment": _assignment, "save": _save, "load": _load, "merge": _merge,
+    "assignment": _assignment, "save": _save, "load": _load, "merge": _merge, "start": _start,
 }  # fmt: skip
 OF_PHOTOGRAPHS = {"open": _open, "facts": _facts, "inspect": _inspect, "plan": _plan}
 STAGES = OF_ANCHORS | OF_PHOTOGRAPHS

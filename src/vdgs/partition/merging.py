@@ -115,7 +115,7 @@ def _visibility(positions: Float[Tensor, "n 3"], rows: np.ndarray, cameras: Sequ
 
 
 def _joined(pieces: Sequence[dict[str, Tensor]]) -> Anchors:
-    """One behind the other; takes the tensors out of the pieces, so that they are in memory twice one kind at a time."""
+    """One behind the other. Takes the tensors out of the pieces: only those of one name are in memory twice."""
     return Anchors(**{name: torch.cat([piece.pop(name) for piece in pieces]) for name in list(pieces[0])})
 
 

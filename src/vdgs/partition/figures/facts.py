@@ -104,8 +104,8 @@ def block_facts(positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray,
 def _panel(
     axes: Axes, index: int, facts: BlockFacts, rows: Float[np.ndarray, " b"], tone: float, step: float | None
 ) -> float:
-    """One column of the block facts for one cut; returns where its longest bar ends. Without `step`, the height of a row
-    in inches, no numbers stand beside the bars."""
+    """One column of the block facts for one cut; returns where its longest bar ends. `step` is the height of a row in
+    inches; without it no numbers stand beside the bars."""
     colours = [mixed(block_colour(block), 1.0, tone) for block in range(len(rows))]
     if index == 3:
         known = np.isfinite(facts.mean)
