@@ -254,6 +254,7 @@ def _elsewhere(work: Work) -> None:
     if child == 0:
         code = 1
         try:
+            torch.set_num_threads(1)  # threads of a process do not live on in its children, who would wait for them
             work()
             code = 0
         finally:

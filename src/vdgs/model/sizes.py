@@ -67,6 +67,6 @@ def _by_nearest(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> F
         for chosen in np.unique(nearest):
             rows = torch.from_numpy(np.flatnonzero(nearest == chosen)).to(positions.device)
             # An anchor in a camera's very centre would get a size of zero, whose logarithm is no number to train.
-            distance = project(positions[rows], cameras[alike[chosen]]).distance.clamp(min=NEAR)
+            distance = project(positions[rows], cameras[int(alike[chosen])]).distance.clamp(min=NEAR)
             near[rows] = torch.minimum(near[rows], span * distance)
     return near

@@ -129,13 +129,16 @@ def _panel(
         right = np.nan_to_num(values.astype(np.float64))
         axes.barh(rows, right, height=0.72, color=colours)
         text = [_number(float(value), index) for value in values]
-    for row, end, label in zip(rows, right, text, strict=True) if step is not None else ():
+    longest = float(np.nanmax(right, initial=0.0))
+    if step is None:
+        return longest
+    for row, end, label in zip(rows, right, text, strict=True):
         missing = label == "nan"
         axes.annotate(
             "no anchors" if missing else label, (0 if missing else end, row), (6, 0), textcoords="offset points",
             va="center", fontsize=_font(step), color=FAINT if missing else INK,
         )  # fmt: skip
-    return float(np.nanmax(right, initial=0.0))
+    return longest
 
 
 def _rows(axes: Axes, rows: list[Float[np.ndarray, " _"]], named: bool, step: float) -> None:
