@@ -63,7 +63,7 @@ def _by_nearest(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> F
     spans = np.array([_span(camera) for camera in cameras])
     for span in np.unique(spans):
         alike = np.flatnonzero(spans == span)
-        nearest = cKDTree(np.stack([cameras[index].position for index in alike])).query(places, workers=1)[1]
+        nearest = cKDTree(np.stack([cameras[int(index)].position for index in alike])).query(places, workers=1)[1]
         for chosen in np.unique(nearest):
             rows = torch.from_numpy(np.flatnonzero(nearest == chosen)).to(positions.device)
             # An anchor in a camera's very centre would get a size of zero, whose logarithm is no number to train.
