@@ -17,8 +17,8 @@ import torch
 from machine import describe
 from vdgs.cameras import Camera
 from vdgs.kernels.native import module
-from vdgs.kernels.native import views as native
-from vdgs.kernels.reference import views as reference
+from vdgs.kernels.native import visibility as native
+from vdgs.kernels.reference import visibility as reference
 
 BRUTE_FORCE_CAMERAS = 10
 #: Name, side of the square in metres, tilt of the cameras in degrees.

@@ -57,6 +57,14 @@ class Camera:
                 float(self.model == "orthographic"), NEAR, *self.whole_size]  # fmt: skip
         return np.concatenate([rigid[:3, :3].ravel(), rigid[:3, 3], tail]).astype(np.float32)
 
+    @cached_property
+    def packed_exactly(self) -> np.ndarray:
+        """The first 20 numbers of `packed` in float64: what decides which places a frustum holds."""
+        rigid = self.camera_from_world
+        tail = [self.fx, self.fy, self.cx, self.cy, self.width, self.height,
+                float(self.model == "orthographic"), NEAR]  # fmt: skip
+        return np.concatenate([rigid[:3, :3].ravel(), rigid[:3, 3], tail]).astype(np.float64)
+
     @property
     def whole_size(self) -> tuple[int, int]:
         """Width and height of the whole picture."""

@@ -44,13 +44,15 @@ def find_photographs(
             f"{folder}: {len(missing)} of {len(source.views)} images that have a camera are missing. Copy "
             f"them there, or choose another folder with --images.{listing(missing)}"
         )
-    used = {path.resolve() for path in paths}
-    spare = [
-        name
+    named = set(paths)
+    others = {
+        name: path
         for spare_folder in source.image_folders
         for name, path in find_images(spare_folder).items()
-        if path.resolve() not in used
-    ]
+        if path not in named
+    }
+    used = {path.resolve() for path in paths} if others else set()  # asked of the disk only where names differ
+    spare = [name for name, path in others.items() if path.resolve() not in used]
     if spare:
         shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
         warnings.append(f"{len(spare)} images have no camera and are not used ({shown}).")

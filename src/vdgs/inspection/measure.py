@@ -10,13 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 
 from vdgs.captures.capture import Capture
 from vdgs.captures.checks import CheckedImages
 from vdgs.figures.sampling import sample_points
 from vdgs.inspection.soundness import Soundness
-from vdgs.model.visibility import LIMITS, imbalance
+from vdgs.model.visibility import LIMITS, imbalance, visibility_of
 
 
 @dataclass(frozen=True)
@@ -128,12 +129,12 @@ def measure(
 
 
 def _ground_sample_distance(capture: Capture, points: np.ndarray) -> float | None:
-    few = sample_points(points, 20_000)
-    distances = []
+    few = np.ascontiguousarray(sample_points(points, 20_000))
+    places, distances = torch.from_numpy(few), []
     for view in capture.views:
-        depth = view.camera.project(few)[1][view.camera.sees(few)]
-        if len(depth):
-            distances.append(float(np.median(depth)) / view.camera.fx)
+        seen = np.flatnonzero(visibility_of(places, [view.camera]).numpy())
+        if len(seen):
+            distances.append(float(np.median(view.camera.project(few[seen])[1])) / view.camera.fx)
     return float(np.median(distances)) if distances else None
 
 

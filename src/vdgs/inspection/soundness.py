@@ -141,7 +141,8 @@ def _judge_seen(capture: Capture, points: np.ndarray, share_seen: float, finding
             f"no training camera sees {unseen:.0%} of the sparse points (V = 0). Points of other photographs, or a "
             "model whose cameras and points do not belong together?"
         )
-    blind = [view.name for view in capture.views if not view.camera.sees(points).any()]
+    places = torch.from_numpy(np.ascontiguousarray(points))
+    blind = [view.name for view in capture.views if not bool(visibility_of(places, [view.camera]).any())]
     if blind:
         findings.warnings.append(
             f"{len(blind)} of {len(capture.views)} photographs show none of the sparse points ({_some(blind)})."

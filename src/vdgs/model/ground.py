@@ -8,6 +8,8 @@ ground too, for there is no sky.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -16,6 +18,7 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.model.frustum import project
+from vdgs.model.groups import Groups
 
 #: Rays that lead down by at least this much, in degrees, end on the ground (choice: as far as the vertical of a capture
 #: without GPS may be wrong).
@@ -29,6 +32,12 @@ def solid_cells(ground: Float[Tensor, "g 3"], camera: Camera) -> Bool[Tensor, "r
     below the horizon."""
     known = known_cells(ground, camera)
     return known | torch.from_numpy(below_horizon(camera, *known.shape)).to(known.device)
+
+
+def solid_cells_of_all(ground: Float[Tensor, "g 3"], cameras: Sequence[Camera]) -> list[Bool[Tensor, "rows columns"]]:
+    """`solid_cells` of many cameras: each looks at the places about its frustum only."""
+    groups = Groups.of(ground) if len(ground) else None
+    return [solid_cells(ground if groups is None else ground[groups.about(camera)], camera) for camera in cameras]
 
 
 def known_cells(ground: Float[Tensor, "g 3"], camera: Camera) -> Bool[Tensor, "rows columns"]:

@@ -11,13 +11,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from vdgs.cameras import NEAR, Camera
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.model.frustum import project
+from vdgs.model.groups import Groups
 
 #: Length of a Gaussian over the longer side of the picture, at most (choice: a Gaussian may lie nearer to a camera than
 #: its anchor, and a view nearer than all cameras. With larger bounds, views of a town held some that were larger than
@@ -30,14 +33,40 @@ REACH = math.sqrt(-2.0 * math.log(ALPHA_MIN))
 def largest_log_scales(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
     """The logarithm of the largest standard deviation that Gaussians of anchors at these places may have, in units of
     the ground frame: what the nearest of the cameras (pinholes) that hold the place allows; where none holds it, the
-    nearest of all. Infinite without cameras. O(n · cameras) time, O(n) memory."""
-    held = torch.full_like(positions[:, 0], math.inf)
-    near = held.clone()
+    nearest of all. Infinite without cameras. Time in proportion to what the cameras hold, O(n) memory."""
+    bound = torch.full_like(positions[:, 0], math.inf)
+    if len(positions) == 0 or not cameras:
+        return bound.log()
+    groups = Groups.of(positions)
     for camera in cameras:
-        seen = project(positions, camera)
-        # What the longer side of the picture spans at the unit of depth.
-        span = max(camera.width, camera.height) / max(camera.fx, camera.fy)
-        held = torch.where(seen.inside, torch.minimum(held, span * seen.depth), held)
-        # An anchor in a camera's very centre would get a size of zero, whose logarithm is no number to train.
-        near = torch.minimum(near, span * seen.distance.clamp(min=NEAR))
-    return (torch.where(held.isfinite(), held, near) * (SPAN / (2.0 * REACH))).log()
+        rows = groups.about(camera)
+        seen = project(positions[rows], camera)
+        rows, depth = rows[seen.inside], seen.depth[seen.inside]
+        bound[rows] = torch.minimum(bound[rows], _span(camera) * depth)
+    rows = bound.isinf().nonzero().squeeze(1)
+    bound[rows] = _by_nearest(positions[rows], cameras)
+    return (bound * (SPAN / (2.0 * REACH))).log()
+
+
+def _span(camera: Camera) -> float:
+    """What the longer side of the picture spans at the unit of depth."""
+    return max(camera.width, camera.height) / max(camera.fx, camera.fy)
+
+
+def _by_nearest(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
+    """The least span · distance over the cameras."""
+    near = torch.full_like(positions[:, 0], math.inf)
+    if len(positions) == 0:
+        return near
+    places = torch.nan_to_num(positions.detach()).cpu().numpy()
+    # Of cameras that span alike the nearest counts: it is looked up, then measured as the held ones are.
+    spans = np.array([_span(camera) for camera in cameras])
+    for span in np.unique(spans):
+        alike = np.flatnonzero(spans == span)
+        nearest = cKDTree(np.stack([cameras[int(index)].position for index in alike])).query(places, workers=1)[1]
+        for chosen in np.unique(nearest):
+            rows = torch.from_numpy(np.flatnonzero(nearest == chosen)).to(positions.device)
+            # An anchor in a camera's very centre would get a size of zero, whose logarithm is no number to train.
+            distance = project(positions[rows], cameras[int(alike[chosen])]).distance.clamp(min=NEAR)
+            near[rows] = torch.minimum(near[rows], span * distance)
+    return near

@@ -58,10 +58,18 @@ class Blocks:
     def _cores(self) -> Cores:
         return Cores([block.core for block in self.items])
 
-    def reaches(self, index: int, places: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-        """Which places belong to the widened block: inside its boundary, or owned by it."""
+    def reaches(
+        self, index: int, places: Float[np.ndarray, "n 2"], owner: Int64[np.ndarray, " n"] | None = None
+    ) -> Bool[np.ndarray, " n"]:
+        """Which places belong to the widened block: inside its boundary, or owned by it. `owner` of the places saves
+        asking for it, where several blocks are looked at."""
         boundary = self.items[index].expanded
-        return shapely.contains_xy(boundary, places[:, 0], places[:, 1]) | (self.owner(places) == index)
+        reached = (self.owner(places) if owner is None else owner) == index
+        (west, south), (east, north) = np.array(boundary.bounds).reshape(2, 2)
+        x, y = places[:, 0], places[:, 1]
+        near = np.flatnonzero((x >= west) & (x <= east) & (y >= south) & (y <= north) & ~reached)
+        reached[near] = shapely.contains_xy(boundary, x[near], y[near])
+        return reached
 
 
 def save_blocks(path: Path, blocks: Blocks, facts: Sequence[dict[str, Any]]) -> None:

@@ -18,10 +18,14 @@ LEAST_CELLS, MOST_CELLS = 6, 512
 WINDOW, WINDOW_MARGIN = (0.01, 0.99), 0.5
 #: An α-shape is drawn through at most so many anchors.
 OUTLINE_POINTS = 20_000
+#: Cells of a grid that may have a number each in memory; of more, those with points are sorted.
+MOST_FLAGS = 1 << 24
 #: α in cells to begin with, and its growth until the shape is one polygon.
 ALPHA_CELLS, ALPHA_GROWTH = 1.0, 1.25
 #: Standard deviation of the weights with which the cells about a cell count for which cluster is the strongest there.
 SMOOTHING_CELLS = 1.5
+#: What smoothing reaches, four standard deviations, and closing, in cells.
+SMOOTHING_REACH, CLOSING_CELLS = 6, 2
 EIGHT = np.ones((3, 3), bool)
 
 
@@ -36,13 +40,33 @@ def cores_of(
     cell = cell_size(places, count)
     shapes = {label: _outline(members, cell) for label, members in _components(places, labels, count, cell).items()}
     cores: list[shapely.Polygon | None] = [None] * count
-    taken = shapely.Polygon()
-    for label in sorted(shapes, key=lambda label: (shapes[label].area, label)):
-        core = _without_slivers(largest_part(shapes[label].difference(taken)), cell / 2)
+    taken = _Taken(list(shapes.values()))
+    for place, label in sorted(enumerate(shapes), key=lambda each: (shapes[each[1]].area, each[1])):
+        core = _without_slivers(largest_part(shapes[label].difference(taken.about(place))), cell / 2)
         if not core.is_empty:
             cores[label] = core
-            taken = taken.union(core)
+            taken.take(place, core)
     return cores
+
+
+class _Taken:
+    """What the cores of smaller shapes take of the plane; asked about one shape at a time, of all that there are."""
+
+    def __init__(self, shapes: list[shapely.Polygon]) -> None:
+        self._shapes, self._tree = shapes, shapely.STRtree(shapes)
+        self._cores: dict[int, shapely.Polygon] = {}
+
+    def about(self, place: int) -> shapely.Geometry:
+        """The union of the cores whose shapes may touch this one, in the order in which they were taken."""
+        near = set(self._tree.query(self._shapes[place]).tolist())
+        taken: shapely.Geometry = shapely.Polygon()
+        for other, core in self._cores.items():
+            if other in near:
+                taken = taken.union(core)
+        return taken
+
+    def take(self, place: int, core: shapely.Polygon) -> None:
+        self._cores[place] = core
 
 
 def widen(core: shapely.Polygon, expansion: float) -> shapely.Polygon:
@@ -66,7 +90,9 @@ def cell_size(places: Float[np.ndarray, "n 2"], count: int) -> float:
     extent = float((high - low).max()) or float(np.ptp(places, axis=0).max())
     rank = min(CELL_NEIGHBOUR, len(places) - 1)
     sample = places[:: -(-len(places) // CELL_SAMPLE)]
-    distances = cKDTree(places).query(sample, k=[rank + 1])[0]
+    # Not balanced: built several times faster, and exact all the same.
+    tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
+    distances = tree.query(sample, k=[rank + 1])[0]
     wanted = CELL_FACTOR * float(np.quantile(distances, CELL_QUANTILE))
     return float(np.clip(wanted, extent / MOST_CELLS, extent / (LEAST_CELLS * np.sqrt(count))))
 
@@ -84,23 +110,62 @@ def _components(places: np.ndarray, labels: np.ndarray, count: int, cell: float)
     index = ((places - places.min(axis=0)) / cell).astype(np.int64) + 2
     rows, columns = index.max(axis=0) + 3
     flat = index[:, 0] * columns + index[:, 1]
-    most = np.zeros(rows * columns)
-    strongest = np.full(rows * columns, -1, np.int64)
-    for label in range(count):
-        anchors = np.bincount(flat[labels == label], minlength=rows * columns).reshape(rows, columns)
-        nearby = ndimage.gaussian_filter(anchors.astype(np.float64), SMOOTHING_CELLS).ravel()
-        strongest[nearby > most] = label
-        most = np.maximum(most, nearby)
-    strongest[np.bincount(flat, minlength=rows * columns) == 0] = -1
+    del index
+    strongest = _strongest(labels, flat, (int(rows), int(columns)), count)
+    own = np.flatnonzero(strongest.ravel()[flat] == labels)
+    members = np.split(
+        own[np.argsort(labels[own], kind="stable")], np.cumsum(np.bincount(labels[own], minlength=count))
+    )
     found = {}
-    for label in range(count):
-        at_home = np.flatnonzero((labels == label) & (strongest[flat] == label))
-        if len(at_home) == 0:
+    for label, window in enumerate(ndimage.find_objects(strongest + 1, count)):
+        at_home = members[label]
+        if window is None or len(at_home) == 0:
             continue
-        held = (strongest == label).reshape(rows, columns)
-        component = ndimage.label(ndimage.binary_closing(held, EIGHT), EIGHT)[0].ravel()[flat[at_home]]
+        window = _grown(window, CLOSING_CELLS, strongest.shape)
+        components = ndimage.label(ndimage.binary_closing(strongest[window] == label, EIGHT), EIGHT)[0]
+        row, column = np.divmod(flat[at_home], columns)
+        component = components[row - window[0].start, column - window[1].start]
         found[label] = places[at_home[component == np.bincount(component).argmax()]]
     return found
+
+
+def _strongest(
+    labels: Int64[np.ndarray, " n"], flat: Int64[np.ndarray, " n"], shape: tuple[int, int], count: int
+) -> Int64[np.ndarray, "rows columns"]:
+    """The cluster that is the strongest about each cell with anchors, else -1; `flat` is the cell of each anchor.
+
+    Each cluster is smoothed over a window that holds all that it reaches: as over all cells, and no slower for many.
+    """
+    most = np.zeros(shape)
+    strongest = np.full(shape, -1, np.int64)
+    order = np.argsort(labels, kind="stable")
+    ends = np.cumsum(np.bincount(labels, minlength=count))
+    for label, cells in enumerate(np.split(flat[order], ends[:-1])):
+        if len(cells) == 0:
+            continue
+        row, column = np.divmod(cells, shape[1])
+        window = _grown(
+            (slice(int(row.min()), int(row.max()) + 1), slice(int(column.min()), int(column.max()) + 1)),
+            SMOOTHING_REACH, shape,
+        )  # fmt: skip
+        above, left = window[0].start, window[1].start
+        across = window[1].stop - left
+        cells = (row - above) * across + (column - left)
+        anchors = np.bincount(cells, minlength=(window[0].stop - above) * across).reshape(-1, across)
+        nearby = ndimage.gaussian_filter(anchors.astype(np.float64), SMOOTHING_CELLS, radius=SMOOTHING_REACH)
+        strongest[window][nearby > most[window]] = label
+        most[window] = np.maximum(most[window], nearby)
+    strongest.ravel()[np.bincount(flat, minlength=strongest.size) == 0] = -1
+    return strongest
+
+
+def _grown(window: tuple[slice, slice], cells: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """A window on a grid with so many cells more to every side, as far as the grid goes."""
+    rows, columns = (
+        slice(max(0, each.start - cells), min(size, each.stop + cells))
+        for each, size in zip(window, shape, strict=True)
+    )
+    return rows, columns
 
 
 def _outline(points: Float[np.ndarray, "m 2"], cell: float) -> shapely.Polygon:
@@ -108,8 +173,7 @@ def _outline(points: Float[np.ndarray, "m 2"], cell: float) -> shapely.Polygon:
     spacing = cell / 4
     thinned = points
     while True:
-        _, first = np.unique(np.floor(points / spacing).astype(np.int64), axis=0, return_index=True)
-        thinned = points[np.sort(first)]
+        thinned = points[_first_of_cells(points, spacing)]
         if len(thinned) <= OUTLINE_POINTS:
             break
         spacing *= np.sqrt(2)
@@ -117,6 +181,19 @@ def _outline(points: Float[np.ndarray, "m 2"], cell: float) -> shapely.Polygon:
     if shape is None or shape.area < (cell / 4) ** 2:
         return shapely.MultiPoint(thinned).convex_hull.buffer(cell / 2)
     return largest_part(shape.simplify(cell / 4))
+
+
+def _first_of_cells(points: Float[np.ndarray, "m 2"], edge: float) -> Int64[np.ndarray, " c"]:
+    """The first point in each cell of a grid, ascending."""
+    cells = np.floor(points / edge).astype(np.int64)
+    cells -= cells.min(axis=0)
+    across, along = (int(size) for size in cells.max(axis=0) + 1)
+    if across * along > MOST_FLAGS:
+        return np.sort(np.unique(cells, axis=0, return_index=True)[1])
+    # Of indices that are written twice the last one stays: written backwards, the first.
+    first = np.full(across * along, -1, np.int64)
+    first[(cells[:, 0] * along + cells[:, 1])[::-1]] = np.arange(len(points))[::-1]
+    return np.sort(first[first >= 0])
 
 
 def alpha_shape(points: Float[np.ndarray, "m 2"], alpha: float) -> shapely.Polygon | None:

@@ -16,8 +16,9 @@ from vdgs.model.visibility import normalised
 EXTENT = (0.01, 0.99)
 #: Centres are fitted to at most so many anchors; all others join the nearest.
 FITTED = 300_000
-#: k-means++ starts, of which the one of least inertia is kept.
-RESTARTS = 8
+#: k-means++ starts, of which the one of least inertia is kept; fewer where there are so many clusters that each costs
+#: much and tells little (clusters of all starts together).
+RESTARTS, RESTARTED_CLUSTERS = 8, 512
 
 #: Anchors that are looked at first for being distinct.
 MOST_COMPARED = 5_000
@@ -26,7 +27,8 @@ MOST_COMPARED = 5_000
 BALANCED_FITTED, BALANCED_FITTED_EACH = 30_000, 4_000
 BALANCED_ROUNDS, BALANCED_SWEEPS = 30, 10
 BALANCED_TOLERANCE = 0.01
-CHUNK = 200_000
+#: Distances from features to centres that are in memory at once.
+CHUNK = 3_200_000
 
 
 def features_of(
@@ -81,7 +83,8 @@ def _fit(features: np.ndarray, count: int, seed: int) -> Float[np.ndarray, "coun
 
     # One thread: sums of several threads differ in their last bits from run to run.
     with threadpool_limits(1):
-        return KMeans(count, n_init=RESTARTS, random_state=seed, copy_x=True).fit(features).cluster_centers_
+        restarts = max(1, min(RESTARTS, RESTARTED_CLUSTERS // count))
+        return KMeans(count, n_init=restarts, random_state=seed, copy_x=True).fit(features).cluster_centers_
 
 
 def _fit_balanced(
@@ -131,9 +134,10 @@ def _squares(features: np.ndarray, centres: np.ndarray) -> Float[np.ndarray, "n 
 
 def _nearest(features: np.ndarray, centres: np.ndarray, weights: np.ndarray) -> Int64[np.ndarray, " n"]:
     """The centre of least |f - c|² - w, in chunks that keep memory small."""
+    chunk = max(1, CHUNK // len(centres))
     return np.concatenate(
         [
-            (_squares(features[start : start + CHUNK], centres) - weights).argmin(axis=1)
-            for start in range(0, len(features), CHUNK)
+            (_squares(features[start : start + chunk], centres) - weights).argmin(axis=1)
+            for start in range(0, len(features), chunk)
         ]
     )

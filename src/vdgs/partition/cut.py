@@ -13,6 +13,7 @@ from vdgs.memory.estimate import Need, estimate
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.boundary import cores_of, widen
 from vdgs.partition.cluster import cluster, features_of, refuse_too_many
+from vdgs.partition.nearest import Cores
 from vdgs.partition.plane import principal_plane
 from vdgs.settings.method import PartitionConfig
 
@@ -114,12 +115,18 @@ def _whole(ground: np.ndarray, expansion: float) -> Blocks:
 
 
 def _worth_training(cores: list[shapely.Polygon], places: np.ndarray, count: int) -> list[shapely.Polygon]:
-    """The cores that own more than a trifle of the anchors; at least one."""
-    while len(cores) > 1:
-        owner = Blocks(tuple(Block(core, core) for core in cores)).owner(places)
-        owned = np.bincount(owner, minlength=len(cores))
+    """The cores that own more than a trifle of the anchors; at least one.
+
+    The least goes first. What it owned goes to others of those that are left; nothing else changes its owner.
+    """
+    found, left = Cores(cores), np.arange(len(cores))
+    owner = found.nearest(places)
+    while len(left) > 1:
+        owned = np.bincount(owner, minlength=len(cores))[left]
         least = int(owned.argmin())
         if owned[least] >= LEAST_SHARE * len(places) / count:
             break
-        cores = cores[:least] + cores[least + 1 :]
-    return cores
+        orphans = np.flatnonzero(owner == left[least])
+        left = np.delete(left, least)
+        owner[orphans] = found.nearest(places[orphans], among=left)
+    return [cores[index] for index in left]

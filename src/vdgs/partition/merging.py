@@ -8,7 +8,7 @@ Symbols: V_i, the number of cameras that hold anchor i in their frustum (section
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,7 +29,7 @@ from vdgs.settings.method import MergeConfig
 
 def merge(
     coarse: AnchorModel,
-    trained: Sequence[AnchorModel | None],
+    trained: Sequence[AnchorModel | Callable[[], AnchorModel] | None],
     blocks: Blocks,
     cameras_of_block: Sequence[Sequence[Camera]],
     config: MergeConfig,
@@ -41,7 +41,8 @@ def merge(
     A trained model holds the anchors that its block was free to move: those that it owns, and those of its ring unless
     that was frozen. The result keeps, block after block and in their order, the anchors of each block at the places
     that the rule gives to it. With `allow_missing` the coarse anchors stand in at places whose owner is None.
-    Memory: one copy of the merged anchors beside the trained ones.
+    Memory: the coarse anchors, the merged ones, and half of those again while they are put together. Trained ones may
+    be given by what opens them: one block at a time is then open.
 
     Raises VdgsError for a missing block (unless allowed), and for a block that shows that it was not trained from
     `coarse`: by its grid, or by other bits of a frozen decoder.
@@ -51,25 +52,24 @@ def merge(
     missing = [index for index, model in enumerate(trained) if model is None]
     if missing and not allow_missing:
         raise VdgsError(_missing_message(missing))
-    for index, model in enumerate(trained):
-        if model is not None:
-            _check_origin(index, model, coarse)
     coarse_owner = blocks.owner(places_of(coarse.anchors.positions)) if missing else None
-    selected, pieces, became = [], [], []
-    for index, model in enumerate(trained):
+    selected, pieces, became, own = [], [], [], False
+    for index, given in enumerate(trained):
+        model = given() if callable(given) else given
         if model is None:
             assert coarse_owner is not None
             piece = coarse.anchors.select(torch.from_numpy(coarse_owner == index))
             trained_here, kept, from_coarse = 0, 0, len(piece)
         else:
+            _check_origin(index, model, coarse)
             givers = giver_of_places(model.anchors.positions, blocks, cameras_of_block, config, missing)
             piece = model.anchors.select(torch.from_numpy(givers == index))
             trained_here, kept, from_coarse = len(model.anchors), len(piece), 0
+            own = own or has_own_decoder(model)
         unseen = int((visibility_of(piece.positions, cameras_of_block[index]) == 0).sum())
         pieces.append(Part(len(piece), coarse.decoder if model is None else model.decoder))
-        selected.append(piece)
+        selected.append(piece.tensors())
         became.append(MergedBlock(index, trained_here, kept, trained_here - kept, from_coarse, unseen))
-    own = any(model is not None and has_own_decoder(model) for model in trained)
     return replace(coarse, anchors=_joined(selected), parts=tuple(pieces) if own else ()), became
 
 
@@ -102,7 +102,7 @@ def giver_of_places(
         rows = np.flatnonzero(owner == index)
         most[rows] = _visibility(positions, rows, cameras_of_block[index])
     for index in (each for each in range(len(blocks)) if each not in missing):
-        rows = np.flatnonzero(blocks.reaches(index, places) & (owner != index) & ~np.isin(owner, missing))
+        rows = np.flatnonzero(blocks.reaches(index, places, owner) & (owner != index) & ~np.isin(owner, missing))
         visibility = _visibility(positions, rows, cameras_of_block[index])
         better = visibility > most[rows]
         giver[rows[better]], most[rows[better]] = index, visibility[better]
@@ -114,9 +114,9 @@ def _visibility(positions: Float[Tensor, "n 3"], rows: np.ndarray, cameras: Sequ
     return visibility_of(positions[torch.from_numpy(rows)], cameras).numpy()
 
 
-def _joined(pieces: Sequence[Anchors]) -> Anchors:
-    tensors = [piece.tensors() for piece in pieces]
-    return Anchors(**{name: torch.cat([each[name] for each in tensors]) for name in tensors[0]})
+def _joined(pieces: Sequence[dict[str, Tensor]]) -> Anchors:
+    """One behind the other. Takes the tensors out of the pieces: only those of one name are in memory twice."""
+    return Anchors(**{name: torch.cat([piece.pop(name) for piece in pieces]) for name in list(pieces[0])})
 
 
 def _check_origin(index: int, model: AnchorModel, coarse: AnchorModel) -> None:

@@ -3,6 +3,9 @@ one.
 
 A cell of half-diagonal r about its centre c belongs to core k as a whole where every other core is farther from c than
 k by more than 2 r. What is left is divided into smaller cells, until looking at the places themselves is cheaper.
+
+Which cores a cell or a place may belong to is kept as pairs, sorted by the first and then by the core: few cores are
+near one place, however many there are.
 """
 
 from __future__ import annotations
@@ -10,10 +13,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float, Int64
 
 #: A cell is divided into so many by so many.
 DIVISION = 4
@@ -23,38 +27,63 @@ PLACES_PER_CELL = 2
 ROUNDING = 1e-13
 
 
+class _Pairs(NamedTuple):
+    """Cells or places by number, and the cores that are asked of each: ascending by `of`, then by `core`."""
+
+    of: Int64[np.ndarray, " p"]
+    core: Int64[np.ndarray, " p"]
+
+    def starts(self) -> Int64[np.ndarray, " c"]:
+        """Where the pairs of each cell or place begin; each has at least one."""
+        return np.flatnonzero(np.diff(self.of, prepend=-1))
+
+    def inherited(self, parents: Int64[np.ndarray, " c"], count: int) -> _Pairs:
+        """The pairs of the children, in the order in which `parents` names their parents out of `count`."""
+        sizes = np.bincount(self.of, minlength=count)
+        begins = (np.cumsum(sizes) - sizes)[parents]
+        sizes = sizes[parents]
+        ends = np.cumsum(sizes)
+        rank = np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - sizes, sizes)
+        return _Pairs(np.repeat(np.arange(len(parents)), sizes), self.core[np.repeat(begins, sizes) + rank])
+
+
 @dataclass(frozen=True, eq=False)
 class Cores:
     """Polygons on the plane without common area; at least one."""
 
     shapes: Sequence[shapely.Polygon]
 
-    def nearest(self, places: Float[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
-        """The core of every place: which holds it, else which is nearest; the first of equals.
+    def nearest(
+        self, places: Float[np.ndarray, "n 2"], among: Int64[np.ndarray, " k"] | None = None
+    ) -> Int64[np.ndarray, " n"]:
+        """The core of every place: which holds it, else which is nearest; the first of equals. `among`: the cores, at
+        least one and ascending, that are asked; by default all.
 
         Raises ValueError if a place is not finite.
         """
         if not np.isfinite(places).all():
             raise ValueError("places that are not finite numbers have no owner")
-        owner = np.zeros(len(places), np.int64)
-        if len(self.shapes) == 1:
+        asked = np.arange(len(self.shapes)) if among is None else among
+        owner = np.full(len(places), asked[0], np.int64)
+        if len(asked) == 1:
             return owner
         # Far places apart from the others: a box that holds them all would have to be divided many times.
         far = ((places < self._box[0]) | (places > self._box[1])).any(axis=1)
         for some in (np.flatnonzero(~far), np.flatnonzero(far)):
             if len(some):
-                owner[some] = self._nearest(places[some])
+                owner[some] = self._nearest(places[some], asked)
         return owner
 
-    def _nearest(self, places: Float[np.ndarray, "n 2"]) -> Int64[np.ndarray, " n"]:
+    def _nearest(self, places: Float[np.ndarray, "n 2"], asked: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " n"]:
         owner = np.full(len(places), -1, np.int64)
-        left, candidates = self._decide_cells(places, owner)
-        owner[left] = self._distances(places[left], candidates).argmin(axis=1)
+        left, pairs = self._decide_cells(places, owner, asked)
+        if len(left):
+            owner[left] = self._first_nearest(places[left], pairs)
         return owner
 
     def _decide_cells(
-        self, places: Float[np.ndarray, "n 2"], owner: Int64[np.ndarray, " n"]
-    ) -> tuple[Int64[np.ndarray, " m"], Bool[np.ndarray, "m k"]]:
+        self, places: Float[np.ndarray, "n 2"], owner: Int64[np.ndarray, " n"], asked: Int64[np.ndarray, " k"]
+    ) -> tuple[Int64[np.ndarray, " m"], _Pairs]:
         """Fill in `owner` for the places of cells that belong to one core; the indices and candidates of the others.
 
         The cells of the first round divide the box of all places, those of the next the undecided cells of the last.
@@ -62,47 +91,70 @@ class Cores:
         low, high = places.min(axis=0), places.max(axis=0)
         edge, least = float((high - low).max()), 1e3 * ROUNDING * float(np.abs(places).max())
         left, parents = np.arange(len(places)), np.zeros(len(places), np.int64)
-        corners, candidates = low[None], np.ones((1, len(self.shapes)), bool)
+        asked = self._about(low, high, asked)
+        corners, pairs = low[None], _Pairs(np.zeros(len(asked), np.int64), asked)
         while edge > least and len(left) > PLACES_PER_CELL * len(corners) * DIVISION**2:
             edge /= DIVISION
             within = ((places[left] - corners[parents]) / edge).astype(np.int64).clip(0, DIVISION - 1)
             cells, parents = _occupied(parents * DIVISION**2 + within[:, 0] * DIVISION + within[:, 1], len(corners))
             above, inner = np.divmod(cells, DIVISION**2)
+            pairs = pairs.inherited(above, len(corners))
             corners = corners[above] + edge * np.stack(np.divmod(inner, DIVISION), axis=1)
-            candidates = self._candidates(corners + edge / 2, edge * np.sqrt(0.5), candidates[above])
-            sole = candidates.sum(axis=1) == 1
+            pairs = self._candidates(corners + edge / 2, edge * np.sqrt(0.5), pairs)
+            starts = pairs.starts()
+            sole = np.diff(starts, append=len(pairs.of)) == 1
             decided = sole[parents]
-            owner[left[decided]] = candidates.argmax(axis=1)[parents[decided]]
-            left, corners, candidates = left[~decided], corners[~sole], candidates[~sole]
-            parents = (np.cumsum(~sole) - 1)[parents[~decided]]
-        return left, candidates[parents]
+            owner[left[decided]] = pairs.core[starts][parents[decided]]
+            renumbered = np.cumsum(~sole) - 1
+            open_pairs = ~sole[pairs.of]
+            pairs = _Pairs(renumbered[pairs.of[open_pairs]], pairs.core[open_pairs])
+            left, corners = left[~decided], corners[~sole]
+            parents = renumbered[parents[~decided]]
+        return left, pairs.inherited(parents, len(corners))
 
-    def _candidates(
-        self, centres: Float[np.ndarray, "c 2"], radius: float, candidates: Bool[np.ndarray, "c k"]
-    ) -> Bool[np.ndarray, "c k"]:
-        """Which of the candidates can be the nearest to a place within `radius` of each centre."""
-        distance = self._distances(centres, candidates)
+    def _about(
+        self, low: Float[np.ndarray, "2"], high: Float[np.ndarray, "2"], asked: Int64[np.ndarray, " k"]
+    ) -> Int64[np.ndarray, " some"]:
+        """Those of the cores that can be the nearest to a place of a box, by their own boxes alone."""
+        lows, highs = self._boxes[asked, :2], self._boxes[asked, 2:]
+        least = np.linalg.norm(np.maximum(np.maximum(lows - high, low - highs), 0.0), axis=1)
+        most = np.linalg.norm(np.maximum(highs - low, high - lows), axis=1)
+        return asked[least <= most.min() * (1 + 1e-9) + ROUNDING * np.abs(self._box).max()]
+
+    def _candidates(self, centres: Float[np.ndarray, "c 2"], radius: float, pairs: _Pairs) -> _Pairs:
+        """Those of the pairs whose core can be the nearest to a place within `radius` of its cell's centre."""
+        distance = self._distances(centres, pairs)
         slack = 2 * radius + ROUNDING * (np.abs(centres).max() + np.abs(self._box).max())
-        return distance <= distance.min(axis=1, keepdims=True) + slack
+        near = distance <= np.minimum.reduceat(distance, pairs.starts())[pairs.of] + slack
+        return _Pairs(pairs.of[near], pairs.core[near])
 
-    def _distances(
-        self, places: Float[np.ndarray, "n 2"], candidates: Bool[np.ndarray, "n k"]
-    ) -> Float[np.ndarray, "n k"]:
-        """From every place to its candidates, 0 inside; infinite to all other cores."""
-        points = shapely.points(places)
-        distance = np.full(candidates.shape, np.inf)
-        for index, shape in enumerate(self.shapes):
-            asked = np.flatnonzero(candidates[:, index])
-            # Whether a core holds a place is asked much faster than how far it is.
-            held = shapely.contains_xy(shape, places[asked])
-            distance[asked[held], index] = 0.0
-            distance[asked[~held], index] = shapely.distance(self._edges[index], points[asked[~held]])
+    def _first_nearest(self, places: Float[np.ndarray, "n 2"], pairs: _Pairs) -> Int64[np.ndarray, " n"]:
+        """The first of the cores that are nearest to each place."""
+        distance = self._distances(places, pairs)
+        nearest = np.flatnonzero(distance == np.minimum.reduceat(distance, pairs.starts())[pairs.of])
+        return pairs.core[nearest[np.diff(pairs.of[nearest], prepend=-1) > 0]]
+
+    def _distances(self, places: Float[np.ndarray, "n 2"], pairs: _Pairs) -> Float[np.ndarray, " p"]:
+        """From the place of each pair to its core, 0 inside."""
+        distance = np.zeros(len(pairs.of))
+        # A core at a time: whether it holds a place is asked of a prepared one, much faster than how far it is.
+        order = np.argsort(pairs.core, kind="stable")
+        cores, begins = np.unique(pairs.core[order], return_index=True)
+        for core, rows in zip(cores.tolist(), np.split(order, begins[1:]), strict=True):
+            asked = places[pairs.of[rows]]
+            outside = ~shapely.contains_xy(self.shapes[core], asked)
+            distance[rows[outside]] = shapely.distance(self._edges[core], shapely.points(asked[outside]))
         return distance
 
     @cached_property
     def _edges(self) -> list[shapely.Geometry]:
         """The edges of each core, holes included."""
         return [shape.boundary for shape in self.shapes]
+
+    @cached_property
+    def _boxes(self) -> Float[np.ndarray, "k 4"]:
+        """Low x and y, high x and y of each core."""
+        return np.asarray(shapely.bounds(np.array(self.shapes, object)), np.float64)
 
     @cached_property
     def _box(self) -> Float[np.ndarray, "2 2"]:

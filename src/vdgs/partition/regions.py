@@ -31,7 +31,8 @@ def split_anchors(anchors: Anchors, blocks: Blocks, index: int, config: BlockCon
     and, with `config.context`, everything else.
     """
     place = places_of(anchors.positions)
-    core, reached = blocks.owner(place) == index, blocks.reaches(index, place)
+    owner = blocks.owner(place)
+    core, reached = owner == index, blocks.reaches(index, place, owner)
     own = core if config.ring == "frozen" else reached
     around = ~own if config.context else reached & ~own
     device = anchors.positions.device

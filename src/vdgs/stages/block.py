@@ -21,7 +21,7 @@ from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.ground import solid_cells
+from vdgs.model.ground import solid_cells_of_all
 from vdgs.model.sizes import largest_log_scales
 from vdgs.model.visibility import effective_count
 from vdgs.partition.blocks import Blocks
@@ -102,7 +102,7 @@ def _train(
             surroundings=Surroundings(surroundings, coarse.decoder),
             may_hold=holds(blocks, index, method.block), mobility=ramp(blocks, index, method.block),
             appearance_of=chosen, shares=shares, crops=crops,
-            ground=[solid_cells(ground, view.camera) for view in views],
+            ground=solid_cells_of_all(ground, [view.camera for view in views]),
             largest=lambda positions: largest_log_scales(positions, flown),
         )  # fmt: skip
         state = continue_or_start(folder, stage, lambda: start_state(anchors, coarse.decoder.copy(), stage), console)

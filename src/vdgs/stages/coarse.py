@@ -14,7 +14,7 @@ from vdgs.inspection.starting import refuse_unworkable
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.ground import solid_cells
+from vdgs.model.ground import solid_cells_of_all
 from vdgs.model.sizes import largest_log_scales
 from vdgs.model.start import initial_anchors
 from vdgs.runs.flight import keep_flight
@@ -83,7 +83,7 @@ def open_stage(
     stage = Stage(
         config, images, len(cameras), voxel, camera_height(capture), background=background,
         shares=shares_for(config, anchors, cameras), device=torch.device(device),
-        ground=[solid_cells(ground, camera) for camera in cameras],
+        ground=solid_cells_of_all(ground, cameras),
         largest=lambda positions: largest_log_scales(positions, cameras),
     )  # fmt: skip
     return stage, anchors

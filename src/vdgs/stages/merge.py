@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -11,7 +12,7 @@ from rich.console import Console
 from vdgs.errors import RunError
 from vdgs.memory.process import forget_peak, peak_memory_bytes
 from vdgs.partition.merging import merge
-from vdgs.runs.cut import blocks_of, views_of_block
+from vdgs.runs.cut import blocks_of, views_of_blocks
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
 from vdgs.runs.standing import standing_of
@@ -40,10 +41,11 @@ def merge_run(path: Path, incomplete: bool, console: Console) -> None:
         began = time.monotonic()
         opened = open_run(path, "coarse")
         capture, coarse = opened.capture, opened.model
-        cameras = [
-            [capture.train_views[i].camera for i in views_of_block(run, capture, index)] for index in range(len(blocks))
+        views = capture.train_views
+        cameras = [[views[i].camera for i in of_block] for of_block in views_of_blocks(run, capture)]
+        trained = [
+            partial(load_vouched, run.block(i), keys.blocks, i) if whole else None for i, whole in enumerate(done)
         ]
-        trained = [load_vouched(run.block(i), keys.blocks, i) if whole else None for i, whole in enumerate(done)]
         merged, became = merge(coarse, trained, blocks, cameras, run.method().merge, allow_missing=incomplete)
         run.merged.discard_unless(key)
         merged = replace(merged, facts={**merged.facts, "key": key})

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from vdgs.cameras import Camera
-from vdgs.synth.sparse import SparseCloud
+from vdgs.synth.sparse import SparseCloud, observations_by_image
 
 
 def write_model(folder: Path, cameras: list[Camera], names: list[str], cloud: SparseCloud) -> None:
@@ -29,8 +29,8 @@ def write_model(folder: Path, cameras: list[Camera], names: list[str], cloud: Sp
         )
     )
     place_in_image = np.empty(len(cloud.observed_image), np.int64)
-    for k, (camera, name) in enumerate(zip(cameras, names, strict=True)):
-        at = np.flatnonzero(cloud.observed_image == k)
+    of_image = observations_by_image(cloud.observed_image, len(cameras))
+    for k, (camera, name, at) in enumerate(zip(cameras, names, of_image, strict=True)):
         place_in_image[at] = np.arange(len(at))
         pose = camera.camera_from_world
         image = pycolmap.Image(name=name, keypoints=cloud.observed_px[at], camera_id=1, image_id=k + 1)

@@ -19,6 +19,8 @@ from vdgs.synth.tracing import Tracer
 
 #: Pictures that look at a place from directions further apart than this are never matched (degrees).
 _WIDEST = 65.0
+#: Pairs of a place and a picture whose directions are in memory at once.
+_PAIRS = 4_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,14 +74,24 @@ def _matched(
     """In which of the pictures that see it a place is also recognised: the likelier, the nearer to the
     direction of the picture it was found in (`home`), [n, cameras] bool."""
     positions = np.stack([camera.position for camera in cameras])
-    ray = places[:, None] - positions
-    ray /= np.linalg.norm(ray, axis=2, keepdims=True)
-    own = ray[np.arange(len(places)), home]
-    apart = np.degrees(np.arccos(np.clip(np.einsum("nkc,nc->nk", ray, own), -1, 1)))
-    chance = 0.9 * np.clip(1 - apart / _WIDEST, 0, 1)
-    matched = visible & (rng.random(visible.shape) < chance)
+    matched = np.zeros_like(visible)
+    step = max(1, _PAIRS // len(cameras))
+    for start in range(0, len(places), step):
+        some = slice(start, start + step)
+        ray = places[some, None] - positions
+        ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+        own = ray[np.arange(len(ray)), home[some]]
+        apart = np.degrees(np.arccos(np.clip(np.einsum("nkc,nc->nk", ray, own), -1, 1)))
+        chance = 0.9 * np.clip(1 - apart / _WIDEST, 0, 1)
+        matched[some] = visible[some] & (rng.random(chance.shape) < chance)
     matched[np.arange(len(places)), home] = visible[np.arange(len(places)), home]
     return matched
+
+
+def observations_by_image(image: np.ndarray, count: int) -> list[np.ndarray]:
+    """The observations of each of `count` images, ascending; `image` [m] says of which each is."""
+    ends = np.cumsum(np.bincount(image, minlength=count))
+    return np.split(np.argsort(image, kind="stable"), ends[:-1])
 
 
 def _adjusted(
@@ -91,8 +103,7 @@ def _adjusted(
     """
     normal = np.zeros((len(places), 3, 3))
     right = np.zeros((len(places), 3))
-    for k, camera in enumerate(cameras):
-        at = np.flatnonzero(image == k)
+    for camera, at in zip(cameras, observations_by_image(image, len(cameras)), strict=True):
         rotation = camera.camera_from_world[:3, :3]
         local = places[point[at]] @ rotation.T + camera.camera_from_world[:3, 3]
         x, y, z = local.T
@@ -122,7 +133,7 @@ def sparse_cloud(
     rng: np.random.Generator,
 ) -> SparseCloud:
     """At most `count` points out of the seeds of all images (`seeds[k]` from `cameras[k]`), all seen in
-    at least two pictures. O(points x images)."""
+    at least two pictures. O(points x images): a byte of memory for each."""
     places = np.concatenate([seed.points for seed in seeds])
     colours = np.concatenate([seed.colours for seed in seeds])
     home = np.repeat(np.arange(len(seeds)), [len(seed.points) for seed in seeds])
@@ -133,15 +144,14 @@ def sparse_cloud(
     places, colours, visible, matched = places[kept], colours[kept], visible[kept], matched[kept]
     point, image = np.nonzero(matched)
     truth = np.empty((len(point), 2))
-    for k, camera in enumerate(cameras):
-        at = image == k
+    of_image = observations_by_image(image, len(cameras))
+    for camera, at in zip(cameras, of_image, strict=True):
         truth[at] = camera.project(places[point[at]])[0]
     noise = rng.normal(0, noise_px, truth.shape) if noise_px > 0 else np.zeros_like(truth)
     points = _adjusted(cameras, places, point, image, noise)
     observed = truth + noise
     residual = np.empty(len(point))
-    for k, camera in enumerate(cameras):
-        at = image == k
+    for camera, at in zip(cameras, of_image, strict=True):
         residual[at] = np.linalg.norm(camera.project(points[point[at]])[0] - observed[at], axis=1)
     errors = np.bincount(point, residual, len(places)) / np.maximum(np.bincount(point, minlength=len(places)), 1)
     wrong = np.zeros(len(places), bool)

@@ -34,10 +34,28 @@ def true_visibility(tracer: Tracer, cameras: list[Camera], places: np.ndarray) -
     return visible
 
 
+def _about(cameras: list[Camera], places: np.ndarray) -> list[Camera]:
+    """The cameras whose frustum can hold any of the places, by the ball about them: few of many for a single view."""
+    if len(places) == 0:
+        return []
+    low, high = places.min(axis=0), places.max(axis=0)
+    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+    poses = np.stack([camera.camera_from_world for camera in cameras])
+    x, y, z = (poses[:, :3, :3] @ middle + poses[:, :3, 3]).T
+    fx, fy, cx, cy, width, height = np.array(
+        [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras], np.float64
+    ).T
+    reach = radius * (1 + 1e-9) + 1e-6
+    held = z > -reach
+    for focal, side, along in ((fx, cx, x), (-fx, width - cx, x), (fy, cy, y), (-fy, height - cy, y)):
+        held &= (focal * along + side * z) / np.hypot(focal, side) > -reach
+    return [camera for camera, near in zip(cameras, held.tolist(), strict=True) if near]
+
+
 def count_visibility(tracer: Tracer, cameras: list[Camera], places: np.ndarray) -> np.ndarray:
     """How many of the cameras truly see each place [n, 3], [n] uint16."""
     count = np.zeros(len(places), np.uint16)
-    for camera in cameras:
+    for camera in _about(cameras, places):
         count[in_sight(tracer, camera, places)] += 1
     return count
 

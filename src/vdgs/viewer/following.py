@@ -14,7 +14,7 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.partition.merging import merge
-from vdgs.runs.cut import blocks_of, views_of_block
+from vdgs.runs.cut import blocks_of, views_of_blocks
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.opening import TrainedRun, open_capture, open_run
 from vdgs.runs.standing import standing_of
@@ -100,10 +100,8 @@ def _with_blocks(coarse: TrainedRun) -> TrainedRun | None:
         trained.append(_block_so_far(coarse, run.block(index), keys.blocks, index, own))
     if not any(trained):
         return None
-    cameras = [
-        [coarse.capture.train_views[view].camera for view in views_of_block(run, coarse.capture, index)]
-        for index in range(len(blocks))
-    ]
+    views = coarse.capture.train_views
+    cameras = [[views[view].camera for view in of_block] for of_block in views_of_blocks(run, coarse.capture)]
     model = coarse.model.to(torch.device("cpu"))
     merged, _ = merge(model, trained, blocks, cameras, run.method().merge, allow_missing=True)
     shown = sum(each is not None for each in trained)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
-from vdgs.cameras import NEAR, Camera
+from vdgs.cameras import Camera
 from vdgs.kernels.native import module
 from vdgs.kernels.native.cells import morton_order
 from vdgs.kernels.reference.visibility import check_points
@@ -19,7 +19,7 @@ SORT_FROM_CAMERAS = 8
 
 
 def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int32[Tensor, "n"]:
-    """As `reference.views.count_visibility`, to the last point: what float32 cannot decide, float64 does.
+    """As `reference.visibility.count_visibility`, to the last point: what float32 cannot decide, float64 does.
 
     O(n) memory. Fast where cameras see small parts of the scene: a block of 512 neighbours that lies inside
     or outside a frustum costs one test.
@@ -28,7 +28,7 @@ def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) ->
     count = torch.zeros(points.shape[0], dtype=torch.int32)
     if len(cameras) == 0 or points.shape[0] == 0:
         return count
-    packed = np.stack([_pack(camera) for camera in cameras])
+    packed = np.stack([camera.packed_exactly for camera in cameras])
     points = points.detach().contiguous()
     if len(cameras) < SORT_FROM_CAMERAS:
         module.native().count_visibility(points, packed, count)
@@ -43,11 +43,3 @@ def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) ->
 def mark_visible(points: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, "n"]:
     """Which points one camera sees."""
     return count_visibility(points, [camera]) > 0
-
-
-def _pack(camera: Camera) -> np.ndarray:
-    """The numbers that visibility.cpp reads, [20] float64, in the order of its ViewCamera."""
-    rigid = camera.camera_from_world
-    tail = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
-            float(camera.model == "orthographic"), NEAR]  # fmt: skip
-    return np.concatenate([rigid[:3, :3].ravel(), rigid[:3, 3], tail]).astype(np.float64)

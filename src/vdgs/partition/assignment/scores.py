@@ -16,7 +16,6 @@ from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
 import numpy as np
-import shapely
 import torch
 from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
@@ -131,13 +130,9 @@ class _Members:
         positions = model.anchors.positions
         places = places_of(positions)
         owner = blocks.owner(places)
-        # Blocks.reaches asks for the owners anew for each block: with millions of anchors, minutes.
-        reached = np.stack(
-            [
-                shapely.contains_xy(block.expanded, places[:, 0], places[:, 1]) | (owner == index)
-                for index, block in enumerate(blocks.items)
-            ]
-        )
+        reached = np.empty((len(blocks), len(places)), bool)
+        for index in range(len(blocks)):
+            reached[index] = blocks.reaches(index, places, owner)
         near = choose(positions.device).morton_order(positions).cpu().numpy()
         order = near[np.argsort(owner[near], kind="stable")]
         bounds = [0, *np.cumsum(np.bincount(owner, minlength=len(blocks))).tolist()]
@@ -177,7 +172,14 @@ def _rendered_scores(
     full = draw(splats, camera, splats.means_px.new_zeros(3))
     owner, reached = members.owner[anchor], members.reached[:, anchor]
     scores, covered = [], []
-    for index in range(len(reached)):
+    blank = Raster(torch.zeros_like(full.image), torch.zeros_like(full.alpha), None)
+    alike_to_blank = alike_share(blank, full, config.tau) if config.mode == "literal" else 0.0
+    # Most of many blocks are nowhere in a view: what they give is known.
+    for index, shown in enumerate(reached.any(dim=1).tolist()):
+        if not shown:
+            covered.append(0.0)
+            scores.append(alike_to_blank)
+            continue
         block = _draw_some(splats, reached[index], full, camera)
         covered.append(covered_share(block, full, config.tau))
         if config.mode == "literal":

@@ -61,7 +61,7 @@ def assignment_rows(
                 best_block=int(np.count_nonzero(why == BEST_BLOCK)),
                 topped_up=int(np.count_nonzero(why == TOPPED_UP)),
                 anchors_core=int(np.count_nonzero(own)),
-                anchors_expanded=int(np.count_nonzero(blocks.reaches(index, places))),
+                anchors_expanded=int(np.count_nonzero(blocks.reaches(index, places, owner))),
                 mean_v=float(visibility[own].mean()) if own.any() else None,
                 std_v=float(visibility[own].std()) if own.any() else None,
                 area=float(block.core.area),

@@ -16,6 +16,9 @@ from vdgs.figures.style import DPI, FAINT, INK, placer, plain, titles
 from vdgs.partition.blocks import Blocks, places_of
 from vdgs.partition.figures.words import block_colour, count_of, mixed
 
+#: The rows of all blocks take at most so many inches, and from so few a row on they are numbered.
+TALLEST, LEAST_STEP = 40.0, 0.05
+
 
 def draw_block_facts(
     file: Path,
@@ -36,7 +39,9 @@ def draw_block_facts(
     if compare is not None:
         rows.append(len(blocks) + 2.5 + np.arange(len(compare)))
     count = float(rows[-1][-1] + 2)  # one row above the blocks names the cut
-    step = float(np.clip(14 / count, 0.13, 0.3))  # inches
+    # Inches; thousands of blocks make a picture that can still be opened, in which numbers are too small to be set.
+    step = min(float(np.clip(14 / count, 0.13, 0.3)), TALLEST / count)
+    set_numbers = step > LEAST_STEP
     figure = Figure(figsize=(14.5, 2.15 + step * count), dpi=DPI)
     canvas, place = FigureCanvasAgg(figure), placer(figure)
     panels = [place(1.15 + 2.65 * index, 0.65, 2.3, step * count) for index in range(5)]
@@ -46,19 +51,27 @@ def draw_block_facts(
     )  # fmt: skip
     for index, (axes, name) in enumerate(zip(panels, names, strict=True)):
         ends = [
-            _panel(axes, index, group, places, tone, step)
+            _panel(axes, index, group, places, tone, step if set_numbers else None)
             for group, places, tone in zip(groups, rows, (1.0, 0.45), strict=False)
         ]
         # From 0, with room for the number right of the longest bar.
         axes.set_xlim(0, 1.38 * max(ends) or 1.0)
         axes.set_ylim(count - 1.3, -1.3)
         axes.set_title(name, loc="left", fontsize=10, color=INK)
-        _rows(axes, rows, index == 0, step)
+        _rows(axes, rows, index == 0 and set_numbers, step)
         axes.xaxis.set_major_locator(MaxNLocator(3, integer=index < 2, min_n_ticks=1))
     note = "mean over the blocks of the standard deviation of V within each: " + _both(groups)
     captions = ("",) if compare is None else ("this cut", "cut by place alone, λ_vis = 0 (numbers of its own)")
     for places, caption in zip(rows, captions, strict=True):
-        panels[0].text(0, places[0] - 0.95, caption, va="center", fontsize=_font(step), fontweight="bold", color=INK)
+        panels[0].text(
+            0,
+            places[0] - 0.95,
+            caption,
+            va="center",
+            fontsize=_font(step) if set_numbers else 8.0,
+            fontweight="bold",
+            color=INK,
+        )
     lower = "colours and numbers are those of the map of blocks"
     titles(figure, count_of(len(blocks), "block"), note, lower)
     canvas.print_png(file)  # type: ignore[arg-type]
@@ -88,8 +101,11 @@ def block_facts(positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray,
     return BlockFacts(np.array([len(v) for v in seen]), None, area, *of_views.T)
 
 
-def _panel(axes: Axes, index: int, facts: BlockFacts, rows: Float[np.ndarray, " b"], tone: float, step: float) -> float:
-    """One column of the block facts for one cut; returns where its longest bar ends."""
+def _panel(
+    axes: Axes, index: int, facts: BlockFacts, rows: Float[np.ndarray, " b"], tone: float, step: float | None
+) -> float:
+    """One column of the block facts for one cut; returns where its longest bar ends. `step` is the height of a row in
+    inches; without it no numbers stand beside the bars."""
     colours = [mixed(block_colour(block), 1.0, tone) for block in range(len(rows))]
     if index == 3:
         known = np.isfinite(facts.mean)
@@ -113,13 +129,16 @@ def _panel(axes: Axes, index: int, facts: BlockFacts, rows: Float[np.ndarray, " 
         right = np.nan_to_num(values.astype(np.float64))
         axes.barh(rows, right, height=0.72, color=colours)
         text = [_number(float(value), index) for value in values]
+    longest = float(np.nanmax(right, initial=0.0))
+    if step is None:
+        return longest
     for row, end, label in zip(rows, right, text, strict=True):
         missing = label == "nan"
         axes.annotate(
             "no anchors" if missing else label, (0 if missing else end, row), (6, 0), textcoords="offset points",
             va="center", fontsize=_font(step), color=FAINT if missing else INK,
         )  # fmt: skip
-    return float(np.nanmax(right, initial=0.0))
+    return longest
 
 
 def _rows(axes: Axes, rows: list[Float[np.ndarray, " _"]], named: bool, step: float) -> None:

@@ -17,8 +17,10 @@ from vdgs.partition.figures.words import count_of
 
 #: From no score to the highest; nothing in it resembles the mark of an assigned camera.
 SCORE = LinearSegmentedColormap.from_list("score", ["#f1f3f5", "#a9c7d6", "#1f6f8b", "#14395b"])
-#: A cell is so many pixels wide before it is drawn; the last ones are a gap.
+#: A cell is so many pixels wide before it is drawn, but a row of them no more than that, if that leaves a few each; the
+#: last ones are a gap.
 CELL, GAP = 60, 3
+LEAST_CELL, ROW = 12, 3000
 #: Width of the mark of an assigned camera, in inches.
 MARK = 0.12
 
@@ -75,11 +77,13 @@ def order_of_cameras(scores: Float[np.ndarray, "c b"]) -> tuple[Int[np.ndarray, 
 def _cells(
     scores: Float[np.ndarray, "c b"], assigned: Bool[np.ndarray, "c b"], norm: Normalize, inches: float
 ) -> np.ndarray:
-    """The picture [c, CELL * b, 3] of the matrix, whose cells are so many `inches` wide."""
-    mark = int(np.clip(CELL * MARK / inches, 2, CELL // 4))
-    cells = np.repeat(SCORE(norm(scores))[:, :, None, :3], CELL, axis=2)
-    cells[:, :, CELL - GAP :] = 1.0
-    cells[:, :, CELL - GAP - mark : CELL - GAP][assigned] = to_rgb(ACCENT)
+    """The picture [c, cell * b, 3] of the matrix, whose cells are so many `inches` wide."""
+    cell = max(LEAST_CELL, min(CELL, ROW // scores.shape[1]))
+    gap = max(1, GAP * cell // CELL)
+    mark = int(np.clip(cell * MARK / inches, 2, cell // 4))
+    cells = np.repeat(SCORE(norm(scores))[:, :, None, :3], cell, axis=2)
+    cells[:, :, cell - gap :] = 1.0
+    cells[:, :, cell - gap - mark : cell - gap][assigned] = to_rgb(ACCENT)
     return cells.reshape(len(scores), -1, 3)
 
 
