@@ -39,7 +39,7 @@ def hold(folder: Path, shared: bool = False) -> Iterator[None]:
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = (folder / ".lock").open("w")
+        handle = (folder / ".lock").open("a+b")
     except OSError as error:
         raise RunError(f"{folder}: cannot be written ({error.strerror}). {remedy(error)}.") from error
     with handle:
