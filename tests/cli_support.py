@@ -176,9 +176,9 @@ def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 def do_tasks_here() -> None:
     """Let this process do itself what it would start processes for."""
     from vdgs.bench import bench
-    from vdgs.stages import train
+    from vdgs.executors import choosing
 
-    bench.LocalExecutor = train.LocalExecutor = CommandsHere  # type: ignore[assignment,misc]
+    bench.LocalExecutor = choosing.LocalExecutor = CommandsHere  # type: ignore[assignment,misc]
 
 
 def limit_files(most_bytes: int) -> None:

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from vdgs.errors import VdgsError
 from vdgs.executors.engine import DONE, EXPLAINED, STOPPED, Attempt, End, Engine
@@ -221,7 +222,7 @@ class _Crew:
 
     def _out_of_time(self, work: _Work, why: str) -> None:
         """It saved and goes on in its next turn; no attempt is lost as long as it gets further from turn to turn."""
-        progress = _progress(work.task)
+        progress = progress_of(work.task.folder)
         if progress > work.progress:
             work.progress, work.attempts = progress, work.attempts - 1
             self._listener.paused(work.task, why)
@@ -261,12 +262,12 @@ class _Crew:
         self._listener.ended(work.task, work.outcome)
 
 
-def _progress(task: Task) -> int:
-    """How many iterations the stage of a task has saved or told."""
-    if task.folder is None:
+def progress_of(folder: Path | None) -> int:
+    """How many iterations the stage in a folder has told; 0 where it tells nothing."""
+    if folder is None:
         return 0
     try:
-        return StageFolder(task.folder).status().iteration or 0
+        return StageFolder(folder).status().iteration or 0
     except (VdgsError, OSError):
         return 0
 

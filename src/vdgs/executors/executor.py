@@ -43,7 +43,7 @@ class Task:
     """The stage folder that the command locks while it works; while another process holds it, the task waits."""
     after: str | None = None
     """The name of the task, among those run with it, that must be done before this one starts."""
-    needs: Needs = Needs()
+    needs: Needs = field(default_factory=Needs)
 
 
 @dataclass(frozen=True)

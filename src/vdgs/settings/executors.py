@@ -20,10 +20,12 @@ class SlurmOptions:
     account: str = ""
     """Account that pays."""
     time: str = ""
-    """Time limit of a job as SLURM writes it (`8:00:00`, `1-0`); empty for the partition's. A block that needs longer is
-    asked to save in time, put back into the queue and continued."""
+    """Time limit of a job as SLURM writes it (`8:00:00`, `1-0`); empty for the partition's. A block that needs longer
+    is asked to save in time, put back into the queue and continued."""
     grace_seconds: Annotated[int, Range(1, 86_400)] = 120
     """How long before the time limit a block is asked to save."""
+    poll_seconds: Annotated[float, Range(0, 3600, above=True)] = 5.0
+    """How often SLURM is asked what became of the jobs."""
     setup: str = ""
     """A shell command run first in every job, such as `module load cuda`."""
     options: tuple[str, ...] = ()
@@ -42,8 +44,8 @@ class ExecutorOptions:
     processors: Annotated[int, WORKERS] = 0
     """Ray and SLURM: processors of a block; 0 shares out those of the cluster (SLURM: 4)."""
     memory_gb: Annotated[float, Range(0, LARGE)] = 0.0
-    """Ray and SLURM: memory of a block; 0 takes what it needs by estimate. After an out-of-memory kill half as much more
-    is asked for."""
+    """Ray and SLURM: memory of a block; 0 takes what it needs by estimate. After an out-of-memory kill half as much
+    more is asked for."""
     gpus: Annotated[float, Range(0, 64)] = 0.0
     """Ray and SLURM: GPUs of a block. Ray also knows shares (0.5: two blocks on one)."""
     slurm: SlurmOptions = field(default_factory=SlurmOptions)
