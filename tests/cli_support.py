@@ -134,6 +134,10 @@ class Command:
         printed = [file.read_text(encoding="utf-8") if file.exists() else "" for file in self._files]
         return subprocess.CompletedProcess(self._main, code, *printed)
 
+    def printed(self) -> str:
+        """What it has printed so far."""
+        return self._files[0].read_text(encoding="utf-8") if self._files[0].exists() else ""
+
     def close(self) -> None:
         """Kill the process if it still runs."""
         self._process.kill()

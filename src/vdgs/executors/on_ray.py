@@ -52,11 +52,11 @@ def connected(address: str | None) -> Iterator[None]:
     Raises VdgsError where there is no Ray, or none that answers.
     """
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    os.environ.setdefault("RAY_DEDUP_LOGS", "0")
     where = address or os.environ.get("RAY_ADDRESS") or "local"
     own: dict[str, Any] = {}
     if where == "local":
         own = {"include_dashboard": False, "object_store_memory": OBJECT_BYTES}
+        os.environ.setdefault("RAY_worker_niceness", "0")  # blocks as processes of this machine have it
         # Ray listens on all addresses: let in who has the token, which is nobody else.
         os.environ["RAY_AUTH_MODE"], os.environ["RAY_AUTH_TOKEN"] = "token", secrets.token_hex(32)
     try:
@@ -189,7 +189,7 @@ class _Cluster:
         options: dict[str, Any] = {"num_cpus": needs.processors, "num_gpus": needs.gpus}
         if needs.memory_bytes:
             options["memory"] = needs.memory_bytes
-        if self.unfit:
+        if self.unfit and any(node.identity not in self.unfit for node in nodes()):
             options["label_selector"] = {"ray.io/node-id": f"!in({','.join(sorted(self.unfit))})"}
         actor = ray.remote(Keeper).options(
             name=self._name(task, attempt), namespace=NAMESPACE, lifetime="detached", max_restarts=0, max_concurrency=8,
