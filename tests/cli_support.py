@@ -146,21 +146,27 @@ class Command:
 
 @contextmanager
 def begun(
-    *arguments: object, pause_at: tuple[str, int] | None = None, prepare: Callable[[], None] | None = None
+    *arguments: object,
+    pause_at: tuple[str, int] | None = None,
+    prepare: Callable[[], None] | None = None,
+    environment: dict[str, str] | None = None,
 ) -> Iterator[Command]:
     """A `vdgs` that runs meanwhile; killed at the end if it still does.
 
     `pause_at`: it waits, and so do processes that it starts, before the n-th time that it opens, renames to or removes
-    a file whose whole path is like this pattern. `prepare` is called in its process before it begins.
+    a file whose whole path is like this pattern. `prepare` is called in its process before it begins; `environment` are
+    variables on top of those that the tests began with.
     """
     main = partial(_vdgs, [str(each) for each in arguments], prepare)
-    with _started(main, pause_at, {}) as command:
+    with _started(main, pause_at, environment or {}) as command:
         yield command
 
 
-def vdgs(*arguments: object, prepare: Callable[[], None] | None = None) -> subprocess.CompletedProcess[str]:
+def vdgs(
+    *arguments: object, prepare: Callable[[], None] | None = None, environment: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
     """Run a command to its end. See `begun`."""
-    with begun(*arguments, prepare=prepare) as command:
+    with begun(*arguments, prepare=prepare, environment=environment) as command:
         return command.finished()
 
 

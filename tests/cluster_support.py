@@ -139,3 +139,11 @@ def models(run: Path) -> list[bytes]:
     folder = RunFolder(run)
     assert len(folder.block_folders()) == 2
     return [each.model.read_bytes() for each in folder.block_folders()]
+
+
+def alive(process: int) -> bool:
+    """Whether a process is there, and no mere remains of one."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from cli_support import begun, vdgs, wait_until
-from cluster_support import BLOCKS, MIDDLE, Cluster, block_of, copy_run, make_run, models, parent_of, train_here
+from cluster_support import BLOCKS, MIDDLE, Cluster, alive, block_of, copy_run, make_run, models, parent_of, train_here
 
 pytestmark = [
     pytest.mark.xdist_group("ray"),
@@ -110,11 +110,3 @@ def test_a_driver_that_was_killed_finds_its_blocks_again_and_stops_them_when_ask
     assert models(run) == models(local)
     for block in (0, 1):
         assert "continuing at iteration 40" in (run / f"blocks/{block:02d}/output.log").read_text()
-
-
-def alive(process: int) -> bool:
-    """Whether a process is there, and no mere remains of one."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False

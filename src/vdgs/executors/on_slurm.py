@@ -171,7 +171,7 @@ class _SlurmAttempt:
     def __init__(self, element: Element, folder: Path, queue: _Queue):
         self._element, self._folder, self._queue = element, folder, queue
         self._over: End | None = None
-        self._missed = 0
+        self._missed = self._turn = 0
         self._cancelled = self._killed = False
         self.begun: Begun | None = None
 
@@ -180,12 +180,18 @@ class _SlurmAttempt:
             listed, record = self._queue.listed(self._element), read(self._folder, self._element.index)
             if listed is not None:
                 self._missed = 0
-                going = listed.placed and record is not None and record.code is None
-                if going or not listed.placed:  # not what the end of an earlier turn says
-                    self.begun = Begun(record.output_from, record.node) if going and record is not None else None
+                self._follow(listed, record)
             else:
                 self._over = self._ended(record)
         return self._over
+
+    def _follow(self, listed: Listed, record: Record | None) -> None:
+        """Where it runs now, if it does; between two turns it runs nowhere, and be it for one look."""
+        if not listed.placed:
+            self.begun = None
+        elif record is not None and record.code is None:  # else it says what the end of an earlier turn was
+            another, self._turn = self.begun is not None and record.turn != self._turn, record.turn
+            self.begun = None if another else Begun(record.output_from, record.node)
 
     def ask_to_stop(self) -> None:
         if self.begun is None:

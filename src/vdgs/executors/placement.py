@@ -14,6 +14,8 @@ from vdgs.settings.executors import ExecutorOptions
 PROCESSORS = 4
 #: Share of its memory that a block keeps decoded photographs in, and GB where nobody knows how much there is (choice).
 IMAGES_SHARE, IMAGES_GB = 0.25, 1.0
+#: GB for photographs at least (choice): those of a step and of the next.
+LEAST_IMAGES_GB = 0.1
 
 
 class Place(Protocol):
@@ -70,7 +72,9 @@ def on_cluster(work: Work, places: Sequence[Place], asked: ExecutorOptions) -> S
     processors = asked.processors or _processors(at_once, places)
     most = max(place.memory_bytes for place in places)
     whole = max(places, key=lambda place: place.memory_bytes)
-    images = work.image_gb or IMAGES_SHARE * whole.memory_bytes * min(1, processors / whole.processors) / 1e9
+    share = whole.memory_bytes * min(1, processors / whole.processors) / 1e9
+    beside = max(LEAST_IMAGES_GB, share - work.block_bytes / 1e9)
+    images = work.image_gb or min(IMAGES_SHARE * share, beside)
     wanted = round(1e9 * asked.memory_gb) or work.block_bytes + round(1e9 * images)
     memory = wanted if asked.memory_gb or not most else min(wanted, most)
     return Share(at_once, Needs(processors, memory if most else 0, asked.gpus), images)
