@@ -4,7 +4,7 @@
 
 It knows what vdgs uses, and does as the real ones do (tests/test_slurm.py runs the same tests on both): arrays, one
 element at a time in each place, signals to the script of a job, an orderly and a hard end, the queue a second time. A
-process of its own goes with every element. $SLURM_STAND_IN names the folder.
+process of its own goes with every element. $VDGS_TEST_SLURM names the folder.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-STATE = Path(os.environ.get("SLURM_STAND_IN", "."))
+STATE = Path(os.environ["VDGS_TEST_SLURM"])
 PLACES = 2
 NODE = "stand-in"
 GLANCE_SECONDS = 0.02

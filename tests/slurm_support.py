@@ -82,7 +82,7 @@ def stand_in(folder: Path) -> Iterator[dict[str, str]]:
     for name in ("sbatch", "squeue", "scancel", "scontrol"):
         (commands / name).write_text(f'#!/bin/sh\nexec "{sys.executable}" -S "{program}" {name} "$@"\n')
         (commands / name).chmod(0o755)
-    yield {"PATH": f"{commands}{os.pathsep}{os.environ['PATH']}", "SLURM_STAND_IN": str(state)}
+    yield {"PATH": f"{commands}{os.pathsep}{os.environ['PATH']}", "VDGS_TEST_SLURM": str(state)}
     for element in state.glob("*_*"):
         (element / "cancel").touch()
 
