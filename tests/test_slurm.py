@@ -34,7 +34,10 @@ def local(cut) -> Path:
     return train_here(cut, cut.parent / "local")
 
 
-@pytest.fixture(params=[pytest.param("real", marks=pytest.mark.skipif(not is_installed(), reason=WITHOUT)), "stand-in"])
+BOTH = [pytest.param("real", marks=pytest.mark.skipif(not is_installed(), reason=WITHOUT)), "stand-in"]
+
+
+@pytest.fixture(params=["real" if is_installed() else "stand-in"])
 def slurm(request, tmp_path, monkeypatch) -> str:
     """SLURM's commands find a cluster of two places."""
     folder = tmp_path / "slurm"
@@ -82,6 +85,7 @@ def is_real() -> bool:
     return "VDGS_TEST_SLURM" not in os.environ
 
 
+@pytest.mark.parametrize("slurm", BOTH, indirect=True)
 def test_time_limits_kills_and_lost_jobs_end_in_the_models_of_the_local_run(slurm, cut, local, tmp_path):
     run = copy_run(cut, tmp_path / "run")
     with begun(*by_slurm(run), pause_at=(MIDDLE, 1), environment=variables()) as driver:
