@@ -51,14 +51,28 @@ def connected(address: str | None) -> Iterator[None]:
 
     Raises VdgsError where there is no Ray, or none that answers.
     """
-    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     where = address or os.environ.get("RAY_ADDRESS") or "local"
-    own: dict[str, Any] = {}
+    variables, own = {"RAY_USAGE_STATS_ENABLED": "0"}, dict[str, Any]()
     if where == "local":
         own = {"include_dashboard": False, "object_store_memory": OBJECT_BYTES}
-        os.environ.setdefault("RAY_worker_niceness", "0")  # blocks as processes of this machine have it
+        variables["RAY_worker_niceness"] = "0"  # as blocks have it that are processes of this machine
         # Ray listens on all addresses: let in who has the token, which is nobody else.
-        os.environ["RAY_AUTH_MODE"], os.environ["RAY_AUTH_TOKEN"] = "token", secrets.token_hex(32)
+        variables |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        with _driver(where, own):
+            yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _driver(where: str, own: Mapping[str, Any]) -> Iterator[None]:
     try:
         import ray
     except ImportError as error:
