@@ -134,6 +134,10 @@ class Command:
         printed = [file.read_text(encoding="utf-8") if file.exists() else "" for file in self._files]
         return subprocess.CompletedProcess(self._main, code, *printed)
 
+    def printed(self) -> str:
+        """What it has printed so far."""
+        return self._files[0].read_text(encoding="utf-8") if self._files[0].exists() else ""
+
     def close(self) -> None:
         """Kill the process if it still runs."""
         self._process.kill()
@@ -142,21 +146,27 @@ class Command:
 
 @contextmanager
 def begun(
-    *arguments: object, pause_at: tuple[str, int] | None = None, prepare: Callable[[], None] | None = None
+    *arguments: object,
+    pause_at: tuple[str, int] | None = None,
+    prepare: Callable[[], None] | None = None,
+    environment: dict[str, str] | None = None,
 ) -> Iterator[Command]:
     """A `vdgs` that runs meanwhile; killed at the end if it still does.
 
     `pause_at`: it waits, and so do processes that it starts, before the n-th time that it opens, renames to or removes
-    a file whose whole path is like this pattern. `prepare` is called in its process before it begins.
+    a file whose whole path is like this pattern. `prepare` is called in its process before it begins; `environment` are
+    variables on top of those that the tests began with.
     """
     main = partial(_vdgs, [str(each) for each in arguments], prepare)
-    with _started(main, pause_at, {}) as command:
+    with _started(main, pause_at, environment or {}) as command:
         yield command
 
 
-def vdgs(*arguments: object, prepare: Callable[[], None] | None = None) -> subprocess.CompletedProcess[str]:
+def vdgs(
+    *arguments: object, prepare: Callable[[], None] | None = None, environment: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
     """Run a command to its end. See `begun`."""
-    with begun(*arguments, prepare=prepare) as command:
+    with begun(*arguments, prepare=prepare, environment=environment) as command:
         return command.finished()
 
 
@@ -176,9 +186,9 @@ def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 def do_tasks_here() -> None:
     """Let this process do itself what it would start processes for."""
     from vdgs.bench import bench
-    from vdgs.stages import train
+    from vdgs.executors import choosing
 
-    bench.LocalExecutor = train.LocalExecutor = CommandsHere  # type: ignore[assignment,misc]
+    bench.LocalExecutor = choosing.LocalExecutor = CommandsHere  # type: ignore[assignment,misc]
 
 
 def limit_files(most_bytes: int) -> None:

@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import threading
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from fnmatch import fnmatch
 from pathlib import Path
@@ -45,7 +46,8 @@ class Pause:
         """Let all go on (or send them another signal), and none wait from now on."""
         (Path(self.waiting) / "off").touch()
         for process in self.processes():
-            os.kill(process, number)
+            with suppress(ProcessLookupError):  # one that was killed while it waited
+                os.kill(process, number)
 
 
 def pause_where_asked() -> None:

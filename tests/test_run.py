@@ -5,14 +5,19 @@ from dataclasses import replace
 
 import pytest
 
+from captures_support import tiny_scene, write_colmap
+from vdgs.captures.facts import capture_facts
 from vdgs.errors import RunError
+from vdgs.runs.beginning import begin_run
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.keys import SINCE, stage_keys
 from vdgs.runs.status import Status
+from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.checks import validate
 from vdgs.settings.method import BlockConfig, GrowthConfig, MethodConfig, TrainConfig, with_iterations
 from vdgs.settings.plain import differences, from_dict, to_dict
 from vdgs.settings.presets import PRESETS
+from vdgs.storage.files import write_json
 
 
 def settings(**changes) -> dict:
@@ -201,3 +206,16 @@ def test_a_mean_is_of_models_of_one_image_size(begins, problems):
     settings = {"average": 0.5, "growth": GrowthConfig(until=0.4), "resolutions": ((0.0, 2), (begins, 1))}
     assert len(validate(MethodConfig(training=TrainConfig(**settings)))) == problems
     assert len(validate(MethodConfig(block=BlockConfig(**settings)))) == problems
+
+
+def test_a_run_whose_blocks_are_at_work_is_taken_up_again_but_not_changed(tmp_path):
+    """Blocks that a driver began which died since share the run with the next."""
+    place, method = tmp_path / "capture", PRESETS["laptop"]
+    other = replace(method, partition=replace(method.partition, lambda_vis=0.7))
+    write_colmap(place, tiny_scene())
+    run, capture = begin_run(place, tmp_path / "run", CaptureOptions(), method, redo=False)
+    write_json(run.capture_file, capture_facts(capture))
+    with run.locked(shared=True):
+        begin_run(place, run.path, CaptureOptions(), method, redo=False)
+        with pytest.raises(RunError, match="another vdgs process"):
+            begin_run(place, run.path, CaptureOptions(), other, redo=True)

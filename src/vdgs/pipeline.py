@@ -41,6 +41,7 @@ def run_all(asked: RunRequest, console: Console, command: str | None = None) -> 
 
     Raises what the stages raise; all that was finished before stays, and the same command continues.
     """
+    asked.where.check()
     refuse(asked)
     refuse_missing(asked.lpips_weights)
     asked = with_capture(asked, console)
@@ -77,7 +78,7 @@ def _stages(run: RunFolder, capture: Capture, asked: RunRequest, console: Consol
     partition_run(run, console, asked.device)
     _title(console, "block training")
     try:
-        train_blocks(run.path, asked.watching, asked.jobs, console, asked.device)
+        train_blocks(run.path, asked.watching, asked.jobs, console, asked.device, asked.where)
     except RunError as error:
         if not asked.incomplete:
             raise

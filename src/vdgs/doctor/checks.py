@@ -27,6 +27,7 @@ EXTRAS = {
     "tensorboard": "curves of the training in TensorBoard",
     "geo": "maps as GeoTIFFs, any EPSG system (vdgs map)",
     "viewer": "a scene in a browser (vdgs view)",
+    "ray": "blocks on many machines (--executor ray)",
     "gsplat": "another rasteriser on an NVIDIA GPU, to compare with",
     "test": "the test suite",
 }

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rich.console import Console
 
 from vdgs.errors import VdgsError
-from vdgs.executors.executor import Executor, Outcome, Task
+from vdgs.executors.executor import Executor, Needs, Outcome, Task
 from vdgs.executors.lines import Lines
 from vdgs.executors.progress import BlockProgress, read_figures
 from vdgs.executors.table import STYLES, Board, duration
@@ -26,6 +26,7 @@ class BlockCommand:
     folder: StageFolder
     """The command locks it and keeps its status file; its output is appended to `output.log` there."""
     command: list[str]
+    needs: Needs = field(default_factory=Needs)
 
     @property
     def name(self) -> str:
@@ -36,7 +37,7 @@ class BlockCommand:
         return self.folder.path / "output.log"
 
     def task(self) -> Task:
-        return Task(self.name, self.command, self.output, folder=self.folder.path)
+        return Task(self.name, self.command, self.output, folder=self.folder.path, needs=self.needs)
 
 
 def default_jobs(blocks: int, cores: int, memory_available: int, memory_per_block: int) -> tuple[int, int]:
@@ -68,10 +69,22 @@ class _Watcher(Lines):
         super().__init__(board.say)
         self._board = board
         self._pairs = {block.name: (block, row) for block, row in zip(blocks, rows, strict=True)}
+        #: On which machine, in words, where it is not this one.
+        self._where = dict[str, str]()
+
+    def placed(self, task: Task, where: str, found: bool) -> None:
+        self._where[task.name] = f" on {where}"
+        if found:
+            self.say(f"{task.name}: is still at work on {where}, and is watched again", "")
 
     def started(self, task: Task, attempt: int) -> None:
         self._pairs[task.name][1].started()
-        self._board.note(f"{task.name}: started{_attempt(attempt)}")
+        self._board.note(f"{task.name}: started{self._where.get(task.name, '')}{_attempt(attempt)}")
+
+    def paused(self, task: Task, why: str) -> None:
+        super().paused(task, why)
+        self._observe(task.name)
+        self._pairs[task.name][1].state = "queued"
 
     def crashed(self, task: Task, how: str, attempts_left: int) -> None:
         super().crashed(task, how, attempts_left)

@@ -1,4 +1,5 @@
-"""What runs commands: the interface that every engine stands behind (processes of this machine: `local`).
+"""What runs commands: the interface that every engine stands behind (processes of this machine: `local`; Ray:
+`on_ray`; SLURM: `on_slurm`).
 
 A task is a command that can be repeated: it continues after an interruption and does nothing once it is done. So an
 engine keeps no state of its own, and may die. A task that ends with 0 is done; with 1 or 2 (usage) it failed for a
@@ -18,6 +19,17 @@ EndState = Literal["done", "failed", "stopped"]
 
 
 @dataclass(frozen=True)
+class Needs:
+    """What a task asks of the place where it runs. Processes of this machine take what there is."""
+
+    processors: int = 1
+    memory_bytes: int = 0
+    """0: says nothing."""
+    gpus: float = 0.0
+    """Shares of one are possible where the engine knows them."""
+
+
+@dataclass(frozen=True)
 class Task:
     """A command that can be repeated."""
 
@@ -31,6 +43,7 @@ class Task:
     """The stage folder that the command locks while it works; while another process holds it, the task waits."""
     after: str | None = None
     """The name of the task, among those run with it, that must be done before this one starts."""
+    needs: Needs = field(default_factory=Needs)
 
 
 @dataclass(frozen=True)
@@ -52,11 +65,17 @@ class Outcome:
 class Listener:
     """Is told what becomes of the tasks while they run; does nothing with it. Called in the thread that runs them."""
 
+    def placed(self, task: Task, where: str, found: bool) -> None:
+        """It runs on the machine `where`; `found` there, begun by a driver that died. Before `started`."""
+
     def started(self, task: Task, attempt: int) -> None:
         """An attempt, counted from 1, begins."""
 
     def waits(self, task: Task) -> None:
         """There is room for it, but another process works on it."""
+
+    def paused(self, task: Task, why: str) -> None:
+        """It saved and lost its place; it will be continued. No attempt is lost."""
 
     def crashed(self, task: Task, how: str, attempts_left: int) -> None:
         """It will be started again."""

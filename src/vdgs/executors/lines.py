@@ -19,6 +19,9 @@ class Lines(Listener):
     def waits(self, task: Task) -> None:
         self.say(f"{task.name}: waiting for another process that works on it", "yellow")
 
+    def paused(self, task: Task, why: str) -> None:
+        self.say(f"{task.name}: saved and waits for another turn" + (f" ({why})" if why else ""), "yellow")
+
     def crashed(self, task: Task, how: str, attempts_left: int) -> None:
         text = f"{task.name}: crashed by {how}; continues from its last checkpoint, attempts left: {attempts_left}"
         self.say(text, "yellow")

@@ -50,7 +50,7 @@ def begin_run(
     if not run.config_file.exists():  # what cannot become a scene leaves no folder that other settings stumble over
         refuse_unsound(capture)
     settings = run_settings(capture_path, capture_options, method)
-    with run.locked():
+    with run.locked(shared=_goes_on(run, settings)):
         read_anew = run.config_file.exists() and reads_otherwise(run, settings)
         if run.capture_file.exists() and not read_anew:
             refuse_another_capture(run.capture_file, read_json(run.capture_file), capture)
@@ -63,6 +63,12 @@ def begin_run(
                 run.capture_file.unlink(missing_ok=True)
         _keep_reconstruction(capture.root, run.path)
     return run, capture
+
+
+def _goes_on(run: RunFolder, settings: dict[str, Any]) -> bool:
+    """Whether the run that is there has the very settings: nothing of it changes, and its blocks may be at work, begun
+    by a driver that died."""
+    return run.config_file.exists() and run.capture_file.exists() and run.settings() == settings
 
 
 def reads_otherwise(run: RunFolder, settings: dict[str, Any]) -> bool:

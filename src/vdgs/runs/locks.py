@@ -39,7 +39,8 @@ def hold(folder: Path, shared: bool = False) -> Iterator[None]:
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = (folder / ".lock").open("w")
+        # For reading and writing: NFS wants the one for a shared lock and the other for one that is not.
+        handle = (folder / ".lock").open("a+b")
     except OSError as error:
         raise RunError(f"{folder}: cannot be written ({error.strerror}). {remedy(error)}.") from error
     with handle:
@@ -53,4 +54,9 @@ def hold(folder: Path, shared: bool = False) -> Iterator[None]:
                         f"{folder}: another vdgs process works on this run. Wait for it or stop it."
                     ) from error
                 time.sleep(LOCK_SECONDS)
+            except OSError as error:
+                raise RunError(
+                    f"{folder}: its file system locks no files ({error.strerror}). Mount it with locks (NFS 4; Lustre: "
+                    "-o flock), or choose a folder elsewhere."
+                ) from error
         yield

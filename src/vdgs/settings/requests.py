@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.executors import ExecutorOptions
 from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig, TrainConfig
 from vdgs.settings.presets import PresetName
 from vdgs.settings.ranges import LARGE, MANY, WORKERS, Named, Range
@@ -63,6 +64,7 @@ class RunRequest:
     block: BlockConfig = field(default_factory=BlockConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
     watching: Annotated[WatchOptions, Named("")] = field(default_factory=WatchOptions)
+    where: Annotated[ExecutorOptions, Named("")] = field(default_factory=ExecutorOptions)
 
     def method(self) -> MethodConfig:
         """The settings that the result depends on."""

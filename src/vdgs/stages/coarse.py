@@ -37,11 +37,11 @@ def train_coarse(
     (state saved), TrainingDiverged (last good state kept).
     """
     options.check()
+    folder, key = run.coarse, run.keys().coarse
+    if folder.is_done(key):  # its blocks may be at work
+        console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
+        return
     with run.locked():
-        folder, key = run.coarse, run.keys().coarse
-        if folder.is_done(key):
-            console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
-            return
         refuse_unworkable(capture, console)
         config = run.method().training
         note_without_growth(config, console)

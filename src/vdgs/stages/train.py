@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from rich.console import Console
 
 from vdgs.errors import RunError, Stopped, VdgsError
-from vdgs.executors.blocks import BlockCommand, default_jobs, run_blocks
-from vdgs.executors.local import LocalExecutor
+from vdgs.executors.blocks import BlockCommand, run_blocks
+from vdgs.executors.choosing import Chosen, Machine, choose
+from vdgs.executors.executor import Outcome
+from vdgs.executors.fitness import Question
+from vdgs.executors.placement import Share, Work
 from vdgs.kernels import threads as threads_available
-from vdgs.memory.estimate import Need, estimate, in_gb
+from vdgs.memory.estimate import Need, estimate
 from vdgs.memory.process import available_bytes
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.opening import open_capture
 from vdgs.runs.status import Status
+from vdgs.settings.executors import ExecutorOptions
 from vdgs.settings.method import block_limit
 from vdgs.settings.watching import WatchOptions
 
@@ -26,16 +33,25 @@ from vdgs.settings.watching import WatchOptions
 SEEN = 0.5
 
 
-def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console, device: str = "cpu") -> None:
-    """Train, or continue, all blocks of a run that are not finished.
+def train_blocks(
+    path: Path,
+    options: WatchOptions,
+    jobs: int,
+    console: Console,
+    device: str = "cpu",
+    where: ExecutorOptions | None = None,
+) -> None:
+    """Train, or continue, all blocks of a run that are not finished, on this machine or `where` was asked for.
 
-    `jobs` processes at once, each on `device`; 0 takes as many as cores and memory allow. Raises RunError if a block
-    failed (the others are trained first), Stopped after Ctrl-C or SIGTERM (every block saved).
+    `jobs` at once, each on `device`; 0 takes as many as there is room for. Raises RunError if a block failed (the
+    others are trained first), Stopped after Ctrl-C or SIGTERM (every block saved), and VdgsError where a machine of a
+    cluster cannot work on the run, before anything starts.
     """
     options.check()
     if jobs < 0:
         raise VdgsError(f"--jobs is {jobs}; it must be at least 1, or 0 for what cores and memory allow")
-    run = RunFolder(path)
+    run = RunFolder(Path(os.path.abspath(path)))  # not resolved: other machines may mount what links point to elsewhere
+    began = time.monotonic()
     with run.locked(shared=True):
         blocks, key = blocks_of(run), run.keys().blocks
         _remove_beyond(run, len(blocks), console)
@@ -43,51 +59,58 @@ def train_blocks(path: Path, options: WatchOptions, jobs: int, console: Console,
         if not left:
             console.print(f"{path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
             return
-        free = available_bytes()
-        each = _block_bytes(run)
-        at_once, threads = default_jobs(len(left), threads_available(), free, each)
-        if jobs:
-            at_once, threads = min(jobs, len(left)), max(1, threads_available() // min(jobs, len(left)))
-        budget = options.image_memory_gb or free / 4e9
-        console.print(
-            f"{len(left)} of {len(blocks)} blocks to train, {at_once} at once with {threads} thread(s) each; by "
-            f"estimate a block takes at most {in_gb(each)} beside its photographs, of {in_gb(free)} free",
-            highlight=False,
-        )
-        if at_once * each > free:
-            console.print(
-                f"[yellow]warning[/] {at_once} at once may run out of memory. What helps: less --jobs, more --blocks, "
-                "--block.growth.max-anchors",
-                highlight=False,
-            )
-        _note_discarded(run, left, key, console)
-        began = time.monotonic()
-        for index in left:
-            _mark_queued(run.block(index), key)
-        commands = [_command(run, index, threads, budget / at_once, options, device) for index in left]
-        outcomes = run_blocks(commands, LocalExecutor(at_once), console)
+        work = Work(len(left), _block_bytes(run), jobs, options.image_memory_gb)
+        machine = Machine(threads_available(), available_bytes())
+        with choose(where or ExecutorOptions(), work, machine, lambda: _question(run)) as chosen:
+            console.print(f"{len(left)} of {len(blocks)} blocks to train, {chosen.line}", highlight=False)
+            for note in chosen.notes:
+                console.print(note, highlight=False)
+            _note_discarded(run, left, key, console)
+            for index in left:
+                _mark_queued(run.block(index), key)
+            outcomes = _run(run, left, chosen, options, device, console)
+    _raise_unless_done(path, len(blocks), outcomes)
+    console.print(f"blocks trained in {(time.monotonic() - began) / 60:.1f} min", highlight=False)
+
+
+def _run(
+    run: RunFolder, left: Sequence[int], chosen: Chosen, options: WatchOptions, device: str, console: Console
+) -> list[Outcome]:
+    # A GPU that a block is given is not this machine's.
+    device = "auto" if chosen.share.needs.gpus and device == "cpu" else device
+    commands = [_command(run, index, chosen.share, options, device) for index in left]
+    return run_blocks(commands, chosen.executor, console)
+
+
+def _raise_unless_done(path: Path, blocks: int, outcomes: Sequence[Outcome]) -> None:
     if any(outcome.state == "stopped" for outcome in outcomes):
         raise Stopped("Stopped; every block that was training is saved. The same command continues.")
     failed = [outcome for outcome in outcomes if outcome.state != "done"]
     if failed:
         raise RunError(
-            f"{path}: {len(failed)} of {len(blocks)} blocks failed:\n  "
+            f"{path}: {len(failed)} of {blocks} blocks failed:\n  "
             + "\n  ".join(f"{outcome.name}: {outcome.why}" for outcome in failed)
             + f"\nTheir output is in {path}/blocks/NN/output.log. The same command tries them again."
         )
-    console.print(f"blocks trained in {(time.monotonic() - began) / 60:.1f} min", highlight=False)
 
 
-def _command(
-    run: RunFolder, index: int, threads: int, image_gb: float, options: WatchOptions, device: str
-) -> BlockCommand:  # fmt: skip
+def _question(run: RunFolder) -> Question:
+    """What a machine must see: the run, its coarse model and its photographs."""
+    files = [run.config_file, run.coarse.model]
+    for view in open_capture(run).train_views:
+        files += [view.image_path] if view.mask_path is None else [view.image_path, view.mask_path]
+    return Question(run.path, files)
+
+
+def _command(run: RunFolder, index: int, share: Share, options: WatchOptions, device: str) -> BlockCommand:
     command = [
-        sys.executable, "-m", "vdgs.cli", "train", str(run.path), "--block", str(index), "--threads", str(threads),
-        "--image-memory-gb", f"{image_gb:.3f}", "--save-every", str(options.save_every), "--device", device,
+        sys.executable, "-m", "vdgs.cli", "train", str(run.path), "--block", str(index),
+        "--threads", str(share.needs.processors), "--image-memory-gb", f"{share.image_gb:.3f}",
+        "--save-every", str(options.save_every), "--device", device,
     ]  # fmt: skip
     if options.tensorboard:
         command.append("--tensorboard")
-    return BlockCommand(index, run.block(index), command)
+    return BlockCommand(index, run.block(index), command, share.needs)
 
 
 def _note_discarded(run: RunFolder, left: list[int], key: str, console: Console) -> None:

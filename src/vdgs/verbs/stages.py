@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
+from vdgs.settings.executors import ExecutorOptions
 from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, PartitionConfig
 from vdgs.settings.ranges import WORKERS, Range
 from vdgs.settings.watching import WatchOptions
@@ -105,6 +106,7 @@ class TrainArguments:
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
     settings: Annotated[BlockConfig, arg(name="block")] = field(default_factory=BlockConfig)
     watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def train(arguments: list[str]) -> None:
@@ -124,7 +126,7 @@ def train(arguments: list[str]) -> None:
     else:
         from vdgs.stages.train import train_blocks
 
-        train_blocks(asked.run, asked.watching, asked.jobs, open_console(asked.quiet), device)
+        train_blocks(asked.run, asked.watching, asked.jobs, open_console(asked.quiet), device, asked.where)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.executors import ExecutorOptions
 from vdgs.settings.method import PartitionConfig, TrainConfig
 from vdgs.settings.presets import PRESETS, PresetName
 from vdgs.settings.ranges import WORKERS
@@ -79,6 +80,7 @@ class RunArguments(RunRequest):
     training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
     partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
     watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def run(arguments: list[str]) -> None:

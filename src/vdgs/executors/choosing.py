@@ -1,0 +1,119 @@
+"""The executor that a person asked for, made ready: connected, its machines asked whether they can work on the run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from vdgs.executors.executor import Executor
+from vdgs.executors.fitness import Question
+from vdgs.executors.local import LocalExecutor
+from vdgs.executors.placement import Share, Work, by_queue, on_cluster, on_this_machine
+from vdgs.memory.estimate import in_gb
+from vdgs.settings.executors import ExecutorOptions
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """What runs blocks, and what each gets."""
+
+    executor: Executor
+    share: Share
+    line: str
+    """Where blocks run and with what, in words."""
+    notes: tuple[str, ...] = ()
+    """What a person should know before it begins."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What this machine has."""
+
+    cores: int
+    free_bytes: int
+
+
+@contextmanager
+def choose(asked: ExecutorOptions, work: Work, machine: Machine, question: Callable[[], Question]) -> Iterator[Chosen]:
+    """Be ready to run blocks while the context lasts. `question` says what machines must see; asked of other machines
+    only.
+
+    Raises VdgsError, before anything starts, for options that do not work, where there is no such cluster, and where a
+    machine cannot work on the run.
+    """
+    asked.check()
+    if asked.executor == "ray":
+        from vdgs.executors.on_ray import connected
+
+        with connected(asked.address):
+            yield _ray(asked, work, question())
+    elif asked.executor == "slurm":
+        yield _slurm(asked, work, question())
+    else:
+        yield _local(work, machine)
+
+
+def _local(work: Work, machine: Machine) -> Chosen:
+    share = on_this_machine(work, machine.cores, machine.free_bytes)
+    line = (
+        f"{share.at_once} at once with {share.needs.processors} thread(s) each; by estimate a block takes at most "
+        f"{in_gb(work.block_bytes)} beside its photographs, of {in_gb(machine.free_bytes)} free"
+    )
+    short = share.at_once * work.block_bytes > machine.free_bytes
+    note = (
+        f"[yellow]warning[/] {share.at_once} at once may run out of memory. What helps: less --jobs, more --blocks, "
+        "--block.growth.max-anchors"
+    )
+    return Chosen(LocalExecutor(share.at_once), share, line, (note,) if short else ())
+
+
+def _ray(asked: ExecutorOptions, work: Work, question: Question) -> Chosen:
+    from vdgs.errors import VdgsError
+    from vdgs.executors.on_ray import RayExecutor, ask_nodes, nodes
+
+    there = nodes()
+    if not there:
+        raise VdgsError("The Ray cluster has no node with processors. See `ray status`.")
+    answers = ask_nodes(question, there)
+    share = on_cluster(work, there, asked)
+    notes, needs = [], share.needs
+    if not any(
+        node.processors >= needs.processors and node.memory_bytes >= needs.memory_bytes and node.gpus >= needs.gpus
+        for node in there
+    ):
+        notes.append(f"[yellow]note[/] no node has {_needs(share)} now: blocks wait until one joins that has")
+    if needs.memory_bytes and needs.memory_bytes < work.block_bytes:
+        notes.append(
+            f"[yellow]warning[/] by estimate a block takes at most {in_gb(work.block_bytes)}, more than any node has. "
+            "What helps: more --blocks, --block.growth.max-anchors"
+        )
+    processors = sorted({answer["processor"] for answer in answers})
+    if len(processors) > 1:
+        notes.append(
+            f"[yellow]note[/] nodes have different processors ({', '.join(processors)}): a block that changes between "
+            "them ends with other last bits. With VDGS_ISA=avx2 (or portable) all compute alike"
+        )
+    names = len(there), sum(node.processors for node in there)
+    line = f"over {names[0]} node{'s' if names[0] > 1 else ''} of Ray with {names[1]} processors, {_needs(share)} each"
+    return Chosen(RayExecutor(share.at_once, question=question), share, line, tuple(notes))
+
+
+def _slurm(asked: ExecutorOptions, work: Work, question: Question) -> Chosen:
+    from vdgs.executors.on_slurm import SlurmExecutor, refuse_without_slurm
+
+    refuse_without_slurm()
+    share = by_queue(work, asked)
+    options = asked.slurm
+    executor = SlurmExecutor(share.at_once, poll_seconds=options.poll_seconds, question=question, options=options)
+    return Chosen(executor, share, f"as jobs of SLURM, {_needs(share)} each")
+
+
+def _needs(share: Share) -> str:
+    needs = share.needs
+    parts = [f"{needs.processors} processor{'s' if needs.processors > 1 else ''}"]
+    if needs.memory_bytes:
+        parts.append(in_gb(needs.memory_bytes))
+    if needs.gpus:
+        parts.append(f"{needs.gpus:g} GPU")
+    return ", ".join(parts)

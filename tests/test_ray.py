@@ -1,0 +1,112 @@
+"""Blocks on a real Ray of several nodes on this machine: whatever is lost, the models are those of the local run."""
+
+import importlib.util
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from cli_support import begun, vdgs, wait_until
+from cluster_support import BLOCKS, MIDDLE, Cluster, alive, block_of, copy_run, make_run, models, parent_of, train_here
+
+pytestmark = [
+    pytest.mark.xdist_group("ray"),
+    pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: pip install 'vdgs[ray]'"),
+    pytest.mark.skipif(sys.platform != "linux", reason="who runs on which node is read from /proc"),
+]
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory) -> Path:
+    return make_run(tmp_path_factory.mktemp("ray"))
+
+
+@pytest.fixture(scope="module")
+def local(cut) -> Path:
+    return train_here(cut, cut.parent / "local")
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    cluster = Cluster()
+    cluster.add("a")
+    cluster.add("b")
+    yield cluster
+    cluster.close()
+
+
+def on_ray(run: Path, cluster: Cluster) -> tuple[object, ...]:
+    return ("train", run, *BLOCKS, "--executor", "ray", "--address", cluster.address)
+
+
+def another_code() -> None:
+    """Let this process take itself for another version of vdgs."""
+    from vdgs.executors import fitness
+
+    fitness.code_identity = lambda: "of this machine"  # type: ignore[assignment]
+
+
+def test_nodes_that_cannot_work_on_a_run_are_named_before_anything_starts(cut, cluster, tmp_path):
+    run = copy_run(cut, tmp_path / "run")
+    done = vdgs(*on_ray(run, cluster), prepare=another_code)
+    assert done.returncode == 1
+    assert f"node {os.uname().nodename}: its vdgs" in done.stderr
+    assert "not the same code" in done.stderr
+    assert not list(run.glob("blocks/*/output.log"))
+    assert not list(run.glob(".fitness*"))
+
+
+def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, cluster, tmp_path):
+    """A node dies under a block, one that joins late takes it; a command is killed, then the worker that keeps it."""
+    run = copy_run(cut, tmp_path / "run")
+    with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1)) as driver:
+
+        def wait_for(count: int) -> dict[int, int]:
+            """The process of each block that waits now, once so many have waited in all."""
+            driver.wait_until_paused(count)
+            there = [process for process in driver.paused() if Path(f"/proc/{process}/cmdline").exists()]
+            return {block_of(process): process for process in there}
+
+        processes = wait_for(2)
+        cluster.remove(cluster.node_of(processes[1]))
+        wait_until(lambda: not alive(processes[1]))
+        cluster.add("late")
+        processes = wait_for(3)
+        assert cluster.node_of(processes[1]) == "late"
+        os.kill(processes[0], signal.SIGKILL)
+        processes = wait_for(4)
+        os.kill(parent_of(processes[0]), signal.SIGKILL)
+        wait_for(5)
+        driver.go_on()
+        done = driver.finished()
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert models(run) == models(local)
+    assert "block 01: crashed by the loss of its node" in done.stdout
+    assert "block 00: crashed by SIGKILL; continues from its last checkpoint, attempts left: 2" in done.stdout
+    assert "block 00: crashed by the loss of its worker" in done.stdout
+    assert "2 of 2 blocks done" in done.stdout
+    assert (run / "blocks/00/output.log").read_text().count("--- ") == 3
+
+
+def test_a_driver_that_was_killed_finds_its_blocks_again_and_stops_them_when_asked(cut, local, cluster, tmp_path):
+    run = copy_run(cut, tmp_path / "run")
+    with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1)) as first:
+        first.wait_until_paused(2)
+        first.send_signal(signal.SIGKILL)
+        first.finished()
+        assert all(alive(process) for process in first.paused())
+        with begun(*on_ray(run, cluster)) as second:
+            wait_until(lambda: "is watched again" in second.printed())
+            wait_until(lambda: second.printed().count("is watched again") == 2)
+            second.send_signal(signal.SIGINT)
+            done = second.finished()
+        assert done.returncode == 130, done.stderr + done.stdout
+        assert "every block that was training is saved" in done.stderr
+        assert not any(alive(process) for process in first.paused())
+    done = vdgs(*on_ray(run, cluster))
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert models(run) == models(local)
+    for block in (0, 1):
+        assert "continuing at iteration 40" in (run / f"blocks/{block:02d}/output.log").read_text()
