@@ -75,6 +75,21 @@ def threads() -> int:
     return module.threads()
 
 
+def default_threads() -> int:
+    """`VDGS_THREADS`, or the number of cores that this process may use; the kernels themselves are not loaded.
+
+    Raises VdgsError for another value of that variable.
+    """
+    text = os.environ.get("VDGS_THREADS")
+    if not text:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if not text.isdecimal() or int(text) < 1:
+        from vdgs.errors import VdgsError
+
+        raise VdgsError(f"VDGS_THREADS must be a whole number from 1, not {text!r}.")
+    return int(text)
+
+
 def set_threads(count: int) -> None:
     """Let the operations use up to `count` threads of the CPU, the calling one included; torch's own as well.
 

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from vdgs.captures.outputs import refuse_in_a_capture
 from vdgs.errors import VdgsError
-from vdgs.kernels import threads as threads_available
+from vdgs.kernels import default_threads
 from vdgs.settings.ranges import refuse
 from vdgs.settings.sfm import SfmRequest
 from vdgs.sfm import mapping, matching
@@ -42,7 +42,7 @@ def prepare(request: SfmRequest) -> Prepared:
     refuse_among_photographs(request.output, collection)
     positions = find_positions(collection.photographs, request.gps, request.options.gps_deviation_m)
     look = look_at(collection, positions)
-    threads = request.threads or threads_available()
+    threads = request.threads or default_threads()
     pairs = matching.expected_pairs(len(collection.photographs), positions, request.options)
     takes = seconds(collection.photographs, pairs, request.options.feature_size, threads)
     return Prepared(request, collection, positions, look, threads, takes)
