@@ -63,6 +63,8 @@ class RunRequest:
     block: BlockConfig = field(default_factory=BlockConfig)
     merge: MergeConfig = field(default_factory=MergeConfig)
     watching: Annotated[WatchOptions, Named("")] = field(default_factory=WatchOptions)
+    photographs: tuple[Path, ...] = ()
+    """More folders of photographs, where the first is one of photographs alone."""
 
     def method(self) -> MethodConfig:
         """The settings that the result depends on."""

@@ -37,13 +37,9 @@ class Placed:
 def place(model: pycolmap.Reconstruction, photographs: Sequence[Photograph], positions: Positions) -> Placed | None:
     """The similarity that brings the model to its positions; None where they are too few. Does not change the model."""
     images = {image.name: image for image in model.images.values() if image.has_pose}
-    placed = [row for row, i in enumerate(positions.index) if photographs[int(i)].name in images]
-    if not positions.usable or len(placed) < LEAST_POSITIONS:
+    rows, centres, targets = _matched(images, photographs, positions)
+    if not positions.usable or len(rows) < LEAST_POSITIONS:
         return None
-    rows = np.array(placed)
-    names = [photographs[int(positions.index[row])].name for row in rows]
-    centres = np.array([images[name].projection_center() for name in names])
-    targets = positions.enu[rows]
     if not is_collinear(centres) and not is_line(targets, positions.deviations[rows]):
         similarity, inliers = fit_similarity_robust(centres, targets)
         how = f"positions of {int(inliers.sum())} photographs ({positions.source})"
@@ -52,6 +48,16 @@ def place(model: pycolmap.Reconstruction, photographs: Sequence[Photograph], pos
         similarity, inliers = _scaled(rotation, centres, targets), np.ones(len(rows), bool)
         how = f"positions of {len(rows)} photographs along one line ({positions.source}), up by {by}"
     return Placed(similarity, how, rows, similarity.apply(centres) - targets, inliers)
+
+
+def as_it_lies(
+    model: pycolmap.Reconstruction, photographs: Sequence[Photograph], positions: Positions, how: str
+) -> Placed:
+    """A model that was brought to its place by other things than positions, and how far those are from it."""
+    images = {image.name: image for image in model.images.values() if image.has_pose}
+    rows, centres, targets = _matched(images, photographs, positions)
+    stays = Similarity(1.0, np.eye(3), np.zeros(3))
+    return Placed(stays, how, rows, centres - targets, np.ones(len(rows), bool))
 
 
 def is_line(places: np.ndarray, deviations: np.ndarray) -> bool:
@@ -82,6 +88,16 @@ def tilt_against_attitudes(model: pycolmap.Reconstruction, photographs: Sequence
         if image.has_pose and image.name in gravity
     ]
     return float(np.median(angles)) if angles else None
+
+
+def _matched(
+    images: Mapping[str, pycolmap.Image], photographs: Sequence[Photograph], positions: Positions
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows [m] of the positions whose photographs are placed, where those were placed [m, 3], and the positions."""
+    rows = np.array([row for row, i in enumerate(positions.index) if photographs[int(i)].name in images], int)
+    names = [photographs[int(positions.index[row])].name for row in rows]
+    centres = np.array([images[name].projection_center() for name in names]).reshape(-1, 3)
+    return rows, centres, positions.enu[rows]
 
 
 def _rotation(image: pycolmap.Image) -> np.ndarray:

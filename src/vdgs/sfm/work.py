@@ -45,6 +45,16 @@ class Work:
     def models(self) -> Path:
         return self.path / "models"
 
+    @property
+    def snapshots(self) -> Path:
+        """Where the mapper writes what it has from time to time; whole only once it goes on."""
+        return self.path / "snapshots"
+
+    @property
+    def kept(self) -> Path:
+        """Whole models that mapping goes on from, by how many photographs they place."""
+        return self.path / "kept"
+
     def is_done(self, step: str, key: str) -> bool:
         return self._steps("done").get(step) == key
 
