@@ -21,7 +21,7 @@ from sfm_support import ORIGIN, Flight, fly, grid, write_photograph
 from vdgs.cameras import Camera
 from vdgs.captures.geodesy import enu_from_geodetic
 from vdgs.captures.loading import load_capture
-from vdgs.captures.reconstruction import ReconstructionFacts
+from vdgs.captures.reconstruction import ReconstructionFacts, read_reconstruction
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.pipeline import with_capture
 from vdgs.settings.presets import PRESETS
@@ -87,7 +87,8 @@ def test_two_folders_two_cameras_landscape_and_portrait_become_one_scene(flight,
     capture = load_capture(found.capture)
     assert len(capture.views) == 9
     assert {view.name.split("/")[0] for view in capture.views} == {"first", "second"}
-    assert len({(view.camera.fx, view.camera.width) for view in capture.views}) == 2
+    facts = read_reconstruction(found.capture)
+    assert [(camera.name, camera.photographs) for camera in facts.cameras] == [("Maker Drone", 4), ("Maker Other", 5)]
     assert "Maker Drone (4)" in said.file.getvalue()
     assert "Maker Other (5)" in said.file.getvalue()
     shift = enu_from_geodetic(np.array([capture.ground.origin_geo]), ORIGIN)[0]

@@ -154,6 +154,8 @@ def _options(hold_focal: bool, with_positions: bool, threads: int) -> pycolmap.I
     options.min_model_size = SMALLEST_MODEL
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not hold_focal
     options.use_prior_position = options.use_robust_loss_on_prior_position = with_positions
+    # Its solver takes minutes for each photograph that does not fit, and finds none in overlapping flights.
+    options.structure_less_registration_fallback = False
     # Points that two photographs see are where the edges of a flight, and few photographs, have any.
     options.triangulation.ignore_two_view_tracks = False
     return options
