@@ -83,7 +83,7 @@ class ReconstructionFacts:
     tilt_deg: float | None
     """Median angle of the views to straight down."""
     attitude_difference_deg: float | None
-    """Median angle between down as the model has it and as the drone recorded it."""
+    """Between down as the model has it and as the drone recorded it, without how the camera hangs on the drone."""
     cameras: tuple[CameraFacts, ...]
     photographs: tuple[PhotographFacts, ...]
     warnings: tuple[str, ...]
@@ -149,7 +149,7 @@ def facts_rows(facts: ReconstructionFacts) -> list[tuple[str, str]]:
         rows.append(("Flying height", f"{facts.height_m:.1f} m over the median point{recorded}"))
     if facts.tilt_deg is not None:
         against = facts.attitude_difference_deg
-        recorded = f"; {against:.1f}° from the recorded attitudes" if against is not None else ""
+        recorded = f"; down is {against:.1f}° from what the drone recorded" if against is not None else ""
         rows.append(("Tilt of the views", f"{facts.tilt_deg:.1f}° (median){recorded}"))
     return rows
 

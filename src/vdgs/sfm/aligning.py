@@ -15,6 +15,8 @@ from vdgs.sfm.positions import LEAST_POSITIONS, Positions
 
 #: Attitudes that agree on which way a world lies, at least.
 LEAST_ATTITUDES = 3
+#: Directions of flight tell a tilt from how a camera hangs if they spread so far: a ratio of singular values.
+SEVERAL_WAYS = 0.3
 #: Positions fix a turn about a line if they spread across it this many times their standard deviation.
 WRONG_TIMES = 3.0
 
@@ -80,14 +82,26 @@ def points_of(model: pycolmap.Reconstruction) -> np.ndarray:
 
 
 def tilt_against_attitudes(model: pycolmap.Reconstruction, photographs: Sequence[Photograph]) -> float | None:
-    """Median angle in degrees between down as the placed model has it and as the drone recorded it."""
+    """Angle in degrees between down as the placed model has it and as the drone recorded it.
+
+    Recorded down in the camera is down of the model, turned by a tilt of the world and by how the camera hangs on the
+    drone, which is the same in all photographs. Flown in several directions the two are told apart, by least squares
+    for small angles; in one, all is taken for a tilt.
+    """
     gravity = {photo.name: photo.attitude.gravity for photo in photographs if photo.attitude}
-    angles = [
-        np.degrees(np.arccos(np.clip(_rotation(image) @ [0, 0, -1] @ gravity[image.name], -1, 1)))
-        for image in model.images.values()
-        if image.has_pose and image.name in gravity
-    ]
-    return float(np.median(angles)) if angles else None
+    images = [image for image in model.images.values() if image.has_pose and image.name in gravity]
+    if len(images) < LEAST_ATTITUDES:
+        return None
+    rotations = np.array([_rotation(image) for image in images])
+    off = np.array([gravity[image.name] for image in images]) + rotations[:, :, 2]
+    hangs = np.broadcast_to(np.eye(3)[:, :2], (len(images), 3, 2))
+    for unknown in (np.concatenate([rotations[:, :, :2], hangs], axis=2), rotations[:, :, :2]):
+        flat = unknown.reshape(-1, unknown.shape[2])
+        singular = np.linalg.svd(flat, compute_uv=False)
+        if singular[-1] > SEVERAL_WAYS * singular[0]:
+            break
+    tilt = np.linalg.lstsq(flat, off.ravel(), rcond=None)[0][:2]
+    return float(np.degrees(np.linalg.norm(tilt)))
 
 
 def _matched(

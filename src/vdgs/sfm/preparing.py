@@ -53,7 +53,7 @@ def prepare(request: SfmRequest) -> Prepared:
     look = replace(look, warnings=[*look.warnings, *(control.notes if control else ())])
     threads = request.threads or default_threads()
     pairs = matching.expected_pairs(len(collection.photographs), positions, request.options)
-    takes = seconds(collection.photographs, pairs, request.options.feature_size, threads)
+    takes = seconds(collection.photographs, pairs, request.options, threads)
     return Prepared(request, collection, positions, look, threads, takes, control)
 
 
