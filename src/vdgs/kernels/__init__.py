@@ -80,14 +80,9 @@ def default_threads() -> int:
 
     Raises VdgsError for another value of that variable.
     """
-    text = os.environ.get("VDGS_THREADS")
-    if not text:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if not text.isdecimal() or int(text) < 1:
-        from vdgs.errors import VdgsError
+    from vdgs.kernels import cores
 
-        raise VdgsError(f"VDGS_THREADS must be a whole number from 1, not {text!r}.")
-    return int(text)
+    return cores.default_threads()
 
 
 def set_threads(count: int) -> None:
