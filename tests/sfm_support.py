@@ -66,12 +66,36 @@ def fly(folder: Path, cameras: Sequence[Camera], extent: float = 60.0) -> Flight
     return flight
 
 
+def sightings(cameras: Sequence[Camera], points: np.ndarray, extent: float = 60.0) -> list[dict[int, np.ndarray]]:
+    """For each place over the town (x, y) the pixels [2] at which cameras, by their numbers, see its ground; and, under
+    -1, the place on the ground itself [3]."""
+    tracer = Tracer(build_town(3, extent).mesh)
+    found = []
+    for x, y in points:
+        above = np.array([[x, y, 300.0]], np.float32)
+        ground = above[0] - [0, 0, tracer.cast(above, np.array([[0, 0, -1]], np.float32)).distance[0]]
+        seen = {-1: np.asarray(ground, np.float64)}
+        for k, camera in enumerate(cameras):
+            away = ground - camera.position
+            hit = tracer.cast(camera.position[None].astype(np.float32), away[None].astype(np.float32))
+            if camera.sees(ground[None])[0] and abs(hit.distance[0] - 1) < 1e-3:
+                seen[k] = camera.project(ground[None])[0][0]
+        found.append(seen)
+    return found
+
+
 def write_photograph(
-    file: Path, pixels: np.ndarray, number: int, enu: np.ndarray | None, orientation: int = 1, xmp: str | None = None
+    file: Path,
+    pixels: np.ndarray,
+    number: int,
+    enu: np.ndarray | None,
+    orientation: int = 1,
+    xmp: str | None = None,
+    model: str = "Drone",
 ) -> None:
     """A JPEG with EXIF, its place where `enu` is given, and XMP."""
     exif = Image.Exif()
-    exif[0x010F], exif[0x0110], exif[0x0112] = "Maker", "Drone", orientation
+    exif[0x010F], exif[0x0110], exif[0x0112] = "Maker", model, orientation
     details = exif.get_ifd(0x8769)
     details[0x9003] = f"2026:06:01 10:{number // 60:02d}:{number % 60:02d}"
     details[0x920A] = FOCAL_MM

@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,6 +19,7 @@ from vdgs.captures.geodesy import geodetic_from_enu
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.settings.sfm import SfmOptions, SfmRequest
 from vdgs.sfm import pairs
+from vdgs.sfm.aligning import tilt_against_attitudes
 from vdgs.sfm.attitude import of_aircraft, of_gimbal
 from vdgs.sfm.collection import collect, only_photographs
 from vdgs.sfm.lens import find_lens
@@ -161,6 +163,31 @@ def test_attitudes_of_gimbal_and_aircraft_agree_straight_down():
 
 
 # ------------------------------------------------------------------------------------------------- positions
+
+
+def turn(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
+    return np.asarray(pycolmap.Rotation3d(np.radians(degrees) * np.array(axis)).matrix())
+
+
+@pytest.mark.parametrize(("tilt", "askew", "headings", "said"), [
+    (0.0, 6.0, (0, 90, 180, 270), 0.0),  # a camera that hangs askew makes no tilted model
+    (4.0, 6.0, (0, 90, 180, 270), 4.0),
+    (4.0, 0.0, (10, 190), 4.0),
+    (4.0, 0.0, (30,), 4.0),  # flown in one direction all is taken for a tilt
+])  # fmt: skip
+def test_a_tilted_model_is_told_from_a_camera_that_hangs_askew(tmp_path, tilt, askew, headings, said):
+    """Recorded attitudes do not know how the camera hangs; the model does, and may lie askew itself."""
+    model, photographs = pycolmap.Reconstruction(), []
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=160, height=120, params=[100, 100, 80, 60], camera_id=1)
+    )
+    for k, heading in enumerate(headings * (6 // len(headings) + 1)):
+        photo = replace(photograph(tmp_path, k), attitude=of_gimbal(heading, -90 + k % 3, 0))
+        photographs.append(photo)
+        truth = turn((0, 1, 0), askew) @ photo.attitude.camera_from_enu
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(truth @ turn((1, 0, 0), tilt)), np.zeros(3))
+        model.add_image_with_trivial_frame(pycolmap.Image(name=photo.name, camera_id=1, image_id=k + 1), pose)
+    assert tilt_against_attitudes(model, photographs) == pytest.approx(said, abs=0.25)
 
 
 def test_positions_that_cannot_be_are_left_out_and_named(tmp_path):

@@ -21,9 +21,8 @@ from vdgs.runs.folder import RunFolder
 from vdgs.settings.checks import validate
 from vdgs.settings.ranges import refuse
 from vdgs.settings.requests import MapRequest, RunRequest
-from vdgs.sfm.collection import only_photographs
 from vdgs.sfm.reconstruct import reconstruct
-from vdgs.sfm.request import sfm_request
+from vdgs.sfm.request import of_photographs, sfm_request
 from vdgs.stages.coarse import train_coarse
 from vdgs.stages.evaluate import evaluate_stage, is_measured
 from vdgs.stages.merge import merge_run
@@ -58,14 +57,14 @@ def with_capture(asked: RunRequest, console: Console) -> RunRequest:
 
     Raises what `reconstruct` raises, and VdgsError for settings that do not work, before the long work.
     """
-    if not only_photographs(asked.capture):
+    if not of_photographs(asked):
         return asked
     if problems := validate(asked.method()):
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
     _title(console, "photographs")
     request = sfm_request(asked)
     reconstruct(request, console)
-    return replace(asked, capture=request.output, options=replace(asked.options, gps=None))
+    return replace(asked, capture=request.output, photographs=(), options=replace(asked.options, gps=None))
 
 
 def _stages(run: RunFolder, capture: Capture, asked: RunRequest, console: Console) -> None:

@@ -30,9 +30,8 @@ from vdgs.settings.checks import validate
 from vdgs.settings.method import MethodConfig, TrainConfig, block_limit, block_training, with_iterations
 from vdgs.settings.ranges import refuse
 from vdgs.settings.requests import RunRequest
-from vdgs.sfm.collection import only_photographs
 from vdgs.sfm.preparing import prepare, tell
-from vdgs.sfm.request import sfm_request
+from vdgs.sfm.request import of_photographs, sfm_request
 from vdgs.stages.coarse import open_stage, start
 from vdgs.storage.files import read_json
 from vdgs.training import TrainingState, train
@@ -71,7 +70,7 @@ def plan_run(asked: RunRequest, console: Console) -> Plan | None:
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
     if asked.options.undistort:
         raise VdgsError("--dry-run writes nothing, and --undistort writes photographs: leave one of the two out.")
-    if only_photographs(asked.capture):
+    if of_photographs(asked):
         return _plan_photographs(asked, console)
     capture = load_capture(asked.capture, asked.options)
     for warning in capture.warnings:
@@ -88,7 +87,9 @@ def _plan_photographs(asked: RunRequest, console: Console) -> Plan | None:
     request = sfm_request(asked)
     finished = read_reconstruction(request.output)
     if finished is not None:
-        return plan_run(replace(asked, capture=request.output, options=replace(asked.options, gps=None)), console)
+        return plan_run(
+            replace(asked, capture=request.output, photographs=(), options=replace(asked.options, gps=None)), console
+        )
     tell(prepare(request), console)
     console.print(
         f"Training can be estimated once they are a capture: vdgs sfm {asked.capture} --output CAPTURE, then the same "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,6 +41,21 @@ class PhotographFacts:
 
 
 @dataclass(frozen=True)
+class SurveyFacts:
+    """One surveyed point, as the model has it."""
+
+    name: str
+    used_as: str
+    """`control`: the model was brought to it; `check`: held out and measured; `not used`: it fits nothing."""
+    photographs: int
+    """Placed photographs that show it; 0: too few to tell its place."""
+    residual_m: tuple[float, ...] | None = None
+    """Seen minus surveyed: east, north, up."""
+    error_px: float | None = None
+    """RMS distance from where photographs show it to where the model puts it there."""
+
+
+@dataclass(frozen=True)
 class ReconstructionFacts:
     """What a person should know about a reconstruction."""
 
@@ -67,13 +83,23 @@ class ReconstructionFacts:
     tilt_deg: float | None
     """Median angle of the views to straight down."""
     attitude_difference_deg: float | None
-    """Median angle between down as the model has it and as the drone recorded it."""
+    """Between down as the model has it and as the drone recorded it, without how the camera hangs on the drone."""
     cameras: tuple[CameraFacts, ...]
     photographs: tuple[PhotographFacts, ...]
     warnings: tuple[str, ...]
     advice: tuple[str, ...]
     seconds: float
     """Of the last part of the work, where it was interrupted."""
+    survey: tuple[SurveyFacts, ...] = ()
+    """Surveyed points, those that placed the model and those held out."""
+
+    def survey_rmse_m(self, used_as: str) -> tuple[float, float, float] | None:
+        """East, north and up of check points, or of control points; None where there are none."""
+        known = [each.residual_m for each in self.survey if each.used_as == used_as and each.residual_m]
+        if not known:
+            return None
+        east, north, up = (math.sqrt(sum(value**2 for value in axis) / len(known)) for axis in zip(*known, strict=True))
+        return east, north, up
 
 
 def is_reconstruction(root: Path) -> bool:
@@ -108,6 +134,7 @@ def facts_rows(facts: ReconstructionFacts) -> list[tuple[str, str]]:
         east, north, up = facts.residual_rms_m
         left_out = f"; {facts.positions_left_out} positions not trusted" if facts.positions_left_out else ""
         rows.append(("Position residuals", f"RMS {east:.2f} m east, {north:.2f} m north, {up:.2f} m up{left_out}"))
+    rows += _survey_rows(facts)
     held = "held" if facts.focal_held else "fitted"
     for camera in facts.cameras:
         rows.append(
@@ -122,9 +149,33 @@ def facts_rows(facts: ReconstructionFacts) -> list[tuple[str, str]]:
         rows.append(("Flying height", f"{facts.height_m:.1f} m over the median point{recorded}"))
     if facts.tilt_deg is not None:
         against = facts.attitude_difference_deg
-        recorded = f"; {against:.1f}° from the recorded attitudes" if against is not None else ""
+        recorded = f"; down is {against:.1f}° from what the drone recorded" if against is not None else ""
         rows.append(("Tilt of the views", f"{facts.tilt_deg:.1f}° (median){recorded}"))
     return rows
+
+
+def _survey_rows(facts: ReconstructionFacts) -> list[tuple[str, str]]:
+    rows = []
+    for label, used_as, what in (
+        ("Control points", "control", "place the model"),
+        ("Check points", "check", "held out"),
+    ):
+        rmse = facts.survey_rmse_m(used_as)
+        if rmse is not None:
+            east, north, up = rmse
+            count = sum(each.used_as == used_as and each.residual_m is not None for each in facts.survey)
+            rows.append((label, f"{count}, {what}: RMSE {east:.3f} m east, {north:.3f} m north, {up:.3f} m up"))
+    return rows
+
+
+def survey_table(facts: ReconstructionFacts) -> list[tuple[str, str, str, str, str, str, str]]:
+    """Surveyed points as rows of words: name, what for, photographs, east, north, up in metres, pixels."""
+    rows = []
+    for each in facts.survey:
+        off = [f"{value:+.3f}" for value in each.residual_m] if each.residual_m else ["–"] * 3
+        pixels = f"{each.error_px:.1f}" if each.error_px is not None else "–"
+        rows.append((each.name, each.used_as, str(each.photographs), *off, pixels))
+    return rows  # type: ignore[return-value]
 
 
 def left_out_lines(facts: ReconstructionFacts) -> list[str]:

@@ -75,6 +75,16 @@ def threads() -> int:
     return module.threads()
 
 
+def default_threads() -> int:
+    """`VDGS_THREADS`, or the number of cores that this process may use; the kernels themselves are not loaded.
+
+    Raises VdgsError for another value of that variable.
+    """
+    from vdgs.kernels import cores
+
+    return cores.default_threads()
+
+
 def set_threads(count: int) -> None:
     """Let the operations use up to `count` threads of the CPU, the calling one included; torch's own as well.
 

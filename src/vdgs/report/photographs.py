@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vdgs.captures.reconstruction import FIGURE, FILE, ReconstructionFacts, facts_rows, left_out_lines
+from vdgs.captures.reconstruction import FIGURE, FILE, ReconstructionFacts, facts_rows, left_out_lines, survey_table
 from vdgs.report.page import Html, details, figure, heading, joined, paragraph, section, table
 from vdgs.report.reading import Shown
 from vdgs.storage.records import record_of
@@ -25,6 +25,10 @@ def photographs_section(shown: Shown) -> Html:
         return section("photographs", "From photographs to cameras", parts, source.notes)
     parts.append(table(["what", "how much"], facts_rows(facts), wordy=True))
     parts += [paragraph(warning, "note") for warning in facts.warnings]
+    if facts.survey:
+        names = ["point", "used as", "photographs", "east [m]", "north [m]", "up [m]", "error [px]"]
+        parts.append(heading("Surveyed points: seen minus surveyed"))
+        parts.append(table(names, survey_table(facts)))
     words = "The points from above; arrows lead from the recorded position of a photograph to where it was placed."
     parts.append(figure(source.picture(FIGURE), words, "residuals of the positions from above", True))
     parts.append(_left_out(left_out_lines(facts)))

@@ -65,6 +65,8 @@ class RunRequest:
     merge: MergeConfig = field(default_factory=MergeConfig)
     watching: Annotated[WatchOptions, Named("")] = field(default_factory=WatchOptions)
     where: Annotated[ExecutorOptions, Named("")] = field(default_factory=ExecutorOptions)
+    photographs: tuple[Path, ...] = ()
+    """More folders of photographs, where the first is one of photographs alone."""
 
     def method(self) -> MethodConfig:
         """The settings that the result depends on."""

@@ -27,6 +27,10 @@ class SfmOptions:
     """Features of a photograph, at most about so many."""
     max_size: Annotated[int, Range(16, 1_000_000, or_zero=True)] = 0
     """Longer side of the photographs that are written into images/, in pixels; 0: as large as they are."""
+    gcp: Path | None = None
+    """gcp_list.txt (as for ODM): surveyed points and where photographs show them. The model is brought to them."""
+    check_points: tuple[str, ...] = ()
+    """Names of points of --gcp that are held out and only measured afterwards; all: every one."""
     gps_deviation_m: Annotated[tuple[float, float], Range(0, 100_000, above=True)] = (1.0, 2.0)
     """Standard deviation of GPS positions across and upwards, in metres, where the photographs say none themselves."""
 

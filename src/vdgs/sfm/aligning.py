@@ -15,6 +15,8 @@ from vdgs.sfm.positions import LEAST_POSITIONS, Positions
 
 #: Attitudes that agree on which way a world lies, at least.
 LEAST_ATTITUDES = 3
+#: Directions of flight tell a tilt from how a camera hangs if they spread so far: a ratio of singular values.
+SEVERAL_WAYS = 0.3
 #: Positions fix a turn about a line if they spread across it this many times their standard deviation.
 WRONG_TIMES = 3.0
 
@@ -37,13 +39,9 @@ class Placed:
 def place(model: pycolmap.Reconstruction, photographs: Sequence[Photograph], positions: Positions) -> Placed | None:
     """The similarity that brings the model to its positions; None where they are too few. Does not change the model."""
     images = {image.name: image for image in model.images.values() if image.has_pose}
-    placed = [row for row, i in enumerate(positions.index) if photographs[int(i)].name in images]
-    if not positions.usable or len(placed) < LEAST_POSITIONS:
+    rows, centres, targets = _matched(images, photographs, positions)
+    if not positions.usable or len(rows) < LEAST_POSITIONS:
         return None
-    rows = np.array(placed)
-    names = [photographs[int(positions.index[row])].name for row in rows]
-    centres = np.array([images[name].projection_center() for name in names])
-    targets = positions.enu[rows]
     if not is_collinear(centres) and not is_line(targets, positions.deviations[rows]):
         similarity, inliers = fit_similarity_robust(centres, targets)
         how = f"positions of {int(inliers.sum())} photographs ({positions.source})"
@@ -52,6 +50,16 @@ def place(model: pycolmap.Reconstruction, photographs: Sequence[Photograph], pos
         similarity, inliers = _scaled(rotation, centres, targets), np.ones(len(rows), bool)
         how = f"positions of {len(rows)} photographs along one line ({positions.source}), up by {by}"
     return Placed(similarity, how, rows, similarity.apply(centres) - targets, inliers)
+
+
+def as_it_lies(
+    model: pycolmap.Reconstruction, photographs: Sequence[Photograph], positions: Positions, how: str
+) -> Placed:
+    """A model that was brought to its place by other things than positions, and how far those are from it."""
+    images = {image.name: image for image in model.images.values() if image.has_pose}
+    rows, centres, targets = _matched(images, photographs, positions)
+    stays = Similarity(1.0, np.eye(3), np.zeros(3))
+    return Placed(stays, how, rows, centres - targets, np.ones(len(rows), bool))
 
 
 def is_line(places: np.ndarray, deviations: np.ndarray) -> bool:
@@ -74,14 +82,36 @@ def points_of(model: pycolmap.Reconstruction) -> np.ndarray:
 
 
 def tilt_against_attitudes(model: pycolmap.Reconstruction, photographs: Sequence[Photograph]) -> float | None:
-    """Median angle in degrees between down as the placed model has it and as the drone recorded it."""
+    """Angle in degrees between down as the placed model has it and as the drone recorded it.
+
+    Recorded down in the camera is down of the model, turned by a tilt of the world and by how the camera hangs on the
+    drone, which is the same in all photographs. Flown in several directions the two are told apart, by least squares
+    for small angles; in one, all is taken for a tilt.
+    """
     gravity = {photo.name: photo.attitude.gravity for photo in photographs if photo.attitude}
-    angles = [
-        np.degrees(np.arccos(np.clip(_rotation(image) @ [0, 0, -1] @ gravity[image.name], -1, 1)))
-        for image in model.images.values()
-        if image.has_pose and image.name in gravity
-    ]
-    return float(np.median(angles)) if angles else None
+    images = [image for image in model.images.values() if image.has_pose and image.name in gravity]
+    if len(images) < LEAST_ATTITUDES:
+        return None
+    rotations = np.array([_rotation(image) for image in images])
+    off = np.array([gravity[image.name] for image in images]) + rotations[:, :, 2]
+    hangs = np.broadcast_to(np.eye(3)[:, :2], (len(images), 3, 2))
+    for unknown in (np.concatenate([rotations[:, :, :2], hangs], axis=2), rotations[:, :, :2]):
+        flat = unknown.reshape(-1, unknown.shape[2])
+        singular = np.linalg.svd(flat, compute_uv=False)
+        if singular[-1] > SEVERAL_WAYS * singular[0]:
+            break
+    tilt = np.linalg.lstsq(flat, off.ravel(), rcond=None)[0][:2]
+    return float(np.degrees(np.linalg.norm(tilt)))
+
+
+def _matched(
+    images: Mapping[str, pycolmap.Image], photographs: Sequence[Photograph], positions: Positions
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows [m] of the positions whose photographs are placed, where those were placed [m, 3], and the positions."""
+    rows = np.array([row for row, i in enumerate(positions.index) if photographs[int(i)].name in images], int)
+    names = [photographs[int(positions.index[row])].name for row in rows]
+    centres = np.array([images[name].projection_center() for name in names]).reshape(-1, 3)
+    return rows, centres, positions.enu[rows]
 
 
 def _rotation(image: pycolmap.Image) -> np.ndarray:

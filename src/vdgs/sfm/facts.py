@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pycolmap
 
-from vdgs.captures.reconstruction import CameraFacts, PhotographFacts, ReconstructionFacts
+from vdgs.captures.reconstruction import CameraFacts, PhotographFacts, ReconstructionFacts, SurveyFacts
 from vdgs.sfm.aligning import Placed, points_of, tilt_against_attitudes
 from vdgs.sfm.collection import Collection, LeftOut
 from vdgs.sfm.features import Kind
@@ -20,6 +20,8 @@ from vdgs.sfm.preparing import Prepared
 FOCAL_DRIFT, HEIGHT_DRIFT = 0.05, 0.15
 #: Degrees between down as the model has it and as the drone recorded it that are worth a word.
 TURNED_DEG = 3.0
+#: A mark so many pixels from where the model puts a surveyed point is wrong (choice).
+MARK_WRONG_PX = 8.0
 
 
 def facts_of(
@@ -29,6 +31,7 @@ def facts_of(
     placed: Placed | None,
     origin: tuple[float, float, float] | None,
     *,
+    survey: tuple[SurveyFacts, ...],
     left_out: Sequence[LeftOut],
     components: Sequence[int],
     pairs: int,
@@ -46,6 +49,7 @@ def facts_of(
     turned = tilt_against_attitudes(model, collection.photographs) if metric else None
     georeferenced = placed.how if placed else f"none: {_why_not(positions)}; scale, north and up are not known"
     warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned)]
+    warnings += _survey_warnings(survey)
     if not metric:
         warnings.append(f"not georeferenced ({_why_not(positions)}): the scale of the scene is arbitrary.")
     return ReconstructionFacts(
@@ -53,12 +57,13 @@ def facts_of(
         components=tuple(components), pairs=pairs, points=model.num_points3D(),
         track_length=float(model.compute_mean_track_length()),
         reprojection_px=float(model.compute_mean_reprojection_error()), georeferenced=georeferenced,
-        altitude_reference=positions.altitude_reference if metric else "", origin=origin,
+        altitude_reference=_altitudes(prepared) if metric else "", origin=origin,
         residual_rms_m=_rms(placed), positions_left_out=int((~placed.inliers).sum()) if placed else 0,
         focal_held=held[0], focal_reason=held[1], height_m=height, recorded_height_m=look.height_m, tilt_deg=tilt,
         attitude_difference_deg=turned, cameras=cameras,
         photographs=_photographs(collection, positions, placed, left_out), warnings=tuple(warnings),
         advice=tuple(_advice(look, held[0], len(images), len(collection.photographs), metric)), seconds=seconds,
+        survey=survey,
     )  # fmt: skip
 
 
@@ -94,6 +99,13 @@ def why_left_out(
     return found
 
 
+def _altitudes(prepared: Prepared) -> str:
+    control = prepared.control
+    if control is not None and control.places_the_model:
+        return f"heights as in {control.source} ({control.system})"
+    return prepared.positions.altitude_reference
+
+
 def _why_not(positions: Positions) -> str:
     if not len(positions):
         return "no positions that can be used"
@@ -101,7 +113,7 @@ def _why_not(positions: Positions) -> str:
 
 
 def _rms(placed: Placed | None) -> tuple[float, ...] | None:
-    if placed is None:
+    if placed is None or not placed.inliers.any():
         return None
     return tuple(float(value) for value in np.sqrt((placed.residuals[placed.inliers] ** 2).mean(axis=0)))
 
@@ -152,6 +164,19 @@ def _warnings(
         )
     if turned is not None and turned > TURNED_DEG:
         found.append(f"down differs by {turned:.1f}° from what the drone recorded: the model may be tilted or bent.")
+    return found
+
+
+def _survey_warnings(survey: Sequence[SurveyFacts]) -> list[str]:
+    found = []
+    for each in survey:
+        if each.residual_m is None:
+            found.append(f"the surveyed point {each.name} is shown by too few placed photographs; not used.")
+        elif each.used_as == "not used":
+            found.append(f"the control point {each.name} does not fit the others; not used. Is its place right?")
+        if each.error_px is not None and each.error_px > MARK_WRONG_PX:
+            away = f"{each.error_px:.0f} px from where it must be seen"
+            found.append(f"the surveyed point {each.name} is marked {away}. Look at its marks again.")
     return found
 
 

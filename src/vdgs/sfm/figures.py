@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,19 +31,22 @@ def draw_positions(positions: Positions, order: Sequence[int], title: str, file:
         _write(figure, file)
 
 
-def draw_residuals(points: np.ndarray, positions: Positions, placed: Placed | None, file: Path) -> None:
-    """Points from above; of every photograph the recorded position, and an arrow to where it was placed."""
-    factor = 1
-    if placed is not None:
+def draw_residuals(
+    points: np.ndarray, positions: Positions, placed: Placed | None, marks: Mapping[str, np.ndarray], file: Path
+) -> None:
+    """Points from above; of every photograph the recorded position, and an arrow to where it was placed; surveyed
+    points by their names."""
+    factor, arrows = 1, placed is not None and len(placed.rows) > 0
+    if placed is not None and arrows:
         span = float(np.ptp(positions.enu[placed.rows, :2], axis=0).max())
         longest = float(np.linalg.norm(placed.residuals[:, :2], axis=1).max())
         factor = next((n for n in (100, 50, 20, 10, 5, 2) if n * longest <= LONGEST_ARROW * span), 1)
-    title = f"Recorded to placed position, {factor} times as long" if placed is not None else "The points from above"
+    title = f"Recorded to placed position, {factor} times as long" if arrows else "The points from above"
     figure, axes = _axes(title, metric=placed is not None)
     few = points[:: max(1, len(points) // 20_000)]
     low, high = np.quantile(few[:, :2], [0.01, 0.99], axis=0)
     axes.plot(few[:, 0], few[:, 1], "o", markersize=1.2, markeredgewidth=0, color=FAINT, alpha=0.6, zorder=1)
-    if placed is not None:
+    if placed is not None and arrows:
         at, move = positions.enu[placed.rows, :2], factor * placed.residuals[:, :2]
         low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
         axes.plot(at[:, 0], at[:, 1], "o", color=INK, markersize=3, zorder=2)
@@ -51,6 +54,10 @@ def draw_residuals(points: np.ndarray, positions: Positions, placed: Placed | No
             at[:, 0], at[:, 1], move[:, 0], move[:, 1], angles="xy", scale_units="xy", scale=1, width=0.003,
             color=[INK if trusted else ACCENT for trusted in placed.inliers], zorder=3,
         )  # fmt: skip
+    for name, place in marks.items():
+        low, high = np.minimum(low, place[:2]), np.maximum(high, place[:2])
+        axes.plot(*place[:2], "^", color=ACCENT, markersize=6, zorder=4)
+        axes.annotate(name, place[:2], textcoords="offset points", xytext=(5, 3), fontsize=TEXT - 2, color=INK)
     margin = 0.05 * float((high - low).max()) + 1e-9
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
     _write(figure, file)

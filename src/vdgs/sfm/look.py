@@ -11,6 +11,7 @@ from datetime import datetime, timedelta
 import numpy as np
 from shapely import MultiPoint
 
+from vdgs.settings.sfm import SfmOptions
 from vdgs.sfm.collection import Collection
 from vdgs.sfm.features import is_searched_finely
 from vdgs.sfm.photograph import Photograph
@@ -24,10 +25,12 @@ LEAST_OVERLAP = 0.6
 LEAST_VIEWS = 4.0
 #: Views farther from straight down than this are oblique (degrees).
 OBLIQUE_DEG = 20.0
-#: Seconds of one core: a megapixel searched for features, a pair of photographs matched, a photograph placed.
-#: Measured on a Xeon without GPU; another machine may take half or twice as long. Features searched
-#: finely take three times as long.
-FEATURE_SECONDS, PAIR_SECONDS, MAPPING_SECONDS, WRITING_SECONDS = 0.5, 0.45, 1.5, 0.35
+#: Seconds of one core, measured on a Xeon without GPU (docs/sfm.md): a megapixel searched for features, a pair of
+#: photographs with 1000 features each compared (it goes with the square), a photograph placed, a megapixel written.
+#: Another machine may take half or twice as long.
+FEATURE_SECONDS, PAIR_SECONDS, MAPPING_SECONDS, WRITING_SECONDS = 0.3, 0.0062, 1.5, 0.35
+#: Features of a megapixel, about; searched finely three times as many, and it takes three times as long.
+FEATURES_A_MEGAPIXEL = 2500
 
 
 @dataclass(frozen=True)
@@ -83,11 +86,12 @@ def look_at(collection: Collection, positions: Positions) -> Look:
     )  # fmt: skip
 
 
-def seconds(photographs: Sequence[Photograph], pairs: int, feature_size: int, threads: int) -> float:
+def seconds(photographs: Sequence[Photograph], pairs: int, options: SfmOptions, threads: int) -> float:
     """About how long the work takes, from what one core was measured to take."""
-    pixels = sum(_searched(photo, feature_size, len(photographs)) for photo in photographs) / 1e6
+    pixels = sum(_searched(photo, options.feature_size, len(photographs)) for photo in photographs) / 1e6
+    features = min(options.features, FEATURES_A_MEGAPIXEL * pixels / len(photographs))
     written = sum(photo.width * photo.height for photo in photographs) / 1e6
-    shared = FEATURE_SECONDS * pixels + PAIR_SECONDS * pairs + WRITING_SECONDS * written
+    shared = FEATURE_SECONDS * pixels + PAIR_SECONDS * (features / 1000) ** 2 * pairs + WRITING_SECONDS * written
     return shared / max(1, threads) + MAPPING_SECONDS * len(photographs)
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -21,6 +23,8 @@ from vdgs.sfm.work import Work, call, progress
 OBLIQUE_SHARE, HEIGHTS_DIFFER = 0.15, 0.2
 #: Parts of fewer photographs than this are no model.
 SMALLEST_MODEL = 3
+#: What the mapper has is kept so many times on the way, each time by so many photographs more at least.
+SNAPSHOTS, LEAST_BETWEEN = 20, 5
 
 
 def holds_focal(photographs: Sequence[Photograph], options: SfmOptions) -> tuple[bool, str]:
@@ -67,23 +71,32 @@ def find_models(
 ) -> list[pycolmap.Reconstruction]:
     """All models that the mapper makes of the matches, that of most photographs first.
 
-    Raises CaptureError where it makes none.
+    What it has is kept on the way, and goes on where it was stopped (`forget_models` first to begin anew). Raises
+    CaptureError where it makes none.
     """
-    shutil.rmtree(work.models, ignore_errors=True)
-    work.models.mkdir(parents=True)
+    for folder in (work.models, work.snapshots):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
     options = _options(hold_focal, with_positions, threads)
-    placed = 0
-    with progress(console, "mapping, photographs", count) as tell:
+    options.snapshot_path, options.snapshot_frames_freq = work.snapshots, max(LEAST_BETWEEN, count // SNAPSHOTS)
+    begun = _largest_kept(work)
+    placed = int(begun.name) if begun else 2  # a model begins with two
+    with progress(console, f"mapping, {f'{placed} placed before, ' if begun else ''}photographs", count) as tell:
 
         def one_more() -> None:
             nonlocal placed
             placed += 1
-            tell(min(placed + 2, count))
+            tell(min(placed, count))
+            keep_snapshots(work)
 
-        models = call(
-            pycolmap.incremental_mapping, work.database, work.photographs, work.models, options,
-            next_image_callback=one_more,
-        )  # fmt: skip
+        try:
+            models = call(
+                pycolmap.incremental_mapping, work.database, work.photographs, work.models, options,
+                input_path=begun or "", next_image_callback=one_more,
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            keep_snapshots(work)  # the mapper ended by itself: they are whole
+            raise
         tell(count)
     if not models:
         raise CaptureError(
@@ -92,6 +105,38 @@ def find_models(
             "with 70 to 80 % overlap, the camera moving between photographs."
         )
     return _sorted(list(models.values()))
+
+
+def keep_snapshots(work: Work) -> None:
+    """Put whole snapshots of the mapper where the same command goes on from, unless a larger one is there.
+
+    To be called where the mapper does not write: then what is there is whole.
+    """
+    for folder in sorted(work.snapshots.iterdir()) if work.snapshots.is_dir() else []:
+        before, count = _largest_kept(work), _placed_in(folder)
+        if before is None or count > int(before.name):
+            work.kept.mkdir(exist_ok=True)
+            os.replace(folder, work.kept / str(count))
+            if before is not None:
+                shutil.rmtree(before)
+        else:
+            shutil.rmtree(folder)
+
+
+def forget_models(work: Work) -> None:
+    """Remove all models, finished or not."""
+    for folder in (work.models, work.snapshots, work.kept):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _largest_kept(work: Work) -> Path | None:
+    return max(work.kept.glob("*"), key=lambda folder: int(folder.name), default=None)
+
+
+def _placed_in(folder: Path) -> int:
+    """Number of photographs that a written model places: the first eight bytes of its images."""
+    with (folder / "images.bin").open("rb") as file:
+        return int.from_bytes(file.read(8), "little")
 
 
 def read_models(work: Work) -> list[pycolmap.Reconstruction]:
@@ -109,6 +154,8 @@ def _options(hold_focal: bool, with_positions: bool, threads: int) -> pycolmap.I
     options.min_model_size = SMALLEST_MODEL
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not hold_focal
     options.use_prior_position = options.use_robust_loss_on_prior_position = with_positions
+    # Its solver takes minutes for each photograph that does not fit, and finds none in overlapping flights.
+    options.structure_less_registration_fallback = False
     # Points that two photographs see are where the edges of a flight, and few photographs, have any.
     options.triangulation.ignore_two_view_tracks = False
     return options

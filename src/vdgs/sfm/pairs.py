@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
-from sklearn.cluster import MiniBatchKMeans
+
+if TYPE_CHECKING:
+    from sklearn.cluster import MiniBatchKMeans
 
 #: With positions: so many that follow in order of time too, where a position is wrong.
 NEXT_WITH_POSITIONS = 2
@@ -21,6 +23,8 @@ WORDS, SAMPLE = 48, 40_000
 
 def near(places: np.ndarray, neighbours: int) -> set[tuple[int, int]]:
     """Pairs of those nearest to each other in the plane; places [n, 3] metres, NaN where unknown."""
+    from scipy.spatial import cKDTree
+
     known = np.flatnonzero(np.isfinite(places).all(axis=1))
     if len(known) < 2:
         return set()
@@ -49,6 +53,8 @@ def alike(descriptors: Sequence[np.ndarray], asking: Sequence[int]) -> set[tuple
 
     Features are counted by their nearest word and summed as differences from it (VLAD, Jégou et al. 2010).
     """
+    from sklearn.cluster import MiniBatchKMeans  # here: the look before the work does without these seconds
+
     usable = [i for i, each in enumerate(descriptors) if len(each)]
     if len(usable) < 2:
         return set()

@@ -57,6 +57,20 @@ class Photograph:
     """Of the picture as the sensor has it; None for pictures that lay on their side."""
     bytes: int
 
+    @property
+    def stored_size(self) -> tuple[int, int]:
+        """Width and height of the file, before EXIF's orientation."""
+        turned = self.orientation in QUARTER_TURNS
+        return (self.height, self.width) if turned else (self.width, self.height)
+
+    def upright(self, pixel: tuple[float, float]) -> tuple[float, float]:
+        """Where a pixel of the file, from its upper left corner, lies once the photograph is upright."""
+        (x, y), (width, height) = pixel, self.stored_size
+        return {
+            1: (x, y), 2: (width - x, y), 3: (width - x, height - y), 4: (x, height - y),
+            5: (y, x), 6: (height - y, x), 7: (height - y, width - x), 8: (y, width - x),
+        }[self.orientation]  # fmt: skip
+
 
 def read_photograph(path: Path, name: str) -> Photograph:
     """Read the head of a photograph; its pixels are not decoded, unless its end is missing.

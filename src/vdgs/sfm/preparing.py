@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
 
 from vdgs.captures.outputs import refuse_in_a_capture
 from vdgs.errors import VdgsError
-from vdgs.kernels import threads as threads_available
+from vdgs.kernels import default_threads
 from vdgs.settings.ranges import refuse
-from vdgs.settings.sfm import SfmRequest
+from vdgs.settings.sfm import SfmOptions, SfmRequest
 from vdgs.sfm import mapping, matching
 from vdgs.sfm.collection import Collection, collect
+from vdgs.sfm.control import Control, check_near, read_control
 from vdgs.sfm.look import Look, look_at, seconds
 from vdgs.sfm.positions import Positions, find_positions
 from vdgs.sfm.telling import tell_look
@@ -33,6 +34,12 @@ class Prepared:
     look: Look
     threads: int
     seconds: float
+    control: Control | None = None
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """Of all metres east, north, up: latitude and longitude in degrees, altitude in metres."""
+        return self.control.middle if self.control and not self.positions.usable else self.positions.origin
 
 
 def prepare(request: SfmRequest) -> Prepared:
@@ -41,11 +48,23 @@ def prepare(request: SfmRequest) -> Prepared:
     collection = collect(request.photographs)
     refuse_among_photographs(request.output, collection)
     positions = find_positions(collection.photographs, request.gps, request.options.gps_deviation_m)
+    control = _control(request.options, collection, positions)
     look = look_at(collection, positions)
-    threads = request.threads or threads_available()
+    look = replace(look, warnings=[*look.warnings, *(control.notes if control else ())])
+    threads = request.threads or default_threads()
     pairs = matching.expected_pairs(len(collection.photographs), positions, request.options)
-    takes = seconds(collection.photographs, pairs, request.options.feature_size, threads)
-    return Prepared(request, collection, positions, look, threads, takes)
+    takes = seconds(collection.photographs, pairs, request.options, threads)
+    return Prepared(request, collection, positions, look, threads, takes, control)
+
+
+def _control(options: SfmOptions, collection: Collection, positions: Positions) -> Control | None:
+    if options.gcp is None:
+        if options.check_points:
+            raise VdgsError("--check-points names points of a list: give it with --gcp")
+        return None
+    control = read_control(options.gcp, collection, options.check_points)
+    check_near(control, positions.enu, positions.origin, options.gcp)
+    return control
 
 
 def tell(prepared: Prepared, console: Console) -> None:
@@ -55,13 +74,24 @@ def tell(prepared: Prepared, console: Console) -> None:
     held, why = mapping.holds_focal(photographs, options)
     how = "near each other by their positions" if prepared.positions.usable else (
         "all with all" if len(photographs) <= options.exhaustive else "next in order, and alike")  # fmt: skip
-    metres = "metres east, north, up, " if prepared.positions.usable else ""
+    metres = "metres east, north, up, " if prepared.positions.usable or prepared.control else ""
     plan = [
         f"features, about {pairs} pairs ({how}), poses and points, {metres}photographs without distortion",
+        *_plan_of(prepared.control),
         f"the focal length is {'held' if held else 'fitted'}: {why}",
         f"about {max(1, round(prepared.seconds / 60))} min on {prepared.threads} threads, if they are idle",
     ]
     tell_look(prepared.look, prepared.collection, plan, console)
+
+
+def _plan_of(control: Control | None) -> list[str]:
+    if control is None:
+        return []
+    held_out = sum(point.held_out for point in control.points)
+    used = len(control.points) - held_out
+    parts = [f"{used} place the model"] if used else []
+    parts += [f"{held_out} are held out to measure it"] if held_out else []
+    return [f"surveyed points of {control.source} ({control.system}): {', '.join(parts)}"]
 
 
 def refuse_among_photographs(output: Path, collection: Collection) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,13 @@ import pycolmap
 from rich.console import Console
 
 from vdgs import __version__
+from vdgs.captures.alignment import Similarity
 from vdgs.captures.reconstruction import (
     FIGURE,
     FILE,
     WORK,
     ReconstructionFacts,
+    SurveyFacts,
     is_reconstruction,
     read_reconstruction,
 )
@@ -26,7 +27,7 @@ from vdgs.errors import VdgsError
 from vdgs.runs.locks import hold
 from vdgs.settings.plain import to_dict
 from vdgs.settings.sfm import SfmRequest
-from vdgs.sfm import aligning, features, mapping, matching, writing
+from vdgs.sfm import aligning, features, mapping, matching, surveying, writing
 from vdgs.sfm.collection import LeftOut
 from vdgs.sfm.facts import facts_of, why_left_out
 from vdgs.sfm.figures import draw_positions, draw_residuals
@@ -79,7 +80,9 @@ def _keys(prepared: Prepared) -> dict[str, str]:
     placed = [positions.index.tolist(), positions.enu.tolist(), positions.deviations.tolist()]
     matched = key_of(found, placed, options.neighbours, options.exhaustive)
     mapped = key_of(matched, options.focal)
-    return {"features": found, "matches": matched, "model": mapped, "capture": key_of(mapped, options.max_size)}
+    points = prepared.control.points if prepared.control else ()
+    capture = key_of(mapped, options.max_size, [plain(point) for point in points])
+    return {"features": found, "matches": matched, "model": mapped, "capture": capture}
 
 
 def _is_finished(output: Path, key: str) -> bool:
@@ -112,15 +115,16 @@ def _steps(prepared: Prepared, work: Work, keys: dict[str, str], console: Consol
     left_out = why_left_out(
         models[0], models[1:], [photo.name for photo in photographs], matching.verified_counts(work), lost
     )
-    placed, origin = _place(models[0], prepared)
+    placed, origin, surveyed = _place(models[0], prepared, held[0])
     _write(prepared, work, models[0], keys["capture"], threads, console)
     facts = facts_of(
-        models[0], prepared, kinds, placed, origin, left_out=left_out,
+        models[0], prepared, kinds, placed, origin, survey=surveyed, left_out=left_out,
         components=[model.num_reg_images() for model in models], pairs=pairs, held=held,
         seconds=time.monotonic() - began,
     )  # fmt: skip
     points = aligning.points_of(models[0])
-    draw_residuals(points, prepared.positions, placed, output / FIGURE)
+    marks = dict(zip((each.name for each in surveyed), _places(prepared), strict=False))
+    draw_residuals(points, prepared.positions, placed, marks, output / FIGURE)
     if origin is not None:
         write_json(output / "georef.json", _georef(facts, origin))
     writing.write_model(output, models[0], _lenses(models[0], request.options.max_size))
@@ -166,7 +170,9 @@ def _models(
 ) -> list[pycolmap.Reconstruction]:
     if work.is_done("model", key):
         return mapping.read_models(work)
-    work.begin("model", key)
+    if not work.is_begun("model", key):
+        mapping.forget_models(work)
+        work.begin("model", key)
     mapping.write_priors(work, prepared.collection.photographs, prepared.positions)
     models = mapping.find_models(work, count, hold_focal, prepared.positions.usable, prepared.threads, console)
     work.finish("model", key)
@@ -174,18 +180,31 @@ def _models(
 
 
 def _place(
-    model: pycolmap.Reconstruction, prepared: Prepared
-) -> tuple[aligning.Placed | None, tuple[float, float, float] | None]:
-    """Bring the model to metres east, north, up, its median point to height 0; the origin that this has on Earth."""
-    placed = aligning.place(model, prepared.collection.photographs, prepared.positions)
+    model: pycolmap.Reconstruction, prepared: Prepared, hold_focal: bool
+) -> tuple[aligning.Placed | None, tuple[float, float, float] | None, tuple[SurveyFacts, ...]]:
+    """Bring the model to metres east, north, up, its median point to height 0; the origin that this has on Earth, and
+    what it makes of surveyed points."""
+    photographs, positions, control = prepared.collection.photographs, prepared.positions, prepared.control
+    doubtful = set[str]()
+    if control is not None and control.places_the_model:
+        how, doubtful = surveying.bring_to_control(model, control, prepared.origin, hold_focal, prepared.threads)
+        placed: aligning.Placed | None = aligning.as_it_lies(model, photographs, positions, how)
+    else:
+        placed = aligning.place(model, photographs, positions)
+        if placed is not None:
+            aligning.move(model, placed.similarity)
     if placed is None:
-        return None, None
-    similarity = placed.similarity
-    aligning.move(model, similarity)
+        return None, None, ()
+    surveyed = surveying.survey(model, control, prepared.origin, doubtful) if control is not None else ()
     ground = float(np.median(aligning.points_of(model)[:, 2]))
-    aligning.move(model, replace(similarity, scale=1.0, rotation=np.eye(3), translation=np.array([0.0, 0.0, -ground])))
-    latitude, longitude, altitude = prepared.positions.origin
-    return placed, (latitude, longitude, altitude + ground)
+    aligning.move(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))
+    latitude, longitude, altitude = prepared.origin
+    return placed, (latitude, longitude, altitude + ground), surveyed
+
+
+def _places(prepared: Prepared) -> np.ndarray:
+    """Surveyed points [n, 3], none where nothing was placed."""
+    return prepared.control.enu(prepared.origin) if prepared.control else np.zeros((0, 3))
 
 
 def _lenses(model: pycolmap.Reconstruction, max_size: int) -> dict[int, writing.Straightened]:

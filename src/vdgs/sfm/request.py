@@ -6,6 +6,19 @@ from vdgs.errors import VdgsError
 from vdgs.runs.folder import RunFolder
 from vdgs.settings.requests import RunRequest
 from vdgs.settings.sfm import SfmRequest
+from vdgs.sfm.collection import only_photographs
+
+
+def of_photographs(asked: RunRequest) -> bool:
+    """Whether a run is asked for of photographs, not of a capture. VdgsError for several folders that are not all of
+    photographs alone."""
+    if only_photographs(asked.capture):
+        return True
+    if asked.photographs:
+        raise VdgsError(
+            f"{asked.capture}: only folders of photographs alone can be several; a capture is given by itself."
+        )
+    return False
 
 
 def sfm_request(asked: RunRequest) -> SfmRequest:
@@ -16,4 +29,6 @@ def sfm_request(asked: RunRequest) -> SfmRequest:
             raise VdgsError(f"{flag} is about a capture's world; photographs get theirs from their positions (--gps).")
     run = RunFolder(asked.output)
     run.refuse_strangers()
-    return SfmRequest((asked.capture,), run.own_capture, options.gps, asked.threads, options=asked.sfm)
+    return SfmRequest(
+        (asked.capture, *asked.photographs), run.own_capture, options.gps, asked.threads, options=asked.sfm
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +25,8 @@ from vdgs.watching.interrupts import stop_if_asked
 Result = TypeVar("Result")
 #: Seconds between two looks whether a person asked to stop.
 _GLANCE = 0.2
+#: Work that takes fewer seconds needs no lines about how far it is.
+_QUIET = 30.0
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,16 @@ class Work:
     @property
     def models(self) -> Path:
         return self.path / "models"
+
+    @property
+    def snapshots(self) -> Path:
+        """Where the mapper writes what it has from time to time; whole only once it goes on."""
+        return self.path / "snapshots"
+
+    @property
+    def kept(self) -> Path:
+        """Whole models that mapping goes on from, by how many photographs they place."""
+        return self.path / "kept"
 
     def is_done(self, step: str, key: str) -> bool:
         return self._steps("done").get(step) == key
@@ -119,10 +132,11 @@ def call(function: Callable[..., Result], *arguments: Any, **named: Any) -> Resu
 
 @contextmanager
 def progress(console: Console, title: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar with the time left where the console is a terminal, else one line; yields what tells how many are done."""
+    """A bar with the time left where the console is a terminal, else a line for every tenth; yields what tells how many
+    are done."""
     if not console.is_terminal:
         console.print(f"{title}: {total}", highlight=False)
-        yield lambda done: None
+        yield _Lines(title, total, console)
         return
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
@@ -131,6 +145,28 @@ def progress(console: Console, title: str, total: int) -> Iterator[Callable[[int
     with Progress(*columns, console=console) as bar:
         task = bar.add_task(title, total=total)
         yield lambda done: bar.update(task, completed=done)
+
+
+class _Lines:
+    """How far work is, for logs: a line for every tenth, with the time left, and none in the first half minute."""
+
+    def __init__(self, title: str, total: int, console: Console) -> None:
+        self.title, self.total, self.console = title, total, console
+        self.began, self.first, self.told = time.monotonic(), -1, 0
+
+    def __call__(self, done: int) -> None:
+        if self.first < 0:
+            self.first = done  # what was done before tells nothing of the pace
+        seconds, tenth = time.monotonic() - self.began, 10 * done // max(1, self.total)
+        if seconds < _QUIET or tenth <= self.told or done <= self.first or done >= self.total:
+            return
+        self.told = tenth
+        left = seconds / (done - self.first) * (self.total - done)
+        self.console.print(f"{self.title}: {done} of {self.total}, about {_minutes(left)} left", highlight=False)
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
 
 
 def quiet_colmap() -> None:

@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from vdgs.settings.ranges import WORKERS, Named
 from vdgs.settings.sfm import SfmOptions, SfmRequest
-from vdgs.verbs.shared import open_console, parse, use_threads
+from vdgs.verbs.shared import open_console, parse
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,9 @@ def sfm(arguments: list[str]) -> None:
     asked = parse(SfmArguments, arguments, "vdgs sfm")
     from vdgs.errors import VdgsError
     from vdgs.sfm.preparing import prepare, tell
-    from vdgs.sfm.reconstruct import reconstruct
 
     if not asked.photographs:
         raise VdgsError("name the folder of the photographs: vdgs sfm PHOTOGRAPHS --output CAPTURE")
-    use_threads(asked.threads)
     request = SfmRequest(
         asked.photographs, asked.output, asked.gps, asked.threads, asked.keep_work, asked.options
     )  # fmt: skip
@@ -52,5 +50,7 @@ def sfm(arguments: list[str]) -> None:
         tell(prepare(request), console)
         console.print("Nothing was written.", highlight=False)
         return
+    from vdgs.sfm.reconstruct import reconstruct
+
     reconstruct(request, console)
     console.print(f"capture: {asked.output}\nnext: vdgs run {asked.output} --output RUN", highlight=False)

@@ -72,6 +72,8 @@ class RunArguments(RunRequest):
 
     capture: Positional[Path]
     """Folder of the capture, or of photographs alone: they become one in RUN/capture first (`vdgs sfm`)."""
+    photographs: Positional[tuple[Path, ...]] = ()
+    """More folders of photographs, where the first is one of photographs alone."""
     dry_run: bool = False
     """Only say what it would take: blocks, memory, time, by estimate and a few steps that are timed. Writes nothing."""
     quiet: bool = False
@@ -101,5 +103,5 @@ def run(arguments: list[str]) -> None:
         return
     from vdgs.pipeline import run_all
 
-    command = as_typed("run", arguments, (asked.capture, asked.output))
+    command = as_typed("run", arguments, (asked.capture, *asked.photographs, asked.output))
     run_all(replace(asked, device=device), open_console(asked.quiet), command)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from vdgs.captures.capture import Split
 from vdgs.captures.formats.json_poses import OPENGL_FROM_OPENCV
@@ -93,6 +92,8 @@ def _read_view(file: Path, image: Path, folder: str, split: Split, origin: np.nd
 
 def _load(file: Path) -> dict[str, Any]:
     """A dictionary from a torch file; `weights_only`, so that nothing in it can run."""
+    import torch  # here: other formats do without it, and it takes seconds
+
     try:
         content = torch.load(file, map_location="cpu", weights_only=True)
     except FileNotFoundError:
@@ -106,6 +107,8 @@ def _load(file: Path) -> dict[str, Any]:
 
 
 def _array(content: dict[str, Any], key: str, shape: tuple[int, ...], file: Path) -> np.ndarray:
+    import torch
+
     try:
         array = torch.as_tensor(content[key]).detach().to(torch.float64).numpy().reshape(shape)
     except (KeyError, TypeError, ValueError, RuntimeError):

@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from vdgs.errors import VdgsError
+from vdgs.kernels.cores import default_threads
 
 #: Every instruction set that the kernels are built for, best first.
 INSTRUCTION_SETS = ("avx512", "avx2", "portable")
@@ -80,23 +81,6 @@ def set_threads(count: int) -> None:
     if count < 1:
         raise ValueError(f"the number of threads must be at least 1, not {count}")
     native().set_threads(count)
-
-
-def default_threads() -> int:
-    """`VDGS_THREADS`, or the number of cores that this process may use."""
-    text = os.environ.get("VDGS_THREADS")
-    if not text:
-        return cores()
-    if not text.isdecimal() or int(text) < 1:
-        raise NativeUnavailable(f"VDGS_THREADS must be a whole number from 1, not {text!r}.")
-    return int(text)
-
-
-def cores() -> int:
-    """How many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _import(name: str) -> ModuleType:
