@@ -38,6 +38,8 @@ def decode_backward_adam(
         outputs = (again.means_px, again.conics, again.colours, again.opacities, again.volumes)
     received = (gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
                 torch.full_like(again.volumes, gradients.volume))  # fmt: skip
+    if gradients.depths is not None:
+        outputs, received = (*outputs, again.depths), (*received, gradients.depths)
     found = torch.autograd.grad(outputs, [*leaves, *decoder.tensors()], received)
     counted = updates[rows] + 1
     finite = True
