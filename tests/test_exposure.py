@@ -58,7 +58,7 @@ def fitted(config=CONFIG, kind: str = "coarse") -> tuple:
 
 
 def test_the_gradient_is_that_of_finite_differences():
-    state, unequal = fitted()
+    state, _ = fitted()
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         state.decoder.exposure.copy_(0.1 * torch.randn(8, 3, 4, generator=generator))
@@ -89,10 +89,11 @@ def test_photographs_of_unequal_brightness_are_told_from_the_scene():
     def error(trained) -> float:
         """Against the place as it is, at the mean brightness."""
         model = AnchorModel(trained.anchors, trained.decoder, 0.4, (0.0, 0.0, 0.0), {})
-        truth = Photographs()
-        return sum(
-            float(((render(model, truth.camera(i)).image - truth.get(i)[0] * (0.7 / 255)) ** 2).mean()) for i in range(8)
-        )
+        truth, errors = Photographs(), []
+        for index, camera in enumerate(truth.cameras):
+            picture = truth.get(index)[0] * (0.7 / 255)
+            errors.append(float(((render(model, camera).image - picture) ** 2).mean()))
+        return sum(errors)
 
     assert error(state) < error(plain)
 

@@ -23,8 +23,8 @@ DEPENDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 #: Settings that came after runs had been made without them, with the value that leaves those runs as they are: where a
-#: setting has it, keys do not mention it, so that a newer version takes older runs for finished, as they are. A group of
-#: which nothing is left is not mentioned either.
+#: setting has it, keys do not mention it, so that a newer version takes older runs for finished, as they are. Nor do
+#: they mention a group in which nothing else is left.
 SINCE: dict[str, dict[str, Any]] = {
     "training": {
         "sampling": "even",
