@@ -131,10 +131,13 @@ def _move(
     config, step = stage.config, state.iteration + 1
     rates = rates_at(config.rates, state.iteration / config.iterations)
     states, updates = state.optimiser.anchor_states(state.anchors, rates, config.early), state.optimiser.updates
-    if config.adam == "dense":
+    dense = config.adam == "dense"
+    if dense:
         updates.fill_(state.iteration)
-        coast_anchors(state.anchors, rows, states, step, stage.mobility)
     finite = move_anchors(state.anchors, rows, gradients, weights, camera, states, updates, stage.mobility)
+    if dense:
+        coast_anchors(state.anchors, rows, states, step, stage.mobility)
+        updates.fill_(step)
     finite &= state.optimiser.update_decoder(state.decoder, rates, step)
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")
