@@ -57,9 +57,9 @@ def compare(drawn: TrainingView, target: Target, decoder: Decoder, number: int, 
     for tensor, gradient in zip(fitted, found[1:], strict=True):
         tensor.grad = gradient
     if target.share != 1.0:
-        for gradient in (*found, alpha, depth):
-            if gradient is not None:
-                gradient.mul_(target.share)
+        for each in (*found, alpha, depth):
+            if each is not None:
+                each.mul_(target.share)
     return Objective(loss, photometric.l1, photometric.ssim, shown.detach(), found[0], alpha, depth)
 
 
