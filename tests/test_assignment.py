@@ -61,6 +61,15 @@ def test_laws_of_assignment(matrix, mode, floor):
     assert np.array_equal(assign(scores, config).why, result.why)
 
 
+@pytest.mark.parametrize("mode", ["coverage", "literal"])
+def test_without_its_best_block_a_camera_may_train_nothing(mode):
+    scores = np.array([[0.9, 0.1], [0.3, 0.2], [0.0, 0.5]])
+    given = hand_made(scores, np.ones((3, 2), int), mode=mode)
+    literal = assign(given, replace(CONFIG, mode=mode, best_block=False, min_cameras=0))
+    assert np.array_equal(literal.cameras, scores > 0.45)
+    assert assign(given, replace(CONFIG, mode=mode, min_cameras=0)).cameras.any(axis=1).all()
+
+
 def test_equal_scores_are_settled_by_anchors_held_and_then_by_index():
     scores = hand_made([[0.2, 0.2, 0.2]] * 4, [[1, 2, 2], [1, 1, 1], [3, 0, 0], [1, 1, 0]])
     result = assign(scores, replace(CONFIG, min_cameras=2))

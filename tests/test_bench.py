@@ -17,7 +17,7 @@ from vdgs.bench import bench
 from vdgs.bench.bench import BenchSettings, run_bench
 from vdgs.bench.grids import bounds_of
 from vdgs.bench.plan import Choices
-from vdgs.bench.seen import seen_truly
+from vdgs.bench.seen import seen_by_frusta, seen_truly
 from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
 from vdgs.settings.capture import CaptureOptions
@@ -107,6 +107,29 @@ def test_generated_scenes_are_grouped_by_the_true_visibility(benched):
     assert f"(V {bounds_of(groups[0])})" in (benched / "toy" / "verdict.txt").read_text()
 
 
+def test_frusta_hold_at_least_what_is_truly_seen(benched):
+    """The paper counts frusta, which hidden surfaces lie in too: groups by both stand in the table."""
+    root = benched / "captures" / "tiny"
+    truly, frusta = seen_truly(root, CaptureOptions()), seen_by_frusta(root, CaptureOptions())
+    assert truly is not None
+    assert frusta is not None
+    more, unseen, pixels = 0, 0, 0
+    for view in truly.capture.test_views:
+        seen, held = truly.counted(view.camera), frusta.counted(view.camera)
+        assert np.array_equal(np.isnan(seen), np.isnan(held))  # sky
+        assert np.mean(held[~np.isnan(held)] >= seen[~np.isnan(seen)]) > 0.99  # rounding at the edge of a picture
+        more += np.nansum(held - seen)
+        unseen, pixels = unseen + int((seen == 0).sum()), pixels + seen.size
+    assert more > 0
+    results = json.loads((benched / "toy" / "results.json").read_text())["results"]
+    assert {each["figures"]["unseen_share"] for each in results} == {unseen / pixels}
+    assert all(each["frusta"] and each["figures"]["psnr@frusta0"] > 0 for each in results)
+    assert results[0]["frusta"] != results[0]["groups"]
+    table = (benched / "toy" / "table.md").read_text()
+    assert "PSNR by visibility as the paper counts it" in table
+    assert f"{unseen / pixels:.1%}. There every method only guesses" in table
+
+
 def test_the_truth_is_that_of_the_views_that_are_used(benched):
     root = benched / "captures" / "tiny"
     small = seen_truly(root, CaptureOptions(downscale=2.0, validation=True))
@@ -127,7 +150,7 @@ def test_sky_belongs_to_no_group(benched, tmp_path, monkeypatch):
         below[:10] = np.nan
         return below
 
-    monkeypatch.setattr(bench, "seen_truly", lambda *_: replace(seen, visibility_map=with_sky, identity="with sky"))
+    monkeypatch.setattr(bench, "seen_truly", lambda *_: replace(seen, counted=with_sky, identity="with sky"))
     shutil.copytree(benched, tmp_path / "copy")
     pixels = sum(int(np.isfinite(with_sky(view.camera)).sum()) for view in seen.capture.test_views)
     for result in run_bench(settings(tmp_path / "copy"), Console(file=io.StringIO())):
@@ -142,6 +165,7 @@ def test_without_truth_pixels_are_grouped_anew_by_a_model(benched, tmp_path):
     before, said = models(copy), io.StringIO()
     by_model = run_bench(settings(copy), Console(file=said))
     assert {each.seen_by for each in by_model} == {"model"}
+    assert not any(each.frusta for each in by_model)
     by_truth = json.loads((benched / "toy" / "results.json").read_text())["results"][0]
     assert by_model[0].groups != tuple(by_truth["groups"])
     assert models(copy) == before

@@ -15,7 +15,8 @@ from vdgs.bench.worker import STAGES
 from vdgs.errors import VdgsError
 from vdgs.runs.keys import SINCE
 from vdgs.settings.checks import validate
-from vdgs.settings.plain import to_dict
+from vdgs.settings.method import block_training
+from vdgs.settings.plain import differences, to_dict
 from vdgs.settings.presets import PRESETS
 from vdgs.verbs.benching import BenchArguments
 
@@ -105,14 +106,45 @@ def test_blocks_as_printed_take_back_what_the_laptop_changes():
     }  # fmt: skip
     assert alone["frozen-decoder"] == replace(base, block=replace(base.block, decoder="frozen"))
     assert alone["even-sampling"] == replace(base, block=replace(base.block, sampling="even"))
-    damped = {name: getattr(paper.block, name) for name in ("offset_rate", "scale_rate", "feature_rate")}
-    assert alone["printed-rates"] == replace(base, block=replace(base.block, **damped))
+    again = {name: getattr(paper.block, name) for name in ("offset_rate", "scale_rate", "feature_rate")}
+    assert set(again.values()) == {1.0}  # the paper prints no rates for blocks
+    assert alone["printed-rates"] == replace(base, block=replace(base.block, **again))
     assert alone["full-size"] == replace(base, block=replace(base.block, resolutions=paper.block.resolutions))
     assert alone["last-model"] == replace(base, block=replace(base.block, average=paper.block.average))
     compensation = paper.block.compensation
     assert alone["printed-compensation"] == replace(base, block=replace(base.block, compensation=compensation))
     assert all(each != base for each in alone.values())
     assert alone["share-0.45"] == replace(base, assignment=replace(base.assignment, threshold=0.45))
+
+
+def test_presets_of_the_paper_restart_the_coarse_stage_and_literal_leaves_our_choices_out():
+    paper, literal = PRESETS["paper"], PRESETS["literal"]
+    for each in (paper, literal):
+        loop = block_training(each, 100)
+        assert (loop.rates, loop.growth) == (each.training.rates, each.training.growth)
+        assert (loop.iterations, loop.early, loop.average) == (50_000, 1.0, 0.0)
+        assert (each.partition.blocks, each.partition.expansion, each.assignment.threshold) == (8, 0.4, 0.45)
+    own = {
+        line.split(":")[0] for line in differences(to_dict(paper), to_dict(literal))
+    }  # fmt: skip
+    assert own == {
+        "assignment.best_block", "assignment.min_cameras", "assignment.mode", "block.compensation.added_to",
+        "block.compensation.gate", "block.context", "training.adam", "training.anchors.bound_sizes",
+        "training.anchors.fill_gaps", "training.anchors.outlier_distance", "training.loss.alpha_weight",
+        "training.loss.background", "training.loss.background_noise",
+    }  # fmt: skip
+    assert not validate(literal)
+
+
+def test_comparators_that_published_dense_adam_have_it():
+    scene = SCENES["lab-uneven"]
+    base = scene.base(scene.budget, 0)
+    scaffold, baseline = (METHODS[name].settings(base, scene.budget) for name in ("scaffold-gs", "baseline"))
+    assert scaffold == replace(baseline, training=replace(baseline.training, adam="dense"))
+    assert block_training(METHODS["dense-adam"].settings(base, scene.budget), 100).adam == "dense"
+    assert baseline.training.adam == "visible"
+    merged = {name: METHODS[name].settings(base, scene.budget).merge.rule for name in METHODS}
+    assert {name for name, rule in merged.items() if rule == "best_seen"} == {"free-best-seen", "ramp-best-seen"}
 
 
 def test_a_sweep_of_t_low_is_not_overruled_by_the_quantile_of_the_laptop():
@@ -139,9 +171,15 @@ def test_a_setting_that_came_later_leaves_older_runs_finished(monkeypatch):
         settings = to_dict(config)  # of everything, or of the coarse stage alone
         for section, since in SINCE.items():
             for part in (settings, settings.get(section, {})):
-                for name in since:
-                    part.pop(name, None)
+                leave_out(part, since)
         return settings
+
+    def leave_out(part: dict, since: dict) -> None:
+        for name, value in since.items():
+            if isinstance(value, dict) and name in part:
+                leave_out(part[name], value)
+            if not isinstance(value, dict) or part.get(name) == {}:
+                part.pop(name, None)
 
     now = keys()
     assert len(now) > 3

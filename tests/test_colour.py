@@ -7,7 +7,7 @@ import pytest
 
 from evaluation_support import photograph, psnr
 from vdgs.evaluation import metrics
-from vdgs.evaluation.colour import correct_colours
+from vdgs.evaluation.colour import correct_colours, correct_colours_affinely
 
 
 def directly_corrected(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
@@ -39,6 +39,20 @@ def test_a_change_of_exposure_and_white_balance_is_undone():
     assert result.fitted
     assert psnr(image, reference) < 30
     assert psnr(metrics.to_8bit(result.image), reference) > 45
+
+
+def test_an_affine_map_undoes_exposure_and_white_balance_and_nothing_that_is_curved():
+    reference = photograph(np.random.default_rng(0), 96, 128)
+    image = distorted(reference)
+    result = correct_colours_affinely(image, reference)
+    assert result.fitted
+    assert psnr(metrics.to_8bit(result.image), reference) > 45
+    curved = metrics.to_8bit((reference / 255) ** 2)
+    affine, quadratic = correct_colours_affinely(curved, reference), correct_colours(curved, reference)
+    assert psnr(curved, reference) < psnr(metrics.to_8bit(affine.image), reference)
+    assert psnr(metrics.to_8bit(affine.image), reference) < psnr(metrics.to_8bit(quadratic.image), reference) - 3
+    black = np.zeros_like(reference)
+    assert not correct_colours_affinely(black, reference).fitted
 
 
 def test_equals_the_direct_computation():

@@ -154,6 +154,29 @@ def test_fed_steadily_the_statistic_tends_to_21_times_its_size():
     assert sizes[-1] == pytest.approx(0.5 * (1 + PAPER.beta_g / (1 - PAPER.gamma)), rel=1e-4)
 
 
+@pytest.mark.parametrize(("added_to", "expected"), [("mean", 0.5 + 1.0), ("sum", 0.5 + 1.0 / 8)])
+def test_what_is_added_to_the_sum_is_divided_by_the_draws(added_to, expected):
+    """Eight draws of a mean of 0.5, and g = 1: parents are those whose statistic reaches the threshold."""
+    config = replace(PAPER, added_to=added_to)
+    for threshold, asks in ((0.999 * expected, True), (1.001 * expected, False)):
+        statistics, memory = one_offset(times=8.5, mean=0.5), Compensation.zeros(1, 1)
+        statistics.drawn.fill_(8.0)
+        statistics.gradient.fill_(4.0)
+        update_cache(memory, statistics, ALL, config)
+        assert float(memory.cache) == 1.0
+        growth = replace(GROWTH, threshold=threshold, levels=1, gate=0.05)
+        change = compensate(memory, ALL, config.t_low, growth, config)
+        anchors = some_anchors(1)
+        anchors = replace(anchors, offsets=100.0 + anchors.offsets[:, :1])
+        seeds = range(12)  # an offset that asks is kept by half of them
+        grown = [
+            len(decide(anchors, Statistics(**{n: t.clone() for n, t in statistics.tensors().items()}), 1.0, growth,
+                       torch.Generator().manual_seed(seed), compensated=change).added)
+            for seed in seeds
+        ]  # fmt: skip
+        assert any(grown) == asks
+
+
 def test_what_is_not_judged_keeps_counting_and_the_cycle_is_still_its_own():
     statistics, memory = one_offset(times=30, mean=2.0), Compensation.zeros(1, 1)
     anchors = some_anchors(1)

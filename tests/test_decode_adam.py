@@ -31,15 +31,17 @@ def states_of(scene: Scene) -> list[AdamState]:
     ]
 
 
-def gradients_of(scene: Scene, rows: torch.Tensor = ROWS) -> SplatGradients:
+def gradients_of(scene: Scene, rows: torch.Tensor = ROWS, depths: bool = False) -> SplatGradients:
     with torch.no_grad():
         splats = native.decode(*scene.arguments, CAMERA, rows)
     g = torch.Generator().manual_seed(8)
     parts = {name: torch.randn(getattr(splats, name).shape, generator=g)
              for name in ("means_px", "conics", "colours", "opacities")}  # fmt: skip
+    of_depth = torch.randn(splats.depths.shape, generator=g) if depths else None
     return SplatGradients(
-        **parts, volume=0.3, source=splats.source, colour_values=splats.colours, opacity_values=splats.opacities
-    )
+        **parts, volume=0.3, source=splats.source, colour_values=splats.colours, opacity_values=splats.opacities,
+        depths=of_depth,
+    )  # fmt: skip
 
 
 def fused(kernels, scene: Scene, gradients: SplatGradients, rows: torch.Tensor = ROWS):
@@ -67,17 +69,20 @@ def apart(scene: Scene, gradients: SplatGradients) -> list[torch.Tensor]:
     outputs = [splats.means_px, splats.conics, splats.colours, splats.opacities, splats.volumes]
     received = [gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
                 torch.full_like(splats.volumes, gradients.volume)]  # fmt: skip
+    if gradients.depths is not None:
+        outputs, received = [*outputs, splats.depths], [*received, gradients.depths]
     found = torch.autograd.grad(outputs, [*leaves, *weights.tensors()], received)
     for state, gradient in zip(states, found, strict=False):
         assert native.adam_rows(state, ROWS, gradient, counted(ROWS)[ROWS])
     return [*(t for state in states for t in state[:3]), *found[3:]]
 
 
+@pytest.mark.parametrize("depths", [False, True])
 @every_instruction_set
-def test_the_bits_are_those_of_autograd_and_adam_for_any_number_of_threads(instructions):
+def test_the_bits_are_those_of_autograd_and_adam_for_any_number_of_threads(instructions, depths):
     scene = Scene.random(700, seed=2)
     with using(instructions):
-        gradients = gradients_of(scene)
+        gradients = gradients_of(scene, depths=depths)
         assert len(gradients.source) > 300
         expected = apart(scene, gradients)
         for count in (1, 3):
@@ -87,12 +92,24 @@ def test_the_bits_are_those_of_autograd_and_adam_for_any_number_of_threads(instr
             assert all(torch.equal(a, b) for a, b in zip(ours, expected, strict=True))
 
 
-@pytest.mark.parametrize("with_distance", [False, True])
-def test_native_equals_the_twin(with_distance):
+@pytest.mark.parametrize(("with_distance", "depths"), [(False, False), (True, False), (False, True)])
+def test_native_equals_the_twin(with_distance, depths):
     scene = Scene.random(700, k=3, with_distance=with_distance, seed=3)
-    gradients = gradients_of(scene)
+    gradients = gradients_of(scene, depths=depths)
     for ours, twins in zip(fused(native, scene, gradients)[1], fused(reference, scene, gradients)[1], strict=True):
         torch.testing.assert_close(ours, twins, rtol=2e-3, atol=2e-4 * float(twins.abs().max()))
+
+
+@pytest.mark.parametrize("kernels", [native, reference])
+def test_a_gradient_by_depth_moves_anchors_and_one_of_nothing_does_not(kernels):
+    scene = Scene.random(700, seed=2)
+    gradients = gradients_of(scene)
+    none, zero, some = (
+        fused(kernels, scene, replace(gradients, depths=depths))[1]
+        for depths in (None, torch.zeros(len(gradients.source)), torch.ones(len(gradients.source)))
+    )
+    assert all(torch.equal(a, b) for a, b in zip(none, zero, strict=True))
+    assert not torch.equal(none[3], some[3])  # offsets
 
 
 def test_rows_that_are_not_given_keep_their_bits():

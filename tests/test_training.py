@@ -20,6 +20,8 @@ from vdgs.settings.method import AnchorConfig, GrowthConfig, RateConfig, TrainCo
 from vdgs.storage.checkpoints import load_newest, save_state
 from vdgs.training import Stage, downscale_at, from_saved, start_state, to_saved, train, train_step, view_at
 from vdgs.training.crops import Crop, crop_at
+from vdgs.training.optimiser import rates_at
+from vdgs.training.step import coast_anchors
 
 pytestmark = pytest.mark.xdist_group("training")
 
@@ -203,6 +205,39 @@ def test_the_first_step_of_an_anchor_is_the_same_whenever_it_is_seen_first(first
         moved = (getattr(state.anchors, name) - getattr(before, name)).abs()
         assert not moved[updates == 0].any()
         assert 0.99 * rate < float(moved.max()) < 1.01 * rate
+
+
+def test_dense_adam_moves_what_a_view_does_not_show_along_its_moments():
+    """All anchors, one photograph a step: parameters and moments are those of torch's Adam on whole tensors."""
+    config = replace(CONFIG, adam="dense", growth=replace(CONFIG.growth, until=0.0), resolutions=((0.0, 1),))
+    state, given = start(config), replace(stage(config), frozen_decoder=True)
+    far = state.anchors.positions[:, 0] > 2.5  # the last views alone show it
+    before = state.anchors.select(far)
+    for _ in range(9):
+        train_step(state, given)
+    assert set(state.optimiser.updates.tolist()) == {9}
+    last, moments = state.anchors.select(torch.arange(len(far))), state.optimiser.anchors
+    first = {name: t.clone() for name, t in moments.first.items()}
+    second = {name: t.clone() for name, t in moments.second.items()}
+    nothing = torch.empty(0, dtype=torch.int64)
+    rates = rates_at(config.rates, 9 / config.iterations)
+    coast_anchors(state.anchors, nothing, state.optimiser.anchor_states(state.anchors, rates, 1.0), 10)
+    for name in ("features", "offsets", "log_scales"):
+        m, v = 0.9 * first[name], 0.999 * second[name]
+        step = rates[name] * (m / (1 - 0.9**10)) / ((v / (1 - 0.999**10)).sqrt() + 1e-15)
+        torch.testing.assert_close(getattr(state.anchors, name), getattr(last, name) - step, rtol=1e-4, atol=1e-6)
+        torch.testing.assert_close(moments.first[name], m)
+        torch.testing.assert_close(moments.second[name], v)
+    assert not torch.equal(before.features, last.select(far).features)
+
+
+def test_visible_and_dense_adam_are_one_where_all_is_seen():
+    """The first step moves what it shows, and nothing else has a moment to follow."""
+    states = [start(replace(CONFIG, adam=adam)) for adam in ("visible", "dense")]
+    for state, adam in zip(states, ("visible", "dense"), strict=True):
+        train_step(state, stage(replace(CONFIG, adam=adam)))
+    visible, dense = (bits(state) for state in states)
+    assert {name for name in visible if visible[name] != dense[name]} == {"updates.anchors"}
 
 
 def test_a_parameter_that_is_not_a_number_stops_training():

@@ -132,13 +132,13 @@ bool backward_adam(const AnchorTensors& tensors, const Array<const int64_t>& row
                    const Rows<const float>& colours, const Rows<const float>& opacities,
                    const std::array<Rows<const float>, 4>& gradients, float volume,
                    const std::array<StepArguments, 3>& steps, const Rows<int32_t>& updates,
-                   const std::optional<nb::list>& weights_out) {
+                   const std::optional<nb::list>& weights_out, const MaybeGradient& depths) {
   const AnchorArrays anchors = anchor_arrays(tensors, rows);
   const WeightLayout layout{anchors.k};
   const Floats packed = pack_weights(weights, layout);
   const WeightGradients summed(weights_out, layout);
   const Camera view = unpack_camera(camera.data());
-  const SplatGradients in = {gradients[0].data(), gradients[1].data(), nullptr, gradients[2].data(),
+  const SplatGradients in = {gradients[0].data(), gradients[1].data(), data(depths), gradients[2].data(),
                              gradients[3].data(), nullptr, volume, colours.data(), opacities.data(), source.data(),
                              static_cast<int64_t>(source.shape(0))};
   const AnchorSteps moves = {adam_rows(steps[0], kFeatures), adam_rows(steps[1], 3 * anchors.k),
@@ -161,6 +161,7 @@ VDGS_BIND(decode) {
   m.def("decode_backward", &backward, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
         nb::arg(), nb::arg().none());
   m.def("decode_backward_adam", &backward_adam, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(),
-        nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none());
+        nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(),
+        nb::arg("depths") = nb::none());
   m.attr("max_offsets") = kMaxOffsets;
 }

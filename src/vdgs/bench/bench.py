@@ -24,12 +24,12 @@ from rich.console import Console
 from vdgs.bench.definitions import Scene
 from vdgs.bench.figure import draw_groups
 from vdgs.bench.grids import grids_of
-from vdgs.bench.measure import GROUPS_FILE, measure_groups
+from vdgs.bench.measure import FRUSTA_FILE, GROUPS_FILE, measure_groups
 from vdgs.bench.notes import notes_of
 from vdgs.bench.plan import Choices, Plan, PlannedRun, make_plan
 from vdgs.bench.renders import check_renders
 from vdgs.bench.results import Result, as_json, gather
-from vdgs.bench.seen import Seen, seen_by_model, seen_truly
+from vdgs.bench.seen import Seen, seen_by_frusta, seen_by_model, seen_truly
 from vdgs.bench.verdict import verdict
 from vdgs.bench.worker import RECORD, Job
 from vdgs.bench.writing import latex, markdown, tidy_csv
@@ -250,15 +250,21 @@ def _measure(
             seen = _seen(plan, scene, captures[scene.name], ended, settings)
             if seen is None:
                 for run in done:  # what an earlier table may have left there is of another V
-                    (settings.output / run.folder / GROUPS_FILE).unlink(missing_ok=True)
+                    for file in (GROUPS_FILE, FRUSTA_FILE):
+                        (settings.output / run.folder / file).unlink(missing_ok=True)
                 continue
+            by_frusta = seen_by_frusta(captures[scene.name], _options(scene, settings)) if seen.by == "truth" else None
             folders = [settings.output / run.folder for run in done]
             keys = {folder: read_json(folder / RECORD)["key"] for folder in folders}
             with console.status(f"{scene.name}: measuring by visibility") as status:
-                measure_groups(
-                    seen, keys, settings.bins,
-                    lambda text, scene=scene, status=status: status.update(f"{scene.name}: {text}"),  # type: ignore[misc]
-                )  # fmt: skip
+                for each in (seen, by_frusta) if by_frusta is not None else (seen,):
+                    measure_groups(
+                        each, keys, settings.bins,
+                        lambda text, scene=scene, status=status: status.update(f"{scene.name}: {text}"),  # type: ignore[misc]
+                    )  # fmt: skip
+            if by_frusta is None:
+                for folder in folders:
+                    (folder / FRUSTA_FILE).unlink(missing_ok=True)
         except VdgsError as error:
             failed |= {run.name: Outcome(run.name, "failed", why=str(error)) for run in done}
     return failed

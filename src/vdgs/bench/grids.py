@@ -98,6 +98,7 @@ SIZES = (
 SEEN_BY = {
     "truth": "Training cameras that truly see the surface at a pixel, with occlusion (sky, and what none sees, belongs "
     "to no group)",
+    "frusta": "Training cameras whose frustum holds the true surface at a pixel, hidden or not, as the paper counts V",
     "model": "Training cameras whose frustum holds the place that one coarse model draws at a pixel",
 }
 
@@ -107,9 +108,12 @@ def grids_of(plan: Plan, results: Sequence[Result]) -> list[Grid]:
     numbers."""
     across = "mean ± standard deviation over seeds" if len(plan.seeds) > 1 else "one seed"
     views = "Validation views" if plan.validation else "Test views"
+    unseen = _unseen(plan, results)
     grids = [
-        _measured(plan, results, "raw", f"{views}, raw ({across})", _for_scenes(plan, QUALITY)),
-        _measured(plan, results, "corrected", f"{views}, colour-corrected ({across})", _for_scenes(plan, CORRECTED)),
+        _measured(plan, results, "raw", f"{views}, raw ({across})", _for_scenes(plan, QUALITY), unseen),
+        _measured(
+            plan, results, "corrected", f"{views}, colour-corrected ({across})", _for_scenes(plan, CORRECTED), unseen
+        ),
     ]
     for scene in plan.scenes:
         mine = [result for result in results if result.scene == scene.name]
@@ -117,6 +121,10 @@ def grids_of(plan: Plan, results: Sequence[Result]) -> list[Grid]:
         if columns:
             title = f"{scene.title}: PSNR by visibility"
             grids.append(_measured(plan, mine, f"visibility-{scene.name}", title, columns, notes))
+        columns, notes = _frusta_columns(mine, scene.name)
+        if columns:
+            title = f"{scene.title}: PSNR by visibility as the paper counts it"
+            grids.append(_measured(plan, mine, f"frusta-{scene.name}", title, columns, notes))
         columns = [_for_scene(c, scene.name) for c in SOLIDITY if any(r.figures.get(c.key) is not None for r in mine)]
         if columns:
             title = f"{scene.title}: solidity"
@@ -141,6 +149,31 @@ def _for_scenes(plan: Plan, columns: Sequence[Column]) -> list[Column]:
         for scene in plan.scenes
         for c in columns
     ]  # fmt: skip
+
+
+def _unseen(plan: Plan, results: Sequence[Result]) -> tuple[str, ...]:
+    """What the figures over all pixels hold that no training camera sees, scene by scene."""
+    shares = {}
+    for scene in plan.scenes:
+        known = [result.figures.get("unseen_share") for result in results if result.scene == scene.name]
+        share = next((each for each in known if each is not None), None)
+        if share is not None:
+            shares[scene.title] = share
+    if not shares:
+        return ()
+    said = "; ".join(f"{title}: {share:.1%}" for title, share in shares.items())
+    return (f"Over all pixels, of which no training camera sees: {said}. There every method only guesses.",)
+
+
+def _frusta_columns(results: Sequence[Result], scene: str) -> tuple[list[Column], tuple[str, ...]]:
+    """PSNR of each group by V as frusta count it, least seen first; how the groups are bounded."""
+    groups = next((result.frusta for result in results if result.frusta), ())
+    if not groups:
+        return [], ()
+    names = group_names(len(groups))
+    columns = [Column(f"{name} ↑", f"psnr@frusta{index}", scene=scene) for index, name in enumerate(names)]
+    bounds = "; ".join(f"{name}: V {bounds_of(group)}" for name, group in zip(names, groups, strict=True))
+    return columns, (f"V: {SEEN_BY['frusta']}. Pooled over all these views: {bounds}.",)
 
 
 def _group_columns(results: Sequence[Result], scene: str) -> tuple[list[Column], tuple[str, ...]]:

@@ -28,6 +28,8 @@ from vdgs.storage.files import jsonable, read_json, write_json
 
 #: In a run folder: its figures by visibility, and the V and the key of the run that they hold for.
 GROUPS_FILE = "by_visibility.json"
+#: The same by the frusta that hold the true surface, of generated scenes.
+FRUSTA_FILE = "by_frusta.json"
 NAMES = ("squared_error", "ssim", "squared_error_cc", "ssim_cc")
 
 
@@ -38,28 +40,33 @@ def evaluated(run: Path) -> Path:
 
 
 def measure_groups(seen: Seen, runs: Mapping[Path, str], bins: int, tell: Callable[[str], None]) -> None:
-    """Write GROUPS_FILE into every run of a scene that has none for this V and its key.
+    """Write GROUPS_FILE (of V by frusta FRUSTA_FILE) into every run of a scene that has none for this V and its key.
 
     `runs`: folder -> key. The test views are read once for all. Raises VdgsError where a picture is missing.
     """
-    of = {"seen_by": seen.by, "seen": seen.identity, "bins": bins, "whole_cameras": True}
+    file = FRUSTA_FILE if seen.by == "frusta" else GROUPS_FILE
+    of = {"seen_by": seen.by, "seen": seen.identity, "bins": bins, "whole_cameras": True, "tells_unseen": True}
     wanted = {folder: of | {"run": key} for folder, key in runs.items()}
-    left = [folder for folder, record in wanted.items() if not _is_measured(folder, record)]
+    left = [folder for folder, record in wanted.items() if not _is_measured(folder / file, record)]
     if not left:
         return
     views = seen.capture.test_views
     stems = file_stems([view.name for view in views])
     histograms = {folder: VisibilityHistogram(NAMES) for folder in left}
+    unseen, pixels = 0, 0
     with ImageCache(views, EVALUATION_IMAGES_BYTES) as images:
         for index, view in enumerate(views):
             tell(f"test view {index + 1} of {len(views)}")
             photograph, views_of_pixels = images.get(index), seen.visibility_map(view.camera)
             mask = None if photograph.mask is None else photograph.mask.numpy() > 0
+            kept = np.ones(views_of_pixels.shape, bool) if mask is None else mask
+            unseen, pixels = unseen + int((seen.unseen(view.camera) & kept).sum()), pixels + int(kept.sum())
             for folder in left:
                 picture = _read_picture(evaluated(folder) / "renders" / f"{stems[index]}.png", folder)
                 histograms[folder].add(views_of_pixels, pixel_values(picture, photograph.image.numpy(), mask), mask)
     for folder in left:
-        write_json(folder / GROUPS_FILE, jsonable(wanted[folder] | {"groups": histograms[folder].bins(bins)}))
+        found = {"groups": histograms[folder].bins(bins), "unseen_share": unseen / max(pixels, 1)}
+        write_json(folder / file, jsonable(wanted[folder] | found))
 
 
 def pixel_values(
@@ -84,9 +91,9 @@ def group_names(count: int) -> list[str]:
     return [f"least seen {part}", *between, f"best seen {part}"]
 
 
-def _is_measured(folder: Path, record: Mapping[str, Any]) -> bool:
+def _is_measured(file: Path, record: Mapping[str, Any]) -> bool:
     try:
-        held = read_json(folder / GROUPS_FILE)
+        held = read_json(file)
     except (VdgsError, FileNotFoundError):
         return False
     return isinstance(held, dict) and all(held.get(name) == value for name, value in record.items())

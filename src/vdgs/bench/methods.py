@@ -12,7 +12,7 @@ from typing import Literal
 
 from vdgs.bench.definitions import COARSE_ONLY, EXPLICIT, Budget, Change, Method
 from vdgs.comparators.gaussians.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS
-from vdgs.settings.method import CompensationConfig, MethodConfig, PartitionStrategy
+from vdgs.settings.method import CompensationConfig, MergeConfig, MethodConfig, PartitionStrategy
 
 LAMBDA_VIS = (0.0, 0.5, 1.0, 1.3)
 T_LOW = (0.05, 0.15, 0.20, 0.30)
@@ -65,7 +65,8 @@ def without_anchor_generation(config: MethodConfig, _budget: Budget) -> MethodCo
 
 def as_printed(config: MethodConfig, _budget: Budget) -> MethodConfig:
     """What the paper says of blocks, in place of the preset's own choices: frozen decoder, every photograph used alike
-    and at its full size, damped rates, the last model and no mean, cameras above a share of 0.45, its compensation."""
+    and at its full size, the coarse stage's rates again, the last model and no mean, cameras above a share of 0.45, its
+    compensation. Where it is silent, as the preset `paper`."""
     plain, scene = MethodConfig(), config.block
     return replace(
         config,
@@ -89,6 +90,27 @@ def with_printed_compensation(config: MethodConfig, **values: float) -> MethodCo
 def in_whole_photographs(change: Change) -> Change:
     """A method whose blocks draw whole photographs, so that each makes exactly as many iterations."""
     return lambda config, budget: change(replace(config, block=replace(config.block, crop="off")), budget)
+
+
+def with_compensation_of_sums(config: MethodConfig, _budget: Budget) -> MethodConfig:
+    """The paper's compensation, added to the sums of gradients and not to their means."""
+    printed = with_printed_compensation(config)
+    return _compensated(printed, added_to="sum")
+
+
+def densely(change: Change) -> Change:
+    """A method whose Adam moves all anchors in every step, as Scaffold-GS and 3DGS do."""
+
+    def dense(config: MethodConfig, budget: Budget) -> MethodConfig:
+        changed = change(config, budget)
+        return replace(changed, training=replace(changed.training, adam="dense"))
+
+    return dense
+
+
+def best_seen(change: Change) -> Change:
+    """Blocks merged by which of them sees a place most (the paper: "based on visibility coverage")."""
+    return lambda config, budget: replace(change(config, budget), merge=MergeConfig(rule="best_seen"))
 
 
 def with_longer_blocks(factor: int) -> Change:
@@ -185,7 +207,10 @@ def _sweep(
 
 
 #: What the partitions leave out beyond what `partition.strategies` says of each.
-_COMMON = ("training schedule and losses of their own: blocks are trained as ours, but with plain growth",)
+_COMMON = (
+    "training schedule, losses and (dense) Adam of their own: what is compared is the partition, and blocks are "
+    "trained as ours, with plain growth",
+)
 _3DGS = "Kerbl et al., 3D Gaussian Splatting for Real-Time Radiance Field Rendering, SIGGRAPH 2023"
 #: As the docstring of `comparators.gaussians.run` has it.
 _3DGS_LEAVES_OUT = (
@@ -222,8 +247,9 @@ _ABLATIONS = [
         "VDGS, blocks as printed",
         as_printed,
         cites="VDGS, sections IV-B and IV-C",
-        differs="blocks of the paper: frozen decoder, even use of photographs, damped rates, full size, no mean of "
-        "models, whole photographs, share of 0.45, its compensation; growth, coarse stage and cut as `full`",
+        differs="blocks of the paper: frozen decoder, even use of photographs, the coarse stage's rates again, full "
+        "size, no mean of models, whole photographs, share of 0.45, its compensation; growth, coarse stage and cut as "
+        "`full`; where the paper is silent, the choices of the preset `paper`",
     ),
     Method("whole-photographs", "VDGS (full), whole photographs", in_whole_photographs(full)),
     Method("no-blocking", "w/o blocking", without_blocking, cites="VDGS, Table II (b)"),
@@ -245,9 +271,10 @@ _OTHERS = [
         leaves_out=_3DGS_LEAVES_OUT, differs=f"background black, as published; {_3DGS_SCHEDULE}",
     ),
     Method(
-        "scaffold-gs", "Scaffold-GS", coarse_alone, COARSE_ONLY,
+        "scaffold-gs", "Scaffold-GS", densely(coarse_alone), COARSE_ONLY,
         cites="Lu et al., Scaffold-GS: Structured 3D Gaussians for View-Adaptive Rendering, CVPR 2024",
-        leaves_out=("its starts, background and volume weight: they are those of our coarse stage",),
+        leaves_out=("its starts, background, rates and volume weight: they are those of our coarse stage",),
+        differs="its dense Adam; `baseline` is the same with ours, which moves only what a photograph shows",
     ),
     Method(
         "vastgaussian", "VastGaussian partition", partitioned_by("vastgaussian"),
@@ -288,7 +315,22 @@ _CHOICES = [
         differs="the share is one of the block's anchors, not of pixels",
     ),
     Method(
-        "printed-rates", "damped rates, as printed", with_block(offset_rate=0.4, scale_rate=0.8, feature_rate=1.0)
+        "printed-rates", "the coarse stage's rates again",
+        with_block(offset_rate=1.0, scale_rate=1.0, feature_rate=1.0),
+    ),
+    Method(
+        "damped-rates", "damped rates", with_block(offset_rate=0.4, scale_rate=0.8, feature_rate=1.0),
+        differs="0.4 and 0.8 times the coarse stage's rates of offsets and scales, with which CityGaussian fine-tunes",
+    ),
+    Method(
+        "printed-damped", "blocks as printed, damped rates",
+        lambda config, budget: with_block(offset_rate=0.4, scale_rate=0.8)(as_printed(config, budget), budget),
+        differs="`printed` with the rates of `damped-rates`: what earlier versions took for printed",
+    ),
+    Method("dense-adam", "dense Adam", densely(full), differs="in the coarse stage and in blocks"),
+    Method(
+        "compensation-of-sums", "compensation as printed, of sums", with_compensation_of_sums,
+        differs="T_low = 0.20, β_g = 2, γ = 0.9; g is added to the sums of gradients",
     ),
     Method("full-size", "full size throughout", with_block(resolutions=((0.0, 1),))),
     Method("last-model", "the last model, no mean", with_block(average=0.0)),
@@ -298,6 +340,18 @@ _CHOICES = [
     ),
     Method("no-context", "without context", with_block(context=False)),
     Method("free-ring", "free ring", with_block(ring="free")),
+    Method(
+        "free-best-seen", "free ring, merged by best seen", best_seen(with_block(ring="free")),
+        differs="to be read against `free-ring`",
+    ),
+    Method(
+        "ramp", "ramp ring, frozen decoder", with_block(ring="ramp", decoder="frozen"),
+        differs="to be read against `frozen-decoder`: a ramp needs one",
+    ),
+    Method(
+        "ramp-best-seen", "ramp ring, frozen decoder, merged by best seen",
+        best_seen(with_block(ring="ramp", decoder="frozen")), differs="to be read against `ramp`",
+    ),
     Method("literal-gate", "literal gate", with_literal_gate),
     Method("cap", "g capped at 4 thresholds", with_cap(4)),
 ]  # fmt: skip

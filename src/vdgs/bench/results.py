@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from vdgs.bench.definitions import EXPLICIT
-from vdgs.bench.measure import GROUPS_FILE, evaluated
+from vdgs.bench.measure import FRUSTA_FILE, GROUPS_FILE, evaluated
 from vdgs.bench.plan import Plan, PlannedRun
 from vdgs.bench.worker import RECORD
 from vdgs.errors import VdgsError
@@ -44,6 +44,8 @@ class Result:
     groups: tuple[Mapping[str, Any], ...] = ()
     #: What V of the groups is (`seen.SeenBy`); empty without groups.
     seen_by: str = ""
+    #: The same by V as the paper counts it, of generated scenes: figures as `psnr@frusta0`.
+    frusta: tuple[Mapping[str, Any], ...] = ()
 
 
 def gather(plan: Plan, output: Path, ended: Mapping[str, Outcome]) -> list[Result]:
@@ -55,8 +57,7 @@ def gather(plan: Plan, output: Path, ended: Mapping[str, Outcome]) -> list[Resul
         result = Result(scene, method, seed, state, why, str(run.folder))
         if state == "done":
             try:
-                figures, groups, seen_by = _read(output, run)
-                result = Result(scene, method, seed, state, why, str(run.folder), figures, groups, seen_by)
+                result = _read(output, run, result)
             except (VdgsError, KeyError, TypeError, FileNotFoundError) as error:
                 result = Result(scene, method, seed, "failed", f"its results cannot be read: {error}", str(run.folder))
         results.append(result)
@@ -67,21 +68,29 @@ def as_json(results: list[Result]) -> list[dict[str, Any]]:
     return [asdict(result) for result in results]
 
 
-def _read(output: Path, planned: PlannedRun) -> tuple[dict[str, float | None], tuple[dict[str, Any], ...], str]:
+def _read(output: Path, planned: PlannedRun, result: Result) -> Result:
+    """The result with the figures that the run left."""
     run = RunFolder(output / planned.folder)
     metrics, record = read_json(evaluated(run.path) / "metrics.json"), read_json(run.path / RECORD)
     figures: dict[str, float | None] = {name: metrics.get(name) for name in (*QUALITY, *SOLIDITY)}
     figures |= {"model_bytes": metrics.get("model_bytes"), "fps": metrics["fps"]}
     if planned.renders is None:
         figures |= _sizes(metrics, planned) | _costs(run, planned.stages, record.get("seconds", {}))
-    file = run.path / GROUPS_FILE
+    bounds, measured = _groups(run.path / GROUPS_FILE, "@", figures)
+    by_frusta, _ = _groups(run.path / FRUSTA_FILE, "@frusta", figures)
+    figures["unseen_share"] = measured.get("unseen_share")
+    seen_by = measured["seen_by"] if bounds else ""
+    return replace(result, figures=figures, groups=bounds, seen_by=seen_by, frusta=by_frusta)
+
+
+def _groups(file: Path, at: str, figures: dict[str, float | None]) -> tuple[tuple[dict[str, Any], ...], dict[str, Any]]:
+    """The bounds of the groups in a file, whose figures are added as `psnr` + `at` + index, and all that it holds."""
     measured: dict[str, Any] = read_json(file) if file.exists() else {"groups": [], "seen_by": ""}
     # A group without bounds holds sky, or what the reference does not show: no claim is about it.
     groups = [group for group in measured["groups"] if group["lower"] is not None]
     for index, group in enumerate(groups):
-        figures |= {f"{name}@{index}": group[name] for name in ("psnr", "ssim", "psnr_cc", "ssim_cc")}
-    bounds = [{name: group[name] for name in ("lower", "upper", "pixels")} for group in groups]
-    return figures, tuple(bounds), measured["seen_by"] if bounds else ""
+        figures |= {f"{name}{at}{index}": group[name] for name in ("psnr", "ssim", "psnr_cc", "ssim_cc")}
+    return tuple({name: group[name] for name in ("lower", "upper", "pixels")} for group in groups), measured
 
 
 def _sizes(metrics: Mapping[str, Any], planned: PlannedRun) -> dict[str, float | None]:

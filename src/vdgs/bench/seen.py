@@ -9,19 +9,22 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import fingerprint
 from vdgs.captures.loading import load_capture
 from vdgs.evaluation.of_run import visibility_map
+from vdgs.model.visibility import visibility_of
 from vdgs.runs.opening import open_run
 from vdgs.settings.capture import CaptureOptions
-from vdgs.synth.truth import has_truth, load_truth
+from vdgs.synth.truth import Truth, has_truth, load_truth
 
-#: `truth`: training cameras that truly see the surface. `model`: whose frustum holds the place that a model draws.
-SeenBy = Literal["truth", "model"]
+#: `truth`: training cameras that truly see the surface. `frusta`: whose frustum holds it, hidden or not, as the paper
+#: counts. `model`: whose frustum holds the place that a model draws.
+SeenBy = Literal["truth", "frusta", "model"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,17 +32,56 @@ class Seen:
     """V of every pixel of a capture's test views."""
 
     capture: Capture
-    #: Camera of a test view -> V [h, w] at its size, NaN where nothing is (sky), nothing is drawn, or no training
-    #: camera looks: a method may only guess there.
-    visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]]
+    #: Camera of a test view -> V [h, w] at its size, NaN where nothing is (sky) or nothing is drawn. Where no training
+    #: camera looks a method may only guess: `visibility_map` is NaN there too.
+    counted: Callable[[Camera], Float[np.ndarray, "h w"]]
     by: SeenBy
     #: Tells this V from any other: what was measured with another one is measured again.
     identity: str
+
+    def visibility_map(self, camera: Camera) -> Float[np.ndarray, "h w"]:
+        """V where some training camera looks, NaN elsewhere."""
+        views = self.counted(camera)
+        return views if self.by == "model" else np.where(views >= 1, views, np.nan)
+
+    def unseen(self, camera: Camera) -> Bool[np.ndarray, "h w"]:
+        """Which pixels show something (no sky, as far as that is known) that no training camera sees."""
+        views = self.counted(camera)
+        return np.isnan(views) | (np.rint(views) == 0) if self.by == "model" else views == 0
 
 
 def seen_truly(root: Path, options: CaptureOptions) -> Seen | None:
     """V by the truth beside a generated capture, read with `options`; None where there is none, or where it counts
     other training views than those that are used or does not know a test view."""
+    known = _known(root, options)
+    if known is None:
+        return None
+    truth, capture, parts = known
+    return Seen(capture, truth.visibility_maps(capture), "truth", f"seen at all: {parts}")
+
+
+def seen_by_frusta(root: Path, options: CaptureOptions) -> Seen | None:
+    """How many training cameras hold the true surface at each pixel in their frustum, whatever hides it; None where
+    `seen_truly` is."""
+    known = _known(root, options)
+    if known is None:
+        return None
+    truth, capture, parts = known
+    views = {view.camera.camera_from_world.tobytes(): view for view in capture.test_views}
+    cameras, unit = [view.camera for view in capture.train_views], capture.ground.scale
+
+    def counted(camera: Camera) -> Float[np.ndarray, "h w"]:
+        depth = unit * truth.depth_map(views[camera.camera_from_world.tobytes()])
+        sky = ~np.isfinite(depth)
+        places = camera.unproject(np.where(sky, 1.0, depth)).reshape(-1, 3)
+        held = visibility_of(torch.from_numpy(places), cameras).numpy().reshape(depth.shape)
+        return np.where(sky, np.nan, held)
+
+    return Seen(capture, counted, "frusta", f"by frusta: {parts}")
+
+
+def _known(root: Path, options: CaptureOptions) -> tuple[Truth, Capture, str] | None:
+    """The truth of a generated capture, the capture, and what tells it from others; None as in `seen_truly`."""
     if not has_truth(root):
         return None
     truth, capture = load_truth(root), load_capture(root, options)
@@ -48,17 +90,7 @@ def seen_truly(root: Path, options: CaptureOptions) -> Seen | None:
     if not counted or not known["views"] >= {Path(view.name).stem for view in capture.test_views}:
         return None
     parts = ", ".join(f"{name} {crc:08x}" for name, crc in fingerprint(capture).items())
-    return Seen(capture, _where_seen(truth.visibility_maps(capture)), "truth", f"seen at all: {parts}")
-
-
-def _where_seen(
-    visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]],
-) -> Callable[[Camera], Float[np.ndarray, "h w"]]:
-    def seen(camera: Camera) -> Float[np.ndarray, "h w"]:
-        views = visibility_map(camera)
-        return np.where(views >= 1, views, np.nan)
-
-    return seen
+    return truth, capture, parts
 
 
 def seen_by_model(reference: Path) -> Seen:

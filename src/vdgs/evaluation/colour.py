@@ -1,12 +1,14 @@
 """Colour correction before a comparison: a render is not blamed for the exposure of its photograph.
 
-The correction of multinerf (Barron et al. 2022), which DOGS applies always and Momentum-GS on request:
-five rounds of least squares from ten quadratic colour features of the render to the photograph. It is
-fitted on the test image itself, so a corrected figure never stands without the raw one beside it.
+Two of them. The correction of multinerf (Barron et al. 2022), which DOGS applies always and Momentum-GS on request:
+five rounds of least squares from ten quadratic colour features of the render to the photograph. And one affine map of
+the colours, the least that another exposure and white balance need: what a model of exposure in training can undo.
+Both are fitted on the test image itself, so a corrected figure never stands without the raw one beside it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,29 +47,49 @@ def correct_colours(
     not the image that comes back. With fewer than `MIN_PIXELS` usable pixels in any channel of any
     round the image comes back unchanged, `fitted` false.
     """
+    return _corrected(image, reference, mask, rounds, _quadratic)
+
+
+def correct_colours_affinely(
+    image: np.ndarray, reference: np.ndarray, mask: Bool[np.ndarray, "h w"] | None = None
+) -> ColourCorrection:
+    """As `correct_colours`, but by one affine map of the colours, fitted once."""
+    return _corrected(image, reference, mask, 1, _affine)
+
+
+Features = Callable[[Float[np.ndarray, "3 n"]], np.ndarray]
+
+
+def _corrected(
+    image: np.ndarray, reference: np.ndarray, mask: Bool[np.ndarray, "h w"] | None, rounds: int, features: Features
+) -> ColourCorrection:
     start, target = _planes(image), _planes(reference)
     kept = True if mask is None else mask.reshape(1, -1)
     usable = kept & _unsaturated(start) & _unsaturated(target)
     current, fitted = start, True
     for _ in range(rounds):
-        coefficients = _fit(current, target, usable & _unsaturated(current))
+        coefficients = _fit(current, target, usable & _unsaturated(current), features)
         if coefficients is None:
             current, fitted = start, False
             break
-        warped = [np.clip(coefficients @ _features(current[:, at]), 0.0, 1.0) for at in _chunks(current)]
+        warped = [np.clip(coefficients @ features(current[:, at]), 0.0, 1.0) for at in _chunks(current)]
         current = np.concatenate(warped, axis=1)
     return ColourCorrection(np.ascontiguousarray(current.T).reshape(image.shape), fitted)
 
 
 def _fit(
-    current: Float[np.ndarray, "3 n"], target: Float[np.ndarray, "3 n"], usable: Bool[np.ndarray, "3 n"]
-) -> Float[np.ndarray, "3 10"] | None:
+    current: Float[np.ndarray, "3 n"],
+    target: Float[np.ndarray, "3 n"],
+    usable: Bool[np.ndarray, "3 n"],
+    features_of: Features,
+) -> Float[np.ndarray, "3 f"] | None:
     """Least squares per channel from its own usable pixels, through the normal equations."""
     if usable.sum(axis=1).min() < MIN_PIXELS:
         return None
-    gram, moment = np.zeros((3, 10, 10)), np.zeros((3, 10))
+    count = len(features_of(current[:, :1]))
+    gram, moment = np.zeros((3, count, count)), np.zeros((3, count))
     for at in _chunks(current):
-        features = _features(current[:, at])
+        features = features_of(current[:, at])
         for channel in range(3):
             counted = features * usable[channel, at]
             gram[channel] += counted @ features.T
@@ -76,7 +98,12 @@ def _fit(
     return np.stack([np.linalg.lstsq(gram[c], moment[c], rcond=1e-13)[0] for c in range(3)])
 
 
-def _features(rgb: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "10 n"]:
+def _affine(rgb: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "4 n"]:
+    """r, g, b, 1."""
+    return np.concatenate([rgb, np.ones_like(rgb[:1])])
+
+
+def _quadratic(rgb: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "10 n"]:
     """r², rg, rb, g², gb, b², r, g, b, 1."""
     r, g, b = rgb
     return np.stack([r * r, r * g, r * b, g * g, g * b, b * b, r, g, b, np.ones_like(r)])

@@ -31,7 +31,7 @@ from vdgs.captures.capture import View
 from vdgs.errors import CaptureError, RunError, TrainingDiverged
 from vdgs.evaluation import metrics, pictures, saving
 from vdgs.evaluation.by_visibility import QUANTILE_BINS, VisibilityHistogram, mean_or_none, view_bins
-from vdgs.evaluation.colour import correct_colours
+from vdgs.evaluation.colour import correct_colours, correct_colours_affinely
 from vdgs.evaluation.depth_errors import DepthErrors, errors_of_view, figures_of
 from vdgs.evaluation.lpips import MIN_SIDE_PX, Lpips
 from vdgs.evaluation.reference_views import ReferenceViews
@@ -49,6 +49,8 @@ from vdgs.watching.interrupts import stop_if_asked
 
 RAW = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")
 CORRECTED = tuple(f"{name}_cc" for name in RAW)
+#: After one affine map of the colours, which is fitted on the view too.
+AFFINE = ("psnr_affine", "ssim_affine")
 
 
 class RenderedView(Protocol):
@@ -177,7 +179,8 @@ def evaluate(
         )
     settings = settings or EvaluationSettings()
     inputs = _Inputs(photographs, model, lpips, settings, output)
-    names = ["squared_error", "ssim"] + ["squared_error_cc", "ssim_cc"] * settings.colour_correction
+    suffixes = ["", "_cc", "_affine"] if settings.colour_correction else [""]
+    names = [f"{name}{suffix}" for suffix in suffixes for name in ("squared_error", "ssim")]
     gathered = _Gathered(histogram=VisibilityHistogram(names) if model.visibility_map else None)
     stems = saving.file_stems([view.name for view in views])
     on_sheet = set(np.linspace(0, len(views) - 1, min(len(views), settings.contact_views)).round().astype(int))
@@ -211,9 +214,12 @@ def _evaluate_view(view: View, stem: str, on_sheet: bool, inputs: _Inputs, gathe
         corrected_maps = _maps(corrected, "_cc")
         row |= _figures(corrected, corrected_maps, "_cc", inputs.lpips)
         row["colour_fitted"] = correction.fitted
-        maps |= corrected_maps
+        affine = _Pair(metrics.to_8bit(correct_colours_affinely(image, reference, mask).image), reference, mask)
+        affine_maps = _maps(affine, "_affine")
+        row |= {name: value for name, value in _figures(affine, affine_maps, "_affine", None).items() if name in AFFINE}
+        maps |= corrected_maps | affine_maps
     else:
-        row |= dict.fromkeys(CORRECTED)
+        row |= dict.fromkeys((*CORRECTED, *AFFINE))
     visibility = None if inputs.model.visibility_map is None else np.asarray(inputs.model.visibility_map(view.camera))
     row["mean_visibility"] = _count_visibility(visibility, gathered, maps, mask)
     seen = _seen(view, inputs.model, mask)
@@ -378,10 +384,10 @@ def _summary(
     gathered: _Gathered, model: MeasuredModel, lpips_note: str, settings: EvaluationSettings
 ) -> dict[str, Any]:
     rows = gathered.rows
-    means = {name: mean_or_none([row[name] for row in rows]) for name in RAW + CORRECTED}
+    means = {name: mean_or_none([row[name] for row in rows]) for name in RAW + CORRECTED + AFFINE}
     pixel_bins = gathered.histogram.bins(settings.visibility_bins) if gathered.histogram else None
     visible = [np.nan if row["mean_visibility"] is None else row["mean_visibility"] for row in rows]
-    figures = [{name: row[name] for name in RAW + CORRECTED} for row in rows]
+    figures = [{name: row[name] for name in RAW + CORRECTED + AFFINE} for row in rows]
     unfitted = sum(row.get("colour_fitted") is False for row in rows)
     notes = [lpips_note] if lpips_note else []
     if unfitted:

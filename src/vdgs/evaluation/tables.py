@@ -33,12 +33,14 @@ SOLIDITY = (
 
 
 def metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
-    """What `metrics.json` holds: quality raw and corrected, quality by visibility, solidity, size and speed."""
+    """What `metrics.json` holds: quality raw, colour-corrected and after an affine map of the colours, quality by
+    visibility, solidity, size and speed."""
     quality = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
-    for column in ("", "raw", "colour-corrected"):
+    for column in ("", "raw", "colour-corrected", "affine fit"):
         quality.add_column(column, justify="left" if not column else "right")
     for key, label, form in FIGURES:
-        quality.add_row(label, shown(result[key], form), shown(result[f"{key}_cc"], form))
+        corrected = (shown(result.get(f"{key}{suffix}"), form) for suffix in ("_cc", "_affine"))
+        quality.add_row(label, shown(result[key], form), *corrected)
     parts: list[RenderableType] = [quality]
     if result["by_visibility"]:
         parts.append(_visibility_table(result["by_visibility"]))

@@ -128,7 +128,7 @@ class AnchorSplats(Splats):
 
 @dataclass(frozen=True, eq=False)
 class SplatGradients:
-    """Derivatives of a loss by the splats of a view (depths have none), and what decoding needs to know of these."""
+    """Derivatives of a loss by the splats of a view, and what decoding needs to know of these."""
 
     means_px: Float[Tensor, "m 2"]
     conics: Float[Tensor, "m 3"]
@@ -140,6 +140,8 @@ class SplatGradients:
     source: Int32[Tensor, "m"]
     colour_values: Float[Tensor, "m 3"]
     opacity_values: Float[Tensor, "m"]
+    #: By the depth of each; None is zero.
+    depths: Float[Tensor, "m"] | None = None
 
 
 class AdamState(NamedTuple):

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.kernels.types import FEATURE_SIZE, HIDDEN_SIZE, DecoderWeights, HeadWeights
+from vdgs.model.exposure import exposure_of
 
 HEADS = {"opacity": 1, "covariance": 7, "colour": 3}  # outputs per offset
 PARTS = ("w1", "b1", "w2", "b2")
@@ -22,12 +23,14 @@ PARTS = ("w1", "b1", "w2", "b2")
 
 @dataclass(frozen=True)
 class Decoder:
-    """The parameters of the three heads and, optionally, of the appearance embedding."""
+    """The parameters of the three heads and, optionally, of the appearance embedding and the exposure of images."""
 
     weights: DecoderWeights
     #: One row per training image, and its map to the colour head's hidden layer; None without appearance.
     appearance: Float[Tensor, "images a"] | None = None
     appearance_weight: Float[Tensor, "32 a"] | None = None
+    #: What each training image's colours depart from the mean (`model.exposure`); None: all are taken as they are.
+    exposure: Float[Tensor, "images 3 4"] | None = None
 
     @staticmethod
     def initial(offsets: int, distance: bool, appearance: int, images: int, generator: torch.Generator) -> Decoder:
@@ -48,12 +51,15 @@ class Decoder:
     def from_tensors(tensors: Mapping[str, Tensor]) -> Decoder:
         """The inverse of `tensors`. Raises KeyError on a missing tensor."""
         weights = DecoderWeights(*(HeadWeights(*(tensors[f"{head}_{part}"] for part in PARTS)) for head in HEADS))
-        return Decoder(weights, tensors.get("appearance"), tensors.get("appearance_weight"))
+        optional = (tensors.get(name) for name in ("appearance", "appearance_weight", "exposure"))
+        return Decoder(weights, *optional)
 
     def tensors(self) -> dict[str, Tensor]:
         named = {f"{head}_{p}": getattr(getattr(self.weights, head), p) for head in HEADS for p in PARTS}
         if self.appearance is not None and self.appearance_weight is not None:
             named |= {"appearance": self.appearance, "appearance_weight": self.appearance_weight}
+        if self.exposure is not None:
+            named["exposure"] = self.exposure
         return named
 
     def to(self, device: torch.device) -> Decoder:
@@ -72,6 +78,10 @@ class Decoder:
         embedding = self.appearance.mean(0) if image is None else self.appearance[image]
         colour = self.weights.colour
         return replace(self.weights, colour=replace(colour, b1=colour.b1 + self.appearance_weight @ embedding))
+
+    def exposure_of(self, image: int) -> Float[Tensor, "3 4"] | None:
+        """The colour model of a training image; None where none is fitted."""
+        return None if self.exposure is None else exposure_of(self.exposure, image)
 
     def check(self, offsets: int) -> None:
         """Raise ValueError unless all shapes fit `offsets` Gaussians per anchor and all numbers are finite."""

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from scipy.ndimage import binary_closing, binary_erosion, binary_fill_holes
 from torch import Tensor
 
@@ -69,7 +69,7 @@ def below_horizon(camera: Camera, rows: int, columns: int) -> Bool[np.ndarray, "
     return up < -np.sin(np.radians(BELOW_HORIZON_DEG))
 
 
-def at_size(cells: Bool[Tensor, "rows columns"], width: int, height: int) -> Bool[Tensor, "height width"]:
+def at_size(cells: Shaped[Tensor, "rows columns"], width: int, height: int) -> Shaped[Tensor, "height width"]:
     """The cell of every pixel of a picture."""
     row, column = (
         ((torch.arange(pixels, device=cells.device) + 0.5) * (count / pixels)).long()

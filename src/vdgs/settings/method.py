@@ -1,7 +1,8 @@
 """Every setting of training, with its meaning, its default and where that comes from.
 
 Only the standard library is imported here, so that the command line can show the settings at once.
-The defaults are the paper's (preset `paper`); `presets.py` holds the others.
+The defaults are the preset `paper`: the paper's numbers, and our choices where it is silent and one was needed.
+`presets.py` holds the others, and says which of those choices are left out in `literal`.
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ class AnchorConfig:
     keeps all (choice: a few points deep below the ground become a backdrop that every camera sees through it)."""
     fill_gaps: bool = True
     """Also start anchors on ground that cameras see but that holds no sparse points: woods, water, fields (choice)."""
+    bound_sizes: bool = True
+    """No Gaussian may be longer than a quarter of the pictures that train it: none can hang as a veil before a whole
+    view (choice)."""
     distance: bool = False
     """Feed the distance between camera and anchor to the decoder too."""
     appearance: Annotated[int, Range(0, 1024)] = 0
@@ -59,6 +63,8 @@ class RateConfig:
     """Colour decoder."""
     appearance: Annotated[tuple[float, float], RATE] = (0.05, 5e-4)
     """Appearance embedding."""
+    exposure: Annotated[tuple[float, float], RATE] = (0.001, 1e-4)
+    """Exposure of the photographs, where one is fitted."""
 
 
 @dataclass(frozen=True)
@@ -107,12 +113,16 @@ class CompensationConfig:
     times the gradients it is made of; with 1 - gamma (the preset `laptop`) it is a mean over cycles."""
     gamma: Annotated[float, SHARE] = 0.9
     """gamma: decay of the cache g from cycle to cycle."""
+    added_to: Literal["mean", "sum"] = "mean"
+    """What g is added to when anchors grow; the paper says "the raw gradient statistics". `mean`: to the mean gradient,
+    after the division by how often the offset was drawn. `sum`: to the sum before it, so that g is divided too: an
+    offset that was drawn eight times gets an eighth of it."""
     gate: Literal["scaled", "literal"] = "scaled"
     """Above how many draws an offset of low visibility is judged: `scaled` takes T_low times the gate of the others, at
     least 2 (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
     cap: Annotated[float, Range(0, MANY)] = 0.0
-    """Greatest value of g; 0 for none. Without it, and with beta_g = 2, a statistic that is fed steadily grows to 21
-    times its size."""
+    """Greatest value of g; 0 for none. Without it, and with beta_g = 2, a mean gradient that is fed steadily grows to
+    21 times its size."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +146,27 @@ class LossConfig:
 
 
 @dataclass(frozen=True)
+class SeldomConfig:
+    """What steers training where few cameras look; all of it is off unless it is asked for (choice). A place that V
+    training cameras hold is seldom seen by 1 - V / V*, at least 0."""
+
+    quantile: Annotated[float, SHARE] = 0.5
+    """V* is this quantile of V over the places where anchors start: what is seen more often is left alone."""
+    drop: Annotated[float, Range(0, 1, below=True)] = 0.0
+    """Up to this share of the Gaussians is left out of each step at random, by how seldom their anchor is seen."""
+    depth_weight: Annotated[float, Range(0, LARGE)] = 0.0
+    """Weight of how far the drawn depth of sparse points is from theirs, relative to it, by how seldom they are
+    seen."""
+    smooth_weight: Annotated[float, Range(0, LARGE)] = 0.0
+    """Weight of the bends of the drawn depth (planes have none), by how seldom a pixel's place is seen."""
+
+    @property
+    def asked(self) -> bool:
+        """Whether any of it is on."""
+        return bool(self.drop or self.depth_weight or self.smooth_weight)
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Training of the coarse stage."""
 
@@ -151,6 +182,10 @@ class TrainConfig:
     average: Annotated[float, Range(0, 1, below=True)] = 0.0
     """The stage ends with the mean of the models of this last share of its iterations, after growth and at full size; 0
     for the very last model (choice)."""
+    adam: Literal["visible", "dense"] = "visible"
+    """Which anchors a step moves, here and in blocks. `visible`: those that its photograph shows; the others keep
+    parameters and moments (choice). `dense`: all of them, as in Scaffold-GS and 3DGS: what is not shown goes on along
+    its moments, and the bias correction counts the steps of the stage."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Everything random follows from it: on the CPU the same seed gives the same bits."""
     anchors: AnchorConfig = field(default_factory=AnchorConfig)
@@ -165,6 +200,11 @@ class TrainConfig:
     """Growth and pruning of anchors."""
     loss: LossConfig = field(default_factory=LossConfig)
     """The loss."""
+    exposure: bool = False
+    """Fit a small colour model to each photograph: an affine map whose mean over all photographs is neutral; the scene
+    is drawn in neutral colours. Blocks take it over as the coarse stage leaves it (choice)."""
+    seldom: SeldomConfig = field(default_factory=SeldomConfig)
+    """Where few cameras look, here and in blocks."""
     compensation: CompensationConfig = field(default_factory=lambda: CompensationConfig(enabled=False))
     """Compensated growth already in this stage (choice: only blocks have it; the ablation without blocks needs it)."""
 
@@ -186,7 +226,9 @@ class PartitionConfig:
     balanced: bool = False
     """Blocks of about equally many anchors (choice; plain k-means leaves them several times apart)."""
     expansion: Annotated[float, Range(0, 1000)] = 0.4
-    """A block is widened by this share of the radius of a disc of its area."""
+    """A block is widened by this share of the radius of a disc of its area. While ring and context are frozen (the
+    default) that decides what is drawn when cameras are assigned and nothing else: no anchor beyond the core is
+    trained, however wide the ring is."""
     block_memory_gb: Annotated[float, Range(0, LARGE, above=True)] = 4.0
     """Memory that one block may take in training, by estimate; only `--blocks auto` looks at it."""
 
@@ -206,9 +248,11 @@ class AssignmentConfig:
     """Share of pixels (or, for `frustum`, of anchors) above which a camera is assigned."""
     threshold_leave_one_out: Annotated[float, SHARE] = 0.05
     """The same for `leave_one_out` (peers: 0.05 to 0.12)."""
+    best_block: bool = True
+    """Every camera also joins its best block (choice: else one that is above the threshold nowhere trains nothing)."""
     min_cameras: Annotated[int, Range(0, MANY)] = 100
-    """Each block is topped up with the cameras that show it best to at least this many, as far as any show it; 0 leaves
-    it as it is."""
+    """Each block is topped up with the cameras that show it best to at least this many, as far as any show it (choice);
+    0 leaves it as it is."""
     longest_side_px: Annotated[int, Range(16, 16_384)] = 320
     """Size at which the renders are compared."""
 
@@ -233,12 +277,13 @@ class BlockConfig:
     `steps`: each step costs less; `pixels`: as many pixels are drawn as without, in up to four times more steps, so
     that each place of the scene is drawn more often: `iterations` then counts photographs, whatever their size
     (choice)."""
-    offset_rate: Annotated[float, FACTOR] = 0.4
-    """The rates of the coarse stage start again, those of offsets times this."""
-    scale_rate: Annotated[float, FACTOR] = 0.8
-    """... and those of log-scales times this."""
+    offset_rate: Annotated[float, FACTOR] = 1.0
+    """The rates of the coarse stage start again, those of offsets times this (the paper prints no rates for blocks;
+    CityGaussian fine-tunes with 0.4)."""
+    scale_rate: Annotated[float, FACTOR] = 1.0
+    """... and those of log-scales times this (CityGaussian: 0.8)."""
     feature_rate: Annotated[float, FACTOR] = 1.0
-    """... and those of features times this (choice; 1 is the paper's)."""
+    """... and those of features times this."""
     early: Annotated[float, Range(1, 1000)] = 1.0
     """As `early` of the coarse stage, for the block's own updates: its anchors begin trained."""
     background_noise: Annotated[float, SHARE] = 0.0
@@ -251,9 +296,9 @@ class BlockConfig:
     boundary are suppressed"); `ramp`: their learning rate falls linearly to zero at the widened boundary; `free`
     move as those of the core."""
     context: bool = True
-    """Draw the anchors outside the block too, frozen. Off: what the block's cameras see there is empty."""
-    growth: GrowthConfig = field(default_factory=lambda: GrowthConfig(start=1000))
-    """Growth and pruning of anchors."""
+    """Draw the anchors outside the block too, frozen (choice). Off: what the block's cameras see there is empty."""
+    growth: GrowthConfig = field(default_factory=GrowthConfig)
+    """Growth and pruning of anchors, by default as in the coarse stage: the paper says nothing else."""
     max_anchors_total: Annotated[int, Range(0, MANY)] = 0
     """No growth beyond this many anchors of all blocks together; 0 for no limit. Each block has a share in proportion
     to the coarse anchors it owns. A block that starts with more grows none, and none of its anchors is removed for

@@ -1,24 +1,45 @@
-"""Settings by name: `paper`, and those that give a good result in minutes."""
+"""Settings by name.
+
+`paper`     the paper's numbers. Where it is silent, or a reading of it leaves a scene that cannot be used, our choices
+            stay: gaps are filled and outliers start no anchor, ground is asked to be opaque before a background of the
+            mean colour, Gaussians are bounded in size; cameras are assigned by `coverage`, join their best block, and
+            blocks are topped up; what lies around a block is drawn; the gate of compensated growth is lower where few
+            cameras look, and g is added to means; only anchors that a photograph shows are moved.
+`literal`   none of those. What remains ours has no reading without a choice: the threshold tau, the number of clusters'
+            starts, the width of a ring, who owns a place, how volumes are weighted in scenes of another scale.
+`laptop`    a good result in minutes on a CPU; docs/findings.md says what each of its departures brings.
+"""
 
 from __future__ import annotations
 
 from typing import Literal
 
 from vdgs.settings.method import (
+    AnchorConfig,
     AssignmentConfig,
     BlockConfig,
     CompensationConfig,
     GrowthConfig,
+    LossConfig,
     MethodConfig,
     PartitionConfig,
     RateConfig,
     TrainConfig,
 )
 
-PresetName = Literal["paper", "laptop"]
+PresetName = Literal["paper", "literal", "laptop"]
 
 PRESETS: dict[str, MethodConfig] = {
     "paper": MethodConfig(),
+    "literal": MethodConfig(
+        training=TrainConfig(
+            adam="dense",
+            anchors=AnchorConfig(outlier_distance=0.0, fill_gaps=False, bound_sizes=False),
+            loss=LossConfig(alpha_weight=0.0, background="black", background_noise=0.0),
+        ),
+        assignment=AssignmentConfig(mode="literal", best_block=False, min_cameras=0),
+        block=BlockConfig(context=False, compensation=CompensationConfig(gate="literal", added_to="sum")),
+    ),
     "laptop": MethodConfig(
         training=TrainConfig(
             iterations=0,

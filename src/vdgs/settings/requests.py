@@ -39,7 +39,11 @@ class RunRequest:
     output: Path
     """Run folder; new, or the run to continue."""
     preset: PresetName = "paper"
-    """`paper`: the paper's settings (100 000 + 50 000 iterations a block). `laptop`: a good result in minutes."""
+    """`laptop`: a good result in minutes. `paper`: the paper's numbers (100 000 + 50 000 iterations a block; blocks
+    restart the coarse stage's rates), and our choices where it is silent: gaps filled, outliers left out, ground asked
+    to be opaque before a background of the mean colour, bounded sizes, cameras by `coverage` and each in its best
+    block, blocks topped up and drawn in their surroundings, a lower gate of compensated growth, g added to means, only
+    visible anchors moved. `literal`: the paper's numbers and none of those choices."""
     redo: bool = False
     """Allow other settings than the run has to discard what was trained with the old ones."""
     jobs: Annotated[int, WORKERS] = 0

@@ -30,6 +30,7 @@ from vdgs.runs.cut import blocks_of, views_of_block
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.ground import ground_of
 from vdgs.runs.opening import open_run
+from vdgs.runs.seldom import seldom_terms
 from vdgs.runs.status import Status
 from vdgs.settings.method import block_limit, block_training
 from vdgs.settings.watching import WatchOptions
@@ -103,7 +104,8 @@ def _train(
             may_hold=holds(blocks, index, method.block), mobility=ramp(blocks, index, method.block),
             appearance_of=chosen, shares=shares, crops=crops,
             ground=solid_cells_of_all(ground, [view.camera for view in views]),
-            largest=lambda positions: largest_log_scales(positions, flown),
+            **seldom_terms(capture, ground, views, config.seldom),
+            largest=(lambda positions: largest_log_scales(positions, flown)) if config.anchors.bound_sizes else None,
         )  # fmt: skip
         state = continue_or_start(folder, stage, lambda: start_state(anchors, coarse.decoder.copy(), stage), console)
         state.seconds += prepared

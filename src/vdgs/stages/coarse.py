@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from rich.console import Console
 
@@ -15,10 +17,12 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.model.ground import solid_cells_of_all
+from vdgs.model.exposure import neutral_exposures
 from vdgs.model.sizes import largest_log_scales
 from vdgs.model.start import initial_anchors
 from vdgs.runs.flight import keep_flight
 from vdgs.runs.folder import RunFolder
+from vdgs.runs.seldom import seldom_terms
 from vdgs.settings.method import TrainConfig
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.files import write_json
@@ -84,7 +88,8 @@ def open_stage(
         config, images, len(cameras), voxel, camera_height(capture), background=background,
         shares=shares_for(config, anchors, cameras), device=torch.device(device),
         ground=solid_cells_of_all(ground, cameras),
-        largest=lambda positions: largest_log_scales(positions, cameras),
+        **seldom_terms(capture, ground, capture.train_views, config.seldom),
+        largest=(lambda positions: largest_log_scales(positions, cameras)) if config.anchors.bound_sizes else None,
     )  # fmt: skip
     return stage, anchors
 
@@ -96,6 +101,8 @@ def start(anchors: Anchors, stage: Stage) -> TrainingState:
     decoder = Decoder.initial(
         config.anchors.offsets, config.anchors.distance, config.anchors.appearance, stage.image_count, generator
     )
+    if config.exposure:
+        decoder = replace(decoder, exposure=neutral_exposures(stage.image_count))
     return start_state(anchors.to(stage.device), decoder.to(stage.device), stage)
 
 

@@ -118,14 +118,15 @@ def compensate(
     growth: GrowthConfig,
     config: CompensationConfig,
 ) -> Compensated:
-    """What this cycle's decision adds to the mean gradients, and from when on it judges offsets of L.
+    """What this cycle's decision adds to the gradients, to their mean or their sum, and from when on it judges offsets
+    of L.
 
     Gate `scaled` (choice): T_low times the plain gate, but at least twice and never more than the plain gate.
     `threshold` is the T_low that `low_visibility` used.
     """
     plain = growth.gate * growth.interval
     gate = plain if config.gate == "literal" else min(plain, max(LEAST_GATE, threshold * plain))
-    return Compensated(compensation.cache * low[:, None], low, gate)
+    return Compensated(compensation.cache * low[:, None], low, gate, to_sum=config.added_to == "sum")
 
 
 def cycle_facts(

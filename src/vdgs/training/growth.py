@@ -33,12 +33,18 @@ MayHold = Callable[[Tensor], Tensor]
 class Compensated:
     """What compensation changes in one decision (VDGS section IV-C); `compensation.compensate` makes it."""
 
-    #: Added to the mean gradients: the cache g_k for offsets of low visibility (the set L), 0 for the others.
+    #: Added to the gradients: the cache g_k for offsets of low visibility (the set L), 0 for the others.
     added: Float[Tensor, "n k"]
     #: The anchors of L.
     low: Bool[Tensor, " n"]
     #: An offset of L with g_k > 0 is judged once it was drawn more often than this (never later than without).
     gate: float
+    #: Added to the sum of an offset's gradients, before it is divided by how often it was drawn; else to their mean.
+    to_sum: bool = False
+
+    def per_draw(self, drawn: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        """What a mean over so many draws gains; an offset that was never drawn counts as drawn once."""
+        return self.added / drawn.clamp(min=1) if self.to_sum else self.added
 
 
 @dataclass(frozen=True)
@@ -123,7 +129,7 @@ def _parents(
     """The judged offsets whose mean gradient, compensated, reaches the threshold of the first level."""
     gradient = mean_gradient(statistics)
     if compensated is not None:
-        gradient += compensated.added
+        gradient += compensated.per_draw(statistics.drawn)
     index = (judged & (gradient >= threshold)).reshape(-1).nonzero()[:, 0]
     low = torch.zeros_like(index, dtype=torch.bool)
     if compensated is not None:

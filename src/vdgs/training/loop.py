@@ -16,17 +16,19 @@ from torch import Tensor
 from vdgs.cameras import Camera
 from vdgs.errors import TrainingDiverged
 from vdgs.kernels import choose
-from vdgs.kernels.types import DecoderWeights, SplatGradients, Splats
+from vdgs.kernels.types import AnchorSplats, DecoderWeights, SplatGradients, Splats
 from vdgs.model.render import decode_rows, visible_rows
 from vdgs.training.averaging import Average, counts_in_mean
 from vdgs.training.background import background_at
 from vdgs.training.growing import grow, reorder
+from vdgs.training.objective import compare
 from vdgs.training.optimiser import rates_at
 from vdgs.training.schedule import downscale_at, view_at
 from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
 from vdgs.training.state import Stage, StepReport, TrainingState
-from vdgs.training.step import draw_view, move_anchors
+from vdgs.training.step import coast_anchors, draw_view, move_anchors
 from vdgs.training.target import target_at
+from vdgs.training.thinning import thinned
 
 #: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
 REFERENCE_HEIGHT = 10.0
@@ -52,42 +54,32 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     rows = visible_rows(state.anchors, camera)
     weights = state.decoder.for_image(appearance_at(stage, view))
     around = _surroundings(stage, view, camera)
+    background = background_at(stage, iteration)
     with torch.no_grad():
-        drawn = draw_view(
-            decode_rows(state.anchors, rows, weights, camera), camera, background_at(stage, iteration), around
-        )
-    image = drawn.image.requires_grad_(True)
-    kernels = choose(stage.device)
-    photometric = kernels.photometric_loss(image, target.image, target.mask, ssim_weight=config.loss.ssim_weight)
-    volume_weight = _volume_weight(stage)
-    loss = photometric.loss.detach()
-    alpha_gradient = None
-    if target.ground is not None:
-        clear, alpha_gradient = target.transparency(drawn.alpha, config.loss.alpha_weight)
-        loss = loss + clear
+        splats = _thinned(decode_rows(state.anchors, rows, weights, camera), rows, state, stage)
+        drawn = draw_view(splats, camera, background, around, stage.draws_depth)
+    compared = compare(drawn, target, state.decoder, appearance_at(stage, view), config)
+    volume_weight, loss = _volume_weight(stage), compared.loss
     if volume_weight and len(drawn.source):
         loss = loss + volume_weight * drawn.volume
     value = float(loss)
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
-    (image_gradient,) = torch.autograd.grad(photometric.loss, image)
-    if target.share != 1.0:
-        image_gradient.mul_(target.share)
-        alpha_gradient = None if alpha_gradient is None else alpha_gradient.mul_(target.share)
-    gradients = drawn.backward(image_gradient, alpha_gradient, volume_weight)
-    psnr = psnr_of(image.detach(), target.image, target.mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
+    gradients = drawn.backward(compared.image, compared.alpha, volume_weight, compared.depth)
+    psnr = psnr_of(compared.shown, target.image, target.mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
     state.whole = False
     _move(state, stage, rows, gradients, weights, camera)
 
     growing = iteration + 1 <= config.growth.until * config.iterations
     if growing and iteration + 1 > config.growth.statistics_from:
         # Seen is what V counts too: an anchor beside the picture may touch it, but is not to blame for showing nothing.
+        kernels = choose(stage.device)
         inside = kernels.mark_visible(state.anchors.positions[rows], camera)
         kernels.add_view_statistics(
             state.statistics, rows, inside, drawn.source, drawn.opacities, gradients.means_px, *camera.whole_size
         )
     state.iteration += 1
-    report = StepReport(value, float(photometric.l1), float(photometric.ssim), len(rows), len(drawn.source))
+    report = StepReport(value, float(compared.l1), float(compared.ssim), len(rows), len(drawn.source))
     if growing and state.iteration >= config.growth.start and state.iteration % config.growth.interval == 0:
         report = replace(report, **grow(state, stage))
     if state.iteration % REORDER_INTERVAL == 0:
@@ -100,6 +92,16 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     _smooth(state, value, psnr)
     state.whole = True
     return report
+
+
+def _thinned(splats: AnchorSplats, rows: Tensor, state: TrainingState, stage: Stage) -> AnchorSplats:
+    """What is drawn of the anchors of the given rows: all, or less where few cameras look."""
+    if state.seldom is None:
+        return splats
+    config, offsets = stage.config, state.anchors.offsets.shape[1]
+    return thinned(
+        splats, config.seldom.drop * state.seldom[rows], offsets, config.seed * 1_000_039 + state.iteration
+    )  # fmt: skip
 
 
 @torch.no_grad()
@@ -125,11 +127,17 @@ def _volume_weight(stage: Stage) -> float:
 def _move(
     state: TrainingState, stage: Stage, rows: Tensor, gradients: SplatGradients, weights: DecoderWeights, camera: Camera
 ) -> None:
-    """One step of Adam for the visible anchors and the decoder."""
+    """One step of Adam for the visible anchors (where it is dense, for all) and the decoder."""
     config, step = stage.config, state.iteration + 1
     rates = rates_at(config.rates, state.iteration / config.iterations)
     states, updates = state.optimiser.anchor_states(state.anchors, rates, config.early), state.optimiser.updates
+    dense = config.adam == "dense"
+    if dense:
+        updates.fill_(state.iteration)
     finite = move_anchors(state.anchors, rows, gradients, weights, camera, states, updates, stage.mobility)
+    if dense:
+        coast_anchors(state.anchors, rows, states, step, stage.mobility)
+        updates.fill_(step)
     finite &= state.optimiser.update_decoder(state.decoder, rates, step)
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")

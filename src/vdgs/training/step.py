@@ -28,6 +28,8 @@ class TrainingView:
     image: Float[Tensor, "h w 3"]
     #: 1 - the share of the background that shows through.
     alpha: Float[Tensor, "h w"]
+    #: Expected depth, not divided by alpha; None if it was not asked for.
+    depth: Float[Tensor, "h w"] | None
     source: Int32[Tensor, " m"]
     colours: Float[Tensor, "m 3"]
     opacities: Float[Tensor, " m"]
@@ -39,31 +41,40 @@ class TrainingView:
 
     @torch.no_grad()
     def backward(
-        self, image: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"] | None, volume_weight: float
+        self,
+        image: Float[Tensor, "h w 3"],
+        alpha: Float[Tensor, "h w"] | None,
+        volume_weight: float,
+        depth: Float[Tensor, "h w"] | None = None,
     ) -> SplatGradients:
-        """Gradients of a loss: `image` by the picture, `alpha` by its alpha (None: zero), `volume_weight` by the mean
-        volume. Call it once."""
+        """Gradients of a loss: `image` by the picture, `alpha` by its alpha and `depth` by its depth (None: zero),
+        `volume_weight` by the mean volume. Call it once."""
         m = len(self.source)
-        means_px, conics, colours, opacities, *_ = self.pullback(image, alpha, over=self.room)
+        means_px, conics, colours, opacities, depths, _ = self.pullback(image, alpha, depth, over=self.room)
         # In float32, as autograd divides.
         volume = float(torch.tensor(volume_weight) / m) if m else 0.0
         return SplatGradients(
-            means_px[:m], conics[:m], colours[:m], opacities[:m], volume, self.source, self.colours, self.opacities
-        )
+            means_px[:m], conics[:m], colours[:m], opacities[:m], volume, self.source, self.colours, self.opacities,
+            None if depth is None or depths is None else depths[:m],
+        )  # fmt: skip
 
 
 @torch.no_grad()
 def draw_view(
-    splats: AnchorSplats, camera: Camera, background: Float[Tensor, "3"], around: Splats | None = None
+    splats: AnchorSplats,
+    camera: Camera,
+    background: Float[Tensor, "3"],
+    around: Splats | None = None,
+    depth: bool = False,
 ) -> TrainingView:
-    """Draw the splats of trained anchors with those `around` them. The tensors of `splats` are the view's from now on:
-    their memory is used again."""
+    """Draw the splats of trained anchors with those `around` them, on request with depth. The tensors of `splats` are
+    the view's from now on: their memory is used again."""
     drawn = splats if around is None else joined(splats, around)
     kernels = choose(drawn.means_px.device)
-    raster, pullback = kernels.rasterise_vjp(drawn, background, camera.width, camera.height)
+    raster, pullback = kernels.rasterise_vjp(drawn, background, camera.width, camera.height, depth=depth)
     return TrainingView(
-        raster.image, raster.alpha, splats.source, splats.colours, splats.opacities, splats.volumes.mean(), pullback,
-        (drawn.means_px, drawn.conics),
+        raster.image, raster.alpha, raster.depth, splats.source, splats.colours, splats.opacities,
+        splats.volumes.mean(), pullback, (drawn.means_px, drawn.conics),
     )  # fmt: skip
 
 
@@ -95,9 +106,37 @@ def move_anchors(
     return finite
 
 
+#: Rows that coast at a time: so many gradients of zero are held.
+COASTING = 2**14
+
+
+@torch.no_grad()
+def coast_anchors(
+    anchors: Anchors,
+    rows: Int64[Tensor, " v"],
+    states: Sequence[AdamState],
+    step: int,
+    mobility: Callable[[Tensor], Tensor] | None = None,
+) -> None:
+    """Let every anchor but those of the given rows go on along its moments, in place: the step of Adam with no gradient
+    that anchors make where a view does not show them and Adam is dense (Scaffold-GS, 3DGS).
+
+    `states` and `mobility` as in `move_anchors`; `step` counts from 1.
+    """
+    unseen = torch.ones_like(anchors.positions[:, 0], dtype=torch.bool).index_fill_(0, rows, False)
+    rest = unseen.nonzero()[:, 0]
+    slow = None if mobility is None else _SlowAnchors.of(anchors, rest, mobility)
+    kernels = choose(anchors.positions.device)
+    for some in rest.split(COASTING):
+        for state in states:
+            kernels.adam_rows(state, some, state.parameter.new_zeros(len(some), *state.parameter.shape[1:]), step)
+    if slow is not None:
+        slow.hold_back(anchors)
+
+
 @dataclass(frozen=True)
 class _SlowAnchors:
-    """Those visible anchors that make less than a full step, as they were before it."""
+    """Those of the anchors that move that make less than a full step, as they were before it."""
 
     rows: Int64[Tensor, " s"]
     share: Float[Tensor, " s"]

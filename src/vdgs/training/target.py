@@ -10,6 +10,7 @@ from torch import Tensor
 from vdgs.cameras import Camera
 from vdgs.model.ground import at_size
 from vdgs.training.crops import WHOLE, crop_at
+from vdgs.training.depths import PixelDepths
 from vdgs.training.state import Stage
 
 #: Share of light let through below which the root is bent to a line: its slope would have no end.
@@ -30,6 +31,10 @@ class Target:
     #: over the part become those of a mean over the whole picture, in which thresholds of growth are given (but for
     #: SSIM within its window of the part's border, where it sees nothing beyond).
     share: float = 1.0
+    #: Pixels with the depth of sparse points, and how seldom each pixel's place is seen; None: of depth nothing is
+    #: asked.
+    depths: PixelDepths | None = None
+    seldom: Float[Tensor, "h w"] | None = None
 
     def transparency(self, alpha: Float[Tensor, "h w"], weight: float) -> tuple[Tensor, Float[Tensor, "h w"]]:
         """`weight` times the sum of √(1 - alpha) over `ground`, divided by how many pixels count at all; and its
@@ -52,18 +57,20 @@ def target_at(stage: Stage, view: int, downscale: int, iteration: int) -> Target
     image, mask = stage.images.get(view, downscale)
     image, mask = image.to(stage.device), None if mask is None else mask.to(stage.device)
     camera = stage.images.camera(view, downscale)
-    ground = _ground(stage, view, mask, camera)
+    ground, seldom = _ground(stage, view, mask, camera), _seldom(stage, view, camera)
     crop = crop_at(stage.crops, view, iteration)
     if crop == WHOLE:
-        return Target(image, mask, ground, camera)
+        return Target(image, mask, ground, camera, depths=_depths(stage, view, mask, camera), seldom=seldom)
     left, top, right, bottom = crop.pixels(camera.width, camera.height)
     inside = (slice(top, bottom), slice(left, right))
     part = camera.cropped(left, top, right, bottom)
-    ground = None if ground is None else ground[inside]
-    if mask is None:
-        return Target(image[inside], None, ground, part, part.width * part.height / (camera.width * camera.height))
-    kept = mask[inside]
-    return Target(image[inside], kept, ground, part, int(kept.count_nonzero()) / max(int(mask.count_nonzero()), 1))
+    ground, seldom = (None if each is None else each[inside] for each in (ground, seldom))
+    kept = None if mask is None else mask[inside]
+    if mask is None or kept is None:
+        share = part.width * part.height / (camera.width * camera.height)
+    else:
+        share = int(kept.count_nonzero()) / max(int(mask.count_nonzero()), 1)
+    return Target(image[inside], kept, ground, part, share, _depths(stage, view, kept, part), seldom)
 
 
 def _ground(stage: Stage, view: int, mask: Tensor | None, camera: Camera) -> Bool[Tensor, "h w"] | None:
@@ -71,3 +78,15 @@ def _ground(stage: Stage, view: int, mask: Tensor | None, camera: Camera) -> Boo
         return None
     ground = at_size(stage.ground[view], camera.width, camera.height)
     return ground if mask is None else ground & (mask > 0)
+
+
+def _seldom(stage: Stage, view: int, camera: Camera) -> Float[Tensor, "h w"] | None:
+    """How seldom each pixel's place is seen, where depth is asked to be smooth."""
+    if stage.seldom_cells is None:
+        return None
+    return at_size(stage.seldom_cells[view], camera.width, camera.height)
+
+
+def _depths(stage: Stage, view: int, mask: Tensor | None, camera: Camera) -> PixelDepths | None:
+    known = None if stage.known_depths is None else stage.known_depths[view]
+    return None if known is None else known.in_picture(camera, mask)

@@ -36,7 +36,9 @@ class CoarseArguments:
     output: Path
     """Run folder; new, or the run to continue."""
     preset: PresetName = "paper"
-    """`paper`: the paper's settings (100 000 iterations). `laptop`: a good result in minutes on a CPU."""
+    """`laptop`: a good result in minutes on a CPU. `paper`: the paper's 100 000 iterations, and our choices where it is
+    silent: gaps filled, outliers left out, ground asked to be opaque before a background of the mean colour, bounded
+    sizes, only visible anchors moved. `literal`: none of those choices."""
     threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     device: str = "auto"

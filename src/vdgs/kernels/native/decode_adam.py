@@ -53,7 +53,7 @@ def decode_backward_adam(
         [contiguous(positions.detach()), *(state[0] for state in steps)], rows.contiguous(), heads,
         packed_camera(camera), gradients.source, contiguous(gradients.colour_values),
         contiguous(gradients.opacity_values), [contiguous(t) for t in incoming], gradients.volume, steps, updates,
-        found,
+        found, *([] if gradients.depths is None else [contiguous(gradients.depths)]),
     )  # fmt: skip
     # What autograd has saved of these no longer holds their values.
     torch.autograd.graph.increment_version([updates, *(t for state in moved for t in state[:3])])
@@ -77,4 +77,5 @@ def _check_splats(g: SplatGradients) -> None:
         len(g.source),
         means_px=(g.means_px, 2), conics=(g.conics, 3), colours=(g.colours, 3), opacities=(g.opacities[:, None], 1),
         colour_values=(g.colour_values, 3), opacity_values=(g.opacity_values[:, None], 1),
+        **({} if g.depths is None else {"depths": (g.depths[:, None], 1)}),
     )  # fmt: skip

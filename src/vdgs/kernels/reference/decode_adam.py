@@ -35,9 +35,11 @@ def decode_backward_adam(
     decoder = weights.map(lambda t: t.detach().requires_grad_(True))
     with torch.enable_grad():
         again = decode(positions[rows], leaves[0], leaves[1], leaves[2], decoder, camera)
-        outputs = (again.means_px, again.conics, again.colours, again.opacities, again.volumes)
-    received = (gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
-                torch.full_like(again.volumes, gradients.volume))  # fmt: skip
+        outputs = [again.means_px, again.conics, again.colours, again.opacities, again.volumes]
+    received = [gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
+                torch.full_like(again.volumes, gradients.volume)]  # fmt: skip
+    if gradients.depths is not None:
+        outputs, received = [*outputs, again.depths], [*received, gradients.depths]
     found = torch.autograd.grad(outputs, [*leaves, *decoder.tensors()], received)
     counted = updates[rows] + 1
     finite = True

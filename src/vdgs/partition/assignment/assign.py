@@ -37,7 +37,8 @@ def assign(scores: Scores, config: AssignmentConfig) -> Assignment:
     1. A camera whose score is above the threshold joins, if its frustum holds any anchor of the block's core: without
        one it has nothing to teach. Mode `literal` asks the score alone, as printed.
     2. Every camera joins its best block among those of which it holds an anchor. One that holds none joins the block
-       with the best score, or where all are 0 the one beneath it: every camera serves at least one block.
+       with the best score, or where all are 0 the one beneath it: every camera serves at least one block. Not so
+       without `config.best_block`.
     3. Every block with fewer than `config.min_cameras` is topped up with the best of the cameras that hold an anchor of
        it, until it has so many or all of them.
 
@@ -47,8 +48,9 @@ def assign(scores: Scores, config: AssignmentConfig) -> Assignment:
     threshold = config.threshold_leave_one_out if scores.mode == "leave_one_out" else config.threshold
     why = np.zeros(scores.scores.shape, np.int8)
     why[(scores.scores > threshold) & (seen | (scores.mode == "literal"))] = ABOVE_THRESHOLD
-    rows, best = np.arange(len(why)), _best_blocks(scores)
-    why[rows, best] = np.where(why[rows, best] == NOT_ASSIGNED, BEST_BLOCK, why[rows, best])
+    if config.best_block:
+        rows, best = np.arange(len(why)), _best_blocks(scores)
+        why[rows, best] = np.where(why[rows, best] == NOT_ASSIGNED, BEST_BLOCK, why[rows, best])
     for block in range(len(scores.anchors)):
         missing = max(config.min_cameras - np.count_nonzero(why[:, block]), 0)
         order = np.lexsort((-scores.held[:, block], -scores.scores[:, block]))
