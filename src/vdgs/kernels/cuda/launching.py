@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -29,15 +30,23 @@ def read_source(name: str) -> str:
     return resources.files(__package__).joinpath("source", name).read_text(encoding="utf-8")
 
 
+def read_header(name: str) -> str:
+    """A header that the C++ of the processor is made of too."""
+    return (Path(__file__).parents[1] / "shared" / name).read_text(encoding="utf-8")
+
+
 def compile_source(
-    name: str, target: Target, *, headers: Mapping[str, str] | None = None, compiler: Nvrtc | None = None
+    name: str, target: Target, *, headers: Sequence[str] = (), compiler: Nvrtc | None = None
 ) -> bytes:
-    """A source of this package, compiled, from the cache if it is there. Raises CompileError, CudaUnavailable."""
+    """A source of this package with these shared headers, compiled, from the cache if it is there.
+
+    Raises CompileError, CudaUnavailable.
+    """
     compiler = compiler or nvrtc()
-    source, headers = read_source(name), dict(headers or {})
-    parts = {f"header {title}": text for title, text in headers.items()}
+    source, texts = read_source(name), {title: read_header(title) for title in headers}
+    parts = {f"header {title}": text for title, text in texts.items()}
     parts |= {"source": source, "options": "\n".join(OPTIONS), "target": target.name, "NVRTC": str(compiler.version)}
-    return cached(f"{name}-{target.name}", parts, lambda: compiler.compile(name, source, headers, target, OPTIONS))
+    return cached(f"{name}-{target.name}", parts, lambda: compiler.compile(name, source, texts, target, OPTIONS))
 
 
 @dataclass(eq=False)
@@ -47,7 +56,8 @@ class Program:
     name: str
     #: Stands in for the driver of this machine.
     driver: Driver | None = None
-    headers: Mapping[str, str] = field(default_factory=dict)
+    #: Names of shared headers that it includes.
+    headers: Sequence[str] = ()
     _functions: dict[tuple[torch.device, str], int] = field(default_factory=dict)
     _modules: dict[torch.device, int] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
