@@ -33,7 +33,7 @@ def build_on_host(source: str, folder: Path, text: str | None = None) -> ctypes.
     `text` is compiled instead of the source's own.
     """
     text = text or read_source(source)
-    kernels = re.findall(r'extern "C" __global__ void(?: __launch_bounds__\(\w+\))?\s+(\w+)\(', text)
+    kernels = re.findall(r'extern "C" __global__ void(?: __launch_bounds__\([\w, ]+\))?\s+(\w+)\(', text)
     assert kernels, f"no kernel in {source}"
     exported = "\n".join(f"HOST_KERNEL({name})" for name in kernels)
     (folder / "host.cpp").write_text(f'#include "cuda_on_host.h"\n{text}\n{exported}\n')

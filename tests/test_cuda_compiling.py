@@ -12,6 +12,7 @@ from cli_support import python_begun
 from vdgs.errors import VdgsError
 from vdgs.kernels.cuda import cache, launching, nvrtc
 from vdgs.kernels.cuda.nvrtc import CompileError, CudaUnavailable, Found, Nvrtc, Target
+from vdgs.kernels.cuda.resources import resources_of
 
 try:
     COMPILER: Nvrtc | None = nvrtc.nvrtc()
@@ -45,13 +46,36 @@ class StandIn:
         return 0
 
 
+#: By source: its shared headers and its kernels.
+SOURCES = {
+    "loss.cu": ((), {"photometric_forward", "photometric_backward", "photometric_total"}),
+    "rasterise.cu": (
+        ("image_formation.h",),
+        {"splat_tiles", "splat_entries", "rasterise_forward", "rasterise_backward", "gather_gradients"},
+    ),
+}
+
+
 @needs_nvrtc
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_the_loss_compiles_for_every_card(architecture):
-    code = launching.compile_source("loss.cu", Target(f"sm_{architecture}"))
+@pytest.mark.parametrize("source", SOURCES)
+def test_every_source_compiles_for_every_card_and_spills_nothing(source, architecture):
+    """Of 64 registers, four blocks of 256 threads fit on every card; of 16 KiB shared memory as well."""
+    headers, kernels = SOURCES[source]
+    found = resources_of(source, Target(f"sm_{architecture}"), headers, COMPILER)
+    assert {each.kernel for each in found} == kernels
+    for each in found:
+        print(f"sm_{architecture} {each}")
+    assert all(each.spilled_bytes == 0 for each in found)
+    assert all(0 < each.registers <= 64 for each in found)
+    assert all(each.shared_bytes <= 16384 for each in found)
+
+
+@needs_nvrtc
+def test_compiled_code_names_its_kernels():
+    code = launching.compile_source("loss.cu", Target("sm_86"))
     assert code[:4] == b"\x7fELF"
-    for kernel in ("photometric_forward", "photometric_backward", "photometric_total"):
-        assert kernel.encode() in code
+    assert all(kernel.encode() in code for kernel in SOURCES["loss.cu"][1])
 
 
 @needs_nvrtc

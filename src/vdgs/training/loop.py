@@ -67,7 +67,8 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
         loss = loss + clear
     if volume_weight and len(drawn.source):
         loss = loss + volume_weight * drawn.volume
-    value = float(loss)
+    # Read at once: on a card, each number that is asked for waits for everything before it.
+    value, l1, ssim = torch.stack([loss, photometric.l1, photometric.ssim]).tolist()
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
     (image_gradient,) = torch.autograd.grad(photometric.loss, image)
@@ -87,7 +88,7 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
             state.statistics, rows, inside, drawn.source, drawn.opacities, gradients.means_px, *camera.whole_size
         )
     state.iteration += 1
-    report = StepReport(value, float(photometric.l1), float(photometric.ssim), len(rows), len(drawn.source))
+    report = StepReport(value, l1, ssim, len(rows), len(drawn.source))
     if growing and state.iteration >= config.growth.start and state.iteration % config.growth.interval == 0:
         report = replace(report, **grow(state, stage))
     if state.iteration % REORDER_INTERVAL == 0:
@@ -130,7 +131,7 @@ def _move(
     rates = rates_at(config.rates, state.iteration / config.iterations)
     states, updates = state.optimiser.anchor_states(state.anchors, rates, config.early), state.optimiser.updates
     finite = move_anchors(state.anchors, rows, gradients, weights, camera, states, updates, stage.mobility)
-    finite &= state.optimiser.update_decoder(state.decoder, rates, step)
+    finite = state.optimiser.update_decoder(state.decoder, rates, step) & finite
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")
 

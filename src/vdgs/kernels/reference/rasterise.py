@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -56,11 +58,22 @@ def rasterise_vjp(
     depth: bool = False,
 ) -> tuple[Raster, RasterPullback]:
     """`rasterise` without autograd for the caller: the picture, and the way back from it (by autograd in here)."""
+
+    def draw(splats: Splats, background: Tensor) -> Raster:
+        return rasterise(splats, background, width, height, depth=depth)
+
+    return pulled_back(draw, splats, background)
+
+
+def pulled_back(
+    draw: Callable[[Splats, Tensor], Raster], splats: Splats, background: Float[Tensor, "3"]
+) -> tuple[Raster, RasterPullback]:
+    """What a function draws that autograd can differentiate, and the way back, with autograd kept in here."""
     inputs = (splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths, background)
     leaves = [tensor.detach().clone().requires_grad_(True) for tensor in inputs]
     means_px, conics, colours, opacities, depths, behind = leaves
     with torch.enable_grad():
-        drawn = rasterise(Splats(means_px, conics, depths, colours, opacities), behind, width, height, depth=depth)
+        drawn = draw(Splats(means_px, conics, depths, colours, opacities), behind)
 
     def pullback(
         image: Tensor | None,

@@ -232,7 +232,7 @@ rasterise_forward(const float* means, const float* conics, const float* colours,
 //
 // With `value` = colour . gradient (+ depth): the light behind a splat, as the gradient sees it, is what the whole pixel
 // shows without what is in front of it and itself: no transmittance has to be divided out of what was multiplied.
-extern "C" __global__ void __launch_bounds__(kThreads)
+extern "C" __global__ void __launch_bounds__(kThreads, 4)
 rasterise_backward(const float* means, const float* conics, const float* colours, const float* opacities,
                    const float* depths, const int* owners, const long long* order, const long long* bounds, int width,
                    int height, const float* image, const float* transmittance, const int* last, const float* depth,
