@@ -38,7 +38,9 @@ from vdgs.kernels.cuda.resources import resources_of
 from vdgs.kernels.gsplat.rasterise import GsplatUnavailable
 
 #: Sources and the headers that they include.
-SOURCES = {"loss.cu": (), "rasterise.cu": ("image_formation.h",)}
+SOURCES = {
+    "decode.cu": ("gaussian_math.h", "image_formation.h"), "loss.cu": (), "rasterise.cu": ("image_formation.h",),
+}  # fmt: skip
 #: How many dB the town may come out better or worse than on the processor: two trainings differ by rounding.
 TOWN_DB = 0.5
 

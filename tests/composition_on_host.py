@@ -11,10 +11,11 @@ import gsplat_stand_in
 from cuda_on_host import HostDriver, build_on_host
 from vdgs.kernels.composed import rasteriser as choosing
 from vdgs.kernels.cuda import cache, loss
-from vdgs.kernels.cuda.rasterise import PROGRAM
+from vdgs.kernels.cuda.decode import PROGRAM as DECODE
+from vdgs.kernels.cuda.rasterise import PROGRAM as RASTERISE
 from vdgs.kernels.reference import adam
 
-PROGRAMS = (loss.PROGRAM, PROGRAM)
+PROGRAMS = (loss.PROGRAM, RASTERISE, DECODE)
 
 
 def build(folder: Path) -> dict[str, HostDriver]:

@@ -17,6 +17,10 @@
 #include <setjmp.h>
 #include <ucontext.h>
 
+// What the headers that are shared with the processor go by.
+#define __CUDACC_RTC__
+#define __forceinline__ inline
+#define __host__
 #define __global__
 #define __device__
 #define __constant__
@@ -192,6 +196,17 @@ inline float __shfl_xor_sync(unsigned, float mine, int lanes) {
   const unsigned place = host::exchange(mine, false);
   return host::lane_of_my_warp(host::running->lane ^ lanes).given[place];
 }
+inline float __shfl_sync(unsigned, float mine, int lane) {
+  const unsigned place = host::exchange(mine, false);
+  return host::lane_of_my_warp(lane).given[place];
+}
+inline unsigned __ballot_sync(unsigned, int mine) {
+  const unsigned place = host::exchange(0.0f, mine);
+  unsigned all = 0;
+  for (unsigned lane = 0; lane < host::kWarp; ++lane) all |= unsigned{host::lane_of_my_warp(lane).vote[place]} << lane;
+  return all;
+}
+inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
 inline int __any_sync(unsigned, int mine) {
   const unsigned place = host::exchange(0.0f, mine);
   for (unsigned lane = 0; lane < host::kWarp; ++lane)

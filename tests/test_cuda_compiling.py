@@ -48,6 +48,7 @@ class StandIn:
 
 #: By source: its shared headers and its kernels.
 SOURCES = {
+    "decode.cu": (("gaussian_math.h", "image_formation.h"), {"decode_anchors"}),
     "loss.cu": ((), {"photometric_forward", "photometric_backward", "photometric_total"}),
     "rasterise.cu": (
         ("image_formation.h",),

@@ -3,7 +3,8 @@
 Not all operations of `vdgs.kernels` are here: `vdgs.kernels.composed` adds what a card needs besides.
 """
 
+from vdgs.kernels.cuda.decode import decode
 from vdgs.kernels.cuda.loss import photometric_loss
 from vdgs.kernels.cuda.rasterise import rasterise, rasterise_vjp
 
-__all__ = ["photometric_loss", "rasterise", "rasterise_vjp"]
+__all__ = ["decode", "photometric_loss", "rasterise", "rasterise_vjp"]

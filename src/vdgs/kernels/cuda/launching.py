@@ -21,8 +21,8 @@ OPTIONS = ("--std=c++17",)
 MOST_BLOCKS: Grid = (2**31 - 1, 65535, 65535)
 MOST_THREADS = 1024
 
-#: What a kernel may be given: a tensor (its data pointer), nothing (a null pointer), or a ctypes number.
-Argument = Tensor | ctypes._SimpleCData | None
+#: What a kernel may be given: a tensor (its data pointer), nothing (a null pointer), a ctypes number or a structure.
+Argument = Tensor | ctypes._SimpleCData | ctypes.Structure | None
 
 
 def read_source(name: str) -> str:
@@ -92,7 +92,9 @@ class Program:
             return self._functions[key]
 
 
-def pack(arguments: Sequence[Argument]) -> tuple[list[ctypes._SimpleCData], ctypes.Array[ctypes.c_void_p]]:
+def pack(
+    arguments: Sequence[Argument],
+) -> tuple[list[ctypes._SimpleCData | ctypes.Structure], ctypes.Array[ctypes.c_void_p]]:
     """What a launch is given: the values, which must outlive the call, and an array of pointers to them."""
     values = [_value(argument) for argument in arguments]
     pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
@@ -115,7 +117,7 @@ def common_device(arguments: Sequence[Argument], device_type: str) -> torch.devi
     return tensors[0].device
 
 
-def _value(argument: Argument) -> ctypes._SimpleCData:
+def _value(argument: Argument) -> ctypes._SimpleCData | ctypes.Structure:
     if argument is None:
         return ctypes.c_void_p(0)
     if isinstance(argument, Tensor):
