@@ -71,10 +71,12 @@ class Sizes:
 
 
 FULL = Sizes(
-    (20_000, 800, 600), ((20_000, 400, 300), (20_000, 800, 600), (200_000, 1600, 1200)), 15, 200_000, ("--size", "village"),
-    1500,
+    (20_000, 800, 600), ((20_000, 400, 300), (20_000, 800, 600), (200_000, 1600, 1200)), 15, 200_000,
+    ("--size", "village"), 1500,
 )  # fmt: skip
-SMALL = Sizes((60, 40, 32), ((60, 40, 32),), 1, 60, ("--size", "toy", "--images", "6", "--width", "48", "--height", "36"), 8)
+SMALL = Sizes(
+    (60, 40, 32), ((60, 40, 32),), 1, 60, ("--size", "toy", "--images", "6", "--width", "48", "--height", "36"), 8
+)
 
 
 @dataclass
@@ -116,8 +118,8 @@ def find_card() -> Machine | str:
         print(f"card         {card.name}, {card.memory_bytes / 1e9:.1f} GB, compute capability {major}.{minor}")
     print(f"NVRTC        {compiler.version[0]}.{compiler.version[1]}, from {compiler.found.origin}")
     return Machine(
-        torch.device("cuda"), torch.cuda.synchronize, torch.cuda.reset_peak_memory_stats, torch.cuda.max_memory_allocated,
-        cards[0].capability,
+        torch.device("cuda"), torch.cuda.synchronize, torch.cuda.reset_peak_memory_stats,
+        torch.cuda.max_memory_allocated, cards[0].capability,
     )  # fmt: skip
 
 
@@ -151,7 +153,9 @@ def train_town(sizes: Sizes, report: Report) -> None:
             for device in ("cpu", "cuda")
         }
     for device, (psnr, seconds) in found.items():
-        print(f"{device:6} {psnr:6.2f} dB after {sizes.iterations} iterations, {seconds:6.1f} s with all that is around")
+        print(
+            f"{device:6} {psnr:6.2f} dB after {sizes.iterations} iterations, {seconds:6.1f} s with all that is around"
+        )
     off = abs(found["cpu"][0] - found["cuda"][0])
     if not off <= TOWN_DB:
         report.wrong.append(f"the town differs by {off:.2f} dB")

@@ -116,7 +116,8 @@ def decode_backward_adam(kernels: Operations, place: Place) -> Results:
         place.random(count)[drawn], 0.1, splats.source, splats.colours, splats.opacities,
     )  # fmt: skip
     states = [
-        AdamState(t.clone(), torch.zeros_like(t), torch.zeros_like(t), 1e-3) for t in (a.features, a.offsets, a.log_scales)
+        AdamState(t.clone(), torch.zeros_like(t), torch.zeros_like(t), 1e-3)
+        for t in (a.features, a.offsets, a.log_scales)
     ]
     updates = torch.zeros(len(a), dtype=torch.int32).to(place.device)
     weights = place.weights.map(lambda t: t.detach().clone().requires_grad_(True))
@@ -184,7 +185,7 @@ def add_view_statistics(kernels: Operations, place: Place) -> Results:
     kernels.add_view_statistics(
         sums, rows, inside, splats.source, splats.opacities, by_px, place.width, place.height
     )  # fmt: skip
-    return {name: tensor for name, tensor in sums.tensors().items()}
+    return sums.tensors()
 
 
 def count_visibility(kernels: Operations, place: Place) -> Results:

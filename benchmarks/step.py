@@ -83,7 +83,7 @@ def one_step(
     state: Any, camera: Camera, target: torch.Tensor, step: int, times: dict[str, list[float]],
     synchronise: Callable[[], None] | None = None,
 ) -> tuple[int, int]:  # fmt: skip
-    """The work of vdgs.training.train_step, phase by phase, on the device of the anchors; `synchronise` waits for it."""
+    """The work of vdgs.training.train_step, phase by phase, where the anchors are; `synchronise` waits for it."""
     device = state.anchors.positions.device
     kernels, rates = choose(device), rates_at(TrainConfig().rates, 0.1)
 

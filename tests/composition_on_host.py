@@ -1,5 +1,5 @@
-"""The composed set of operations on the processor: its CUDA kernels run their own text there (cuda_on_host.h), and of gsplat
-only what it compiles is stood in for (gsplat_stand_in.py)."""
+"""The composed set of operations on the processor: its CUDA kernels run their own text there (cuda_on_host.h), and of
+gsplat only what it compiles is stood in for (gsplat_stand_in.py)."""
 
 from __future__ import annotations
 
@@ -41,4 +41,4 @@ def install(
     gsplat_stand_in.install(monkeypatch)
     monkeypatch.setenv(choosing.VARIABLE, rasteriser)
     choosing.chosen.cache_clear()
-    adam._on_device.cache_clear()
+    adam.tables_on.cache_clear()

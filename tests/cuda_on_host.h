@@ -57,7 +57,7 @@ struct Fiber {
   // nobody overwrites what another has not read yet.
   unsigned barriers, exchanges;
   bool vote[2];
-  float given[2];
+  uint32_t given[2];
 };
 
 using Kernel = void (*)(void** arguments);
@@ -106,12 +106,21 @@ inline Fiber& lane_of_my_warp(unsigned lane) {
   return fibers[(running - fibers.data()) / kWarp * kWarp + lane];
 }
 
-inline unsigned exchange(float mine, bool vote) {
+template <class T>
+unsigned exchange(T mine, bool vote) {
+  static_assert(sizeof mine == sizeof(uint32_t));
   const unsigned place = running->exchanges++ % 2;
-  running->given[place] = mine;
+  std::memcpy(&running->given[place], &mine, sizeof mine);
   running->vote[place] = vote;  // barriers and warps never wait at once
   wait(State::in_warp);
   return place;
+}
+
+template <class T>
+T given_by(unsigned lane, unsigned place) {
+  T given;
+  std::memcpy(&given, &lane_of_my_warp(lane).given[place], sizeof given);
+  return given;
 }
 
 // All lanes that have not ended must take part, as the mask of all lanes says.
@@ -194,12 +203,13 @@ inline int __syncthreads_and(int mine) {
 }
 inline float __shfl_xor_sync(unsigned, float mine, int lanes) {
   const unsigned place = host::exchange(mine, false);
-  return host::lane_of_my_warp(host::running->lane ^ lanes).given[place];
+  return host::given_by<float>(host::running->lane ^ lanes, place);
 }
 inline float __shfl_sync(unsigned, float mine, int lane) {
   const unsigned place = host::exchange(mine, false);
-  return host::lane_of_my_warp(lane).given[place];
+  return host::given_by<float>(lane, place);
 }
+inline void __syncwarp() { host::exchange(0.0f, false); }
 inline unsigned __ballot_sync(unsigned, int mine) {
   const unsigned place = host::exchange(0.0f, mine);
   unsigned all = 0;

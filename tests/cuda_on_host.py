@@ -46,6 +46,10 @@ def build_on_host(source: str, folder: Path, text: str | None = None) -> ctypes.
     return ctypes.CDLL(str(library))
 
 
+class Stuck(Exception):
+    """A kernel that a GPU may not survive."""
+
+
 class HostDriver:
     """`vdgs.kernels.cuda.driver.Driver` on tensors in main memory, whatever device they say that they are on."""
 
@@ -75,4 +79,5 @@ class HostDriver:
             ctypes.c_void_p(function), (ctypes.c_uint * 3)(*grid), (ctypes.c_uint * 3)(*block), arguments,
             ctypes.c_uint(self.order),
         )  # fmt: skip
-        assert whole, "threads of a block wait for others that never come"
+        if not whole:
+            raise Stuck("threads of a block wait for others that never come")

@@ -1,8 +1,9 @@
-"""Stands in for the compiled part of gsplat 1.5.3, on the processor: the four functions that its Python calls for tiles and
-pixels, with the arguments and results of its C++ (`gsplat/cuda/_wrapper.py`, `csrc/Intersect.cpp`, `csrc/Rasterization.cpp`).
+"""Stands in for the compiled part of gsplat 1.5.3, on the processor: the four functions that its Python calls for tiles
+and pixels, with the arguments and results of its C++ (`gsplat/cuda/_wrapper.py`, `csrc/Intersect.cpp`,
+`csrc/Rasterization.cpp`).
 
-A splat is drawn only in tiles that its radii reach, so that radii that are too small show in the picture. All the rest of
-gsplat is its own.
+A splat is drawn only in tiles that its radii reach, so that radii that are too small show in the picture. All the rest
+of gsplat is its own.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ from torch import Tensor
 
 from pretended_device import unseen
 
-needs_gsplat = pytest.mark.skipif(importlib.util.find_spec("gsplat") is None, reason="gsplat: pip install 'vdgs[gsplat]'")
+needs_gsplat = pytest.mark.skipif(
+    importlib.util.find_spec("gsplat") is None, reason="gsplat: pip install 'vdgs[gsplat]'"
+)
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -180,7 +180,7 @@ class _Crossing(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, tensor: Tensor, memory: Memory, to_card: bool) -> Tensor:
         ctx.memory, ctx.to_card = memory, to_card
-        copy = torch.from_numpy(tensor.detach().numpy().copy()) if tensor.numel() else torch.empty_like(tensor)
+        copy = torch.from_numpy(tensor.detach().numpy().copy()) if tensor.numel() else torch.empty(tensor.shape, dtype=tensor.dtype)
         return memory.mark(copy) if to_card else copy
 
     @staticmethod
@@ -202,7 +202,7 @@ def pretended_card() -> Iterator[Counter[str]]:
 
 
 def unseen(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that stands in for compiled code: nobody looks at how it computes, and what it makes is on the card."""
+    """A function that stands in for compiled code: how it computes is not looked at, what it makes is on the card."""
 
     @wraps(function)
     def run(*args: Any) -> Any:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import fields
+from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -12,12 +14,15 @@ from cuda_on_host import ORDERS, HostDriver, build_on_host, host_compiler
 from decode_scenes import Scene, looking_down, turned
 from test_cuda_compiling import needs_nvrtc
 from vdgs.cameras import Camera
+from vdgs.kernels import native
 from vdgs.kernels.cuda import cache
 from vdgs.kernels.cuda.decode import PROGRAM, PackedCamera, decode
+from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.driver import cuda_driver
 from vdgs.kernels.cuda.launching import Program, read_header
 from vdgs.kernels.reference.decode import decode as reference
-from vdgs.kernels.types import AnchorSplats
+from vdgs.kernels.reference.decode_adam import decode_backward_adam as by_reference
+from vdgs.kernels.types import AdamState, AnchorSplats, SplatGradients
 
 pytestmark = [needs_nvrtc, pytest.mark.xdist_group("cuda_decode")]
 needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
@@ -147,3 +152,72 @@ def test_a_card_gives_what_the_reference_gives(name):
         found = decode(*anchors, weights, CAMERAS[name])
     here = AnchorSplats(**{field.name: getattr(found, field.name).cpu() for field in fields(AnchorSplats)})
     assert_same(here, exactly(scene, CAMERAS[name]))
+
+
+def moved_by(kernels, scene: Scene, camera: Camera, rows: torch.Tensor, frozen: bool = False, spoil: bool = False):
+    """Whether all was finite, and after a step of Adam: parameters and moments, updates, gradients of the decoder."""
+    with torch.no_grad():
+        splats = native.decode(scene.positions, *scene.trainable[:3], scene.weights, camera, rows)
+    g = torch.Generator().manual_seed(8)
+    m = len(splats.source)
+    gradients = SplatGradients(
+        0.1 * torch.randn(m, 2, generator=g), torch.randn(m, 3, generator=g), torch.randn(m, 3, generator=g),
+        torch.randn(m, generator=g), 0.3, splats.source, splats.colours, splats.opacities,
+    )  # fmt: skip
+    if spoil:
+        gradients.means_px[0] = torch.nan
+    states = [
+        AdamState(t.clone(), 0.1 * torch.randn(t.shape, generator=g), torch.rand(t.shape, generator=g), rate, 4.0)
+        for t, rate in zip(scene.trainable[:3], (0.01, 0.02, 0.005), strict=True)
+    ]
+    updates = (torch.arange(len(scene.positions)) ** 2 % 97).to(torch.int32)
+    updates[3] = 30_000  # more than the tables tell apart
+    weights = scene.weights.map(lambda t: t.clone().requires_grad_(not frozen))
+    finite, found = kernels(scene.positions, states, weights, camera, rows, gradients, updates)
+    return bool(finite), [t for state in states for t in state[:3]], updates, found
+
+
+@needs_a_compiler
+class TestMoving:
+    @pytest.fixture
+    def moving(self, library):
+        return partial(decode_backward_adam, program=Program(PROGRAM.name, HostDriver(library), PROGRAM.headers))
+
+    @pytest.mark.parametrize("name", CAMERAS)
+    @pytest.mark.parametrize(("k", "with_distance"), [(10, False), (3, True)])
+    def test_anchors_move_as_by_the_reference(self, name, k, with_distance, moving):
+        scene, rows = Scene.random(45, k, with_distance=with_distance), torch.arange(0, 45, 2)
+        ours, theirs = (moved_by(kernels, scene, CAMERAS[name], rows) for kernels in (moving, by_reference))
+        assert ours[0] is theirs[0] is True
+        assert torch.equal(ours[2], theirs[2])
+        for found, expected in zip((*ours[1], *ours[3]), (*theirs[1], *theirs[3]), strict=True):
+            error = float((found - expected).norm() / expected.norm().clamp(min=1e-6))
+            assert error < 1e-4, error
+
+    def test_a_frozen_decoder_costs_nothing(self, moving):
+        scene, rows = Scene.random(20, 4), torch.arange(20)
+        assert moved_by(moving, scene, turned(), rows, frozen=True)[3] is None
+
+    def test_a_gradient_that_is_no_number_is_told_and_moves_nothing_of_its_anchor(self, moving):
+        scene, rows = Scene.random(20, 4), torch.arange(20)
+        finite, tensors, updates, _ = moved_by(moving, scene, looking_down(), rows, spoil=True)
+        assert not finite
+        assert all(tensor.isfinite().all() for tensor in tensors)
+        assert int(updates[5]) == 26
+
+    @pytest.mark.parametrize("order", ORDERS[1:])
+    def test_the_order_in_which_threads_take_turns_changes_no_bit(self, order, library):
+        results = []
+        for turns in (0, order):
+            program = Program(PROGRAM.name, HostDriver(library, turns), PROGRAM.headers)
+            moving = partial(decode_backward_adam, program=program)
+            results.append(moved_by(moving, Scene.random(17, 10), turned(), torch.arange(17)))
+        assert all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
+        assert all(torch.equal(one, other) for one, other in zip(results[0][3], results[1][3], strict=True))
+
+    def test_states_that_anneal_apart_are_refused(self, moving):
+        scene = Scene.random(4, 3)
+        states = [AdamState(t, t, t, 0.1, early) for t, early in zip(scene.trainable[:3], (1.0, 2.0, 1.0), strict=True)]
+        nothing: Any = None
+        with pytest.raises(ValueError, match="annealed alike"):
+            moving(scene.positions, states, scene.weights, turned(), torch.arange(4), nothing, torch.zeros(4).int())

@@ -1,8 +1,7 @@
-"""benchmarks/gpu.py without a card, so that it does not fail on its first day: all of it, on a card that is not there."""
+"""benchmarks/gpu.py without a card, so that it does not fail on its first day: all of it, on a pretended card."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from types import ModuleType
 

@@ -74,7 +74,9 @@ def test_the_way_back_gives_what_training_asks_for():
             assert_close(getattr(found, name), expected, 1e-4)
 
 
-@pytest.mark.parametrize(("tensor", "error"), [(torch.zeros(5, 3), ValueError), (torch.zeros(5, 2).double(), TypeError)])
+@pytest.mark.parametrize(
+    ("tensor", "error"), [(torch.zeros(5, 3), ValueError), (torch.zeros(5, 2).double(), TypeError)]
+)
 def test_unsuitable_tensors_are_refused(tensor, error):
     splats = Splats(tensor, torch.zeros(5, 3), torch.zeros(5), torch.zeros(5, 3), torch.zeros(5))
     with pytest.raises(error, match="means_px"):

@@ -52,7 +52,8 @@ def trained_on(device: torch.device, steps: int, **changes: Any) -> TrainingStat
     return state
 
 
-#: What a step waits for: how many anchors are visible, how many splats they show, how many tiles these reach, whether the loss is a number, and whether the gradients were.
+#: What a step waits for: how many anchors are visible, how many splats they show, how many tiles these reach, whether
+#: the loss is a number, and whether the gradients were.
 WAITS = {
     "kernels/reference/cull.py: cull: nonzero": 1,
     "kernels/cuda/decode.py: decode: _local_scalar_dense": 1,
@@ -97,7 +98,10 @@ def test_a_step_waits_for_the_card_only_where_it_must(rasteriser):
         train_step(state, stage)
         # gsplat's wait of this kind is in its compiled part.
         tiles = {"kernels/cuda/rasterise.py: _entries: _local_scalar_dense": 1} if rasteriser == "cuda" else {}
-        surroundings = {"kernels/reference/cull.py: cull: nonzero": 2, "kernels/cuda/decode.py: decode: _local_scalar_dense": 2}
+        surroundings = {
+            "kernels/reference/cull.py: cull: nonzero": 2,
+            "kernels/cuda/decode.py: decode: _local_scalar_dense": 2,
+        }
         assert dict(waits) == WAITS | tiles | surroundings
 
 
@@ -115,7 +119,10 @@ def test_growth_a_new_order_and_the_mean_stay_on_the_device(monkeypatch, rasteri
 def test_mixed_devices_are_found(monkeypatch, rasteriser):
     """The check can fail: with a background left in main memory, it does."""
     monkeypatch.setattr(loop, "background_at", lambda stage, iteration: torch.zeros(3))
-    with pretended_card(), pytest.raises((RuntimeError, TypeError), match="cuda and of shape|a cuda device, not on cpu"):
+    with (
+        pretended_card(),
+        pytest.raises((RuntimeError, TypeError), match=r"cuda and of shape|a cuda device, not on cpu"),
+    ):
         trained_on(CARD, 1)
 
 

@@ -1,9 +1,9 @@
 """The numerical operations, in interchangeable implementations, behind one door: `choose(device)`.
 
 `native` is C++ for the CPU, `reference` readable torch for any device (and the oracle of the tests). `Operations` in
-`operations.py` is the typed set that both offer; "d" marks those that torch can differentiate. `composed` is the set for
-NVIDIA GPUs, of `reference`, own kernels (`cuda`) and `gsplat`; a table in `operations.py` says which is which. Code
-outside this folder names no implementation.
+`operations.py` is the typed set that both offer; "d" marks those that torch can differentiate. `composed` is the set
+for NVIDIA GPUs, of `reference`, own kernels (`cuda`) and `gsplat`; a table in `operations.py` says which is which.
+Code outside this folder names no implementation.
 
 Names and dimensions, fixed once for all files in this folder:
 
@@ -46,8 +46,8 @@ VARIABLE = "VDGS_KERNELS"
 
 
 def choose(device: torch.device) -> Operations:
-    """The operations for tensors on `device`: C++ on the CPU, the composed set on NVIDIA GPUs, torch elsewhere; those that
-    VDGS_KERNELS names on any device, if it does.
+    """The operations for tensors on `device`: C++ on the CPU, the composed set on NVIDIA GPUs, torch elsewhere; on any
+    device those that VDGS_KERNELS names, if it does.
 
     Raises VdgsError for another value of that variable.
     """

@@ -1,7 +1,7 @@
 """Numbers on their way from main memory to a card, without waiting for it.
 
-A plain `tensor.to(card)`, `torch.tensor(…, device=card)` or `new_tensor` first waits until the card has done all that was
-queued. On the processor nothing of this makes a difference.
+A plain `tensor.to(card)`, `torch.tensor(…, device=card)` or `new_tensor` first waits until the card has done all that
+was queued. On the processor nothing of this makes a difference.
 """
 
 from __future__ import annotations

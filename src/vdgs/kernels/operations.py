@@ -107,10 +107,11 @@ class Operations(Protocol):
 OPERATIONS = tuple(sorted(name for name in vars(Operations) if not name.startswith("_")))
 
 #: By which implementation (a folder of `vdgs.kernels`) each operation is done on an NVIDIA card: torch's own arithmetic
-#: (`reference`), own kernels (`cuda`) or gsplat's. Of several the first that can be used; gsplat cannot tell median depth,
-#: so that pictures with depth are always drawn by the own kernels.
+#: (`reference`), own kernels (`cuda`) or gsplat's. Of several the first that can be used; gsplat cannot tell median
+#: depth, so that pictures with depth are always drawn by the own kernels.
 ON_A_CARD: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATIONS, ("reference",)) | {
     "decode": ("cuda",),
+    "decode_backward_adam": ("cuda",),
     "photometric_loss": ("cuda",),
     "rasterise": ("gsplat", "cuda"),
     "rasterise_vjp": ("gsplat", "cuda"),

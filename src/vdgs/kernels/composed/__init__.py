@@ -4,7 +4,7 @@
 """
 
 from vdgs.kernels.composed.rasteriser import rasterise, rasterise_vjp
-from vdgs.kernels.cuda import decode, photometric_loss
+from vdgs.kernels.cuda import decode, decode_backward_adam, photometric_loss
 from vdgs.kernels.reference import (
     adam_rows,
     add_view_statistics,
@@ -13,7 +13,6 @@ from vdgs.kernels.reference import (
     contains,
     count_visibility,
     cull,
-    decode_backward_adam,
     group_cells,
     group_max,
     mark_visible,

@@ -4,7 +4,8 @@ Not all operations of `vdgs.kernels` are here: `vdgs.kernels.composed` adds what
 """
 
 from vdgs.kernels.cuda.decode import decode
+from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.loss import photometric_loss
 from vdgs.kernels.cuda.rasterise import rasterise, rasterise_vjp
 
-__all__ = ["decode", "photometric_loss", "rasterise", "rasterise_vjp"]
+__all__ = ["decode", "decode_backward_adam", "photometric_loss", "rasterise", "rasterise_vjp"]

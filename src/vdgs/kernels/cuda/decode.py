@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float, Int64
@@ -53,20 +54,15 @@ def decode(
 ) -> AnchorSplats:
     """As `reference.decode.decode`, for float32 tensors on a CUDA device. Same bits every time.
 
-    Where autograd follows it is the reference that decodes: this has no derivative. Waits for the device once: how many
-    splats there is room to be made for. Nothing is kept between anchors and splats. Raises ValueError for more than 32
+    Where autograd follows it is the reference that decodes: this has no derivative. Waits for the device once: for how
+    many splats room must be made. Nothing is kept between anchors and splats. Raises ValueError for more than 32
     offsets, TypeError for other types of elements, CudaUnavailable where the kernel cannot be run.
     """
     anchors = (positions, features, offsets, log_scales)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (*anchors, *weights.tensors())):
         return by_torch(*anchors, weights, camera, rows)
     k, inputs = offsets.shape[1], weights.opacity.w1.shape[1]
-    if not 1 <= k <= MOST_OFFSETS:
-        raise ValueError(f"offsets per anchor must be 1 to {MOST_OFFSETS}, not {k}")
-    if inputs not in (FEATURE_SIZE + 3, FEATURE_SIZE + 4):
-        raise ValueError(f"a head's first layer must be 35 or 36 wide, not {inputs}")
-    if any(t.dtype != torch.float32 for t in (*anchors, *weights.tensors())):
-        raise TypeError("anchors and decoder must be float32")
+    check_decoder(k, weights, anchors)
     # Neighbouring lanes read neighbouring weights.
     heads = [t.detach().t().contiguous() if t.ndim == 2 else t.detach().contiguous() for t in weights.tensors()]
     count = len(positions) if rows is None else len(rows)
@@ -85,7 +81,18 @@ def decode(
         source=positions.new_empty(m, dtype=torch.int32),
     )
     program.launch(
-        "decode_anchors", grid, block, *given, ends, None, splats.means_px, splats.conics, splats.depths, splats.colours,
-        splats.opacities, splats.volumes, splats.source,
+        "decode_anchors", grid, block, *given, ends, None, splats.means_px, splats.conics, splats.depths,
+        splats.colours, splats.opacities, splats.volumes, splats.source,
     )  # fmt: skip
     return splats
+
+
+def check_decoder(k: int, weights: DecoderWeights, anchors: Sequence[Tensor]) -> None:
+    """Raise a clear error unless a warp can decode anchors of so many offsets, and all numbers are float32."""
+    inputs = weights.opacity.w1.shape[1]
+    if not 1 <= k <= MOST_OFFSETS:
+        raise ValueError(f"offsets per anchor must be 1 to {MOST_OFFSETS}, not {k}")
+    if inputs not in (FEATURE_SIZE + 3, FEATURE_SIZE + 4):
+        raise ValueError(f"a head's first layer must be 35 or 36 wide, not {inputs}")
+    if any(t.dtype != torch.float32 for t in (*anchors, *weights.tensors())):
+        raise TypeError("anchors and decoder must be float32")

@@ -35,9 +35,7 @@ def read_header(name: str) -> str:
     return (Path(__file__).parents[1] / "shared" / name).read_text(encoding="utf-8")
 
 
-def compile_source(
-    name: str, target: Target, *, headers: Sequence[str] = (), compiler: Nvrtc | None = None
-) -> bytes:
+def compile_source(name: str, target: Target, *, headers: Sequence[str] = (), compiler: Nvrtc | None = None) -> bytes:
     """A source of this package with these shared headers, compiled, from the cache if it is there.
 
     Raises CompileError, CudaUnavailable.

@@ -30,7 +30,9 @@ def resources_of(
     texts = {title: read_header(title) for title in headers}
     options = (*OPTIONS, "--ptxas-options=-v")
     _, log = (compiler or nvrtc()).compile_and_tell(name, read_source(name), texts, target, options)
-    return tuple(_read(kernel, text) for kernel, text in re.findall(r"entry function '(\w+)'(.*?)Compile time", log, re.S))
+    return tuple(
+        _read(kernel, text) for kernel, text in re.findall(r"entry function '(\w+)'(.*?)Compile time", log, re.S)
+    )
 
 
 def _read(kernel: str, text: str) -> Resources:

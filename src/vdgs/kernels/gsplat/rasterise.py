@@ -109,7 +109,7 @@ def reach_px(splats: Splats) -> Int32[Tensor, "m 2"]:
 
 
 def load() -> Any:
-    """gsplat, as installed, with its kernels compiled. Raises GsplatUnavailable, with what to do, if it cannot be used."""
+    """gsplat, as installed, its kernels compiled. Raises GsplatUnavailable, with what to do, if it cannot be used."""
     try:
         engine = importlib.import_module("gsplat")
         with redirect_stdout(sys.stderr):  # it tells the terminal how compiling goes; output belongs to the verbs

@@ -55,8 +55,8 @@ def adam_rows(
     Returns whether every gradient was finite; if not, nothing is changed. On a card the answer stays there.
 
     Raises IndexError for a row outside the parameter, ValueError for rows that do not ascend, shapes that
-    do not match or settings out of range, TypeError for other types of elements: before any change. Numbers that are on a
-    card are not looked at.
+    do not match or settings out of range, TypeError for other types of elements: before any change. Numbers that are
+    on a card are not looked at.
     """
     check_rows(state, rows, gradient)
     factors = check_step(state, step, len(gradient), beta1, beta2, epsilon)
@@ -71,7 +71,9 @@ def adam_rows(
     second = beta2 * before[1] + (1 - beta2) * gradient**2
     rate, root = _of_rows(factors, state, step, gradient)
     moved = before[2] - rate * first / (second.sqrt() * root + epsilon)
-    for tensor, old, new in zip((state.first, state.second, state.parameter), before, (first, second, moved), strict=True):
+    for tensor, old, new in zip(
+        (state.first, state.second, state.parameter), before, (first, second, moved), strict=True
+    ):
         tensor[index] = new if finite is None else torch.where(finite, new, old)
     return True if finite is None else finite
 
@@ -83,7 +85,7 @@ def _of_rows(
     if isinstance(step, int):
         return float(factors.rates[0]), float(factors.roots[0])
     # The rate changes with every step, these tables never: so they are on the card but once.
-    lacking, roots = _on_device(factors.beta1, factors.beta2, gradient.device)
+    lacking, roots = tables_on(factors.beta1, factors.beta2, gradient.device)
     place = (step.long() - 1).clamp(max=len(roots) - 1)
     root = roots[place]
     rate = root.clamp(max=state.early) * state.learning_rate / lacking[place]
@@ -92,7 +94,7 @@ def _of_rows(
 
 
 @cache
-def _on_device(beta1: float, beta2: float, device: torch.device) -> tuple[Tensor, Tensor]:
+def tables_on(beta1: float, beta2: float, device: torch.device) -> tuple[Tensor, Tensor]:
     """1 - beta1^u and 1 / sqrt(1 - beta2^u) for u = 1, 2, ... updates, in float64."""
     first, second = _lacking(beta1, beta2)
     return torch.from_numpy(first).to(device), torch.from_numpy(1 / np.sqrt(second)).to(device)

@@ -58,7 +58,7 @@ def decode_chosen(
     camera: Camera,
     source: Int32[Tensor, "m"],
 ) -> AnchorSplats:
-    """`decode` once more for those splats that it has kept: their number is known, so that nothing has to be waited for."""
+    """`decode` once more for those splats that it has kept: as their number is known, nothing waits for a card."""
     k = offsets.shape[1]
     anchors = _Anchors.of(positions, features, offsets, log_scales, weights, camera)
     chosen = source.long()
@@ -80,7 +80,12 @@ class _Anchors:
 
     @staticmethod
     def of(
-        positions: Tensor, features: Tensor, offsets: Tensor, log_scales: Tensor, weights: DecoderWeights, camera: Camera
+        positions: Tensor,
+        features: Tensor,
+        offsets: Tensor,
+        log_scales: Tensor,
+        weights: DecoderWeights,
+        camera: Camera,
     ) -> _Anchors:
         positions = positions.detach()
         viewing = _viewing(positions, camera)
@@ -115,10 +120,8 @@ def _viewing(positions: Tensor, camera: Camera) -> Float[Tensor, "v 4"]:
     """Viewing direction and distance of every anchor."""
     ray = positions - beside(camera.position, positions)
     distance = ray.norm(dim=-1, keepdim=True)
-    if camera.model == "orthographic":
-        direction = beside(camera.forward, positions).expand_as(ray)
-    else:
-        direction = ray / distance
+    level = camera.model == "orthographic"
+    direction = beside(camera.forward, positions).expand_as(ray) if level else ray / distance
     return torch.cat([direction, distance], -1)
 
 
