@@ -209,11 +209,12 @@ def rasterisers() -> list[str]:
 
 
 def print_memory(machine: Machine, sizes: Sizes) -> None:
-    """Slopes of the peak over the number of anchors, in view and out of view, at 400x300."""
+    """Slopes of the peak over the number of anchors, in view and out of view, with the smallest pictures."""
+    _, width, height = sizes.steps[0]
 
     def peak(visible: int, hidden: int) -> int:
         machine.forget_peak()
-        state, camera, target = step.prepare(visible, 400, 300, hidden, device=machine.device)
+        state, camera, target = step.prepare(visible, width, height, hidden, device=machine.device)
         for number in range(1, 4):
             step.one_step(state, camera, target, number, {phase: [] for phase in step.PHASES}, machine.synchronise)
         return machine.peak_bytes()

@@ -180,7 +180,11 @@ class _Crossing(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, tensor: Tensor, memory: Memory, to_card: bool) -> Tensor:
         ctx.memory, ctx.to_card = memory, to_card
-        copy = torch.from_numpy(tensor.detach().numpy().copy()) if tensor.numel() else torch.empty(tensor.shape, dtype=tensor.dtype)
+        copy = (
+            torch.from_numpy(tensor.detach().numpy().copy())
+            if tensor.numel()
+            else torch.empty(tensor.shape, dtype=tensor.dtype)
+        )
         return memory.mark(copy) if to_card else copy
 
     @staticmethod

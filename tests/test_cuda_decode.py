@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 from dataclasses import fields
 from functools import partial
-from typing import Any
 
 import pytest
 import torch
@@ -218,6 +217,16 @@ class TestMoving:
     def test_states_that_anneal_apart_are_refused(self, moving):
         scene = Scene.random(4, 3)
         states = [AdamState(t, t, t, 0.1, early) for t, early in zip(scene.trainable[:3], (1.0, 2.0, 1.0), strict=True)]
-        nothing: Any = None
+        nothing = torch.zeros(0)
+        none = SplatGradients(
+            torch.zeros(0, 2),
+            torch.zeros(0, 3),
+            torch.zeros(0, 3),
+            nothing,
+            0.0,
+            nothing.int(),
+            torch.zeros(0, 3),
+            nothing,
+        )
         with pytest.raises(ValueError, match="annealed alike"):
-            moving(scene.positions, states, scene.weights, turned(), torch.arange(4), nothing, torch.zeros(4).int())
+            moving(scene.positions, states, scene.weights, turned(), torch.arange(4), none, torch.zeros(4).int())

@@ -29,14 +29,14 @@ def decode_backward_adam(
 ) -> tuple[Finite, tuple[Tensor, ...] | None]:
     """As `reference.decode_adam.decode_backward_adam`, for float32 tensors on a CUDA device.
 
-    Gradients of anchors are never held: a warp takes an anchor from its splats to its new place. Those of the decoder are
-    matrix products (by torch) of what each anchor adds, for which some 1.4 kB a visible anchor are taken; where nobody
-    wants them, nothing. Nothing waits for the device, and whether all was finite stays there: an anchor for which it is
-    not does not move. All of `moved` anneal alike (`AdamState.early`). Raises ValueError or TypeError for unsuitable
-    tensors, CudaUnavailable where the kernel cannot be run.
+    Gradients of anchors are never held: a warp takes an anchor from its splats to its new place. Those of the decoder
+    are matrix products (by torch) of what each anchor adds, for which some 1.4 kB a visible anchor are taken; where
+    nobody wants them, nothing. Nothing waits for the device, and whether all was finite stays there: an anchor for
+    which it is not does not move. All of `moved` anneal alike (`AdamState.early`). Raises ValueError or TypeError for
+    unsuitable tensors, CudaUnavailable where the kernel cannot be run.
     """
     check_updates(updates, len(positions))
-    features, offsets, log_scales = moved
+    features, offsets, _ = moved
     k, inputs = offsets.parameter.shape[1], weights.opacity.w1.shape[1]
     parts = [getattr(state, name) for name in ("parameter", "first", "second") for state in moved]
     check_decoder(k, weights, (positions, *parts))
