@@ -5,7 +5,7 @@ VENV   ?= .venv
 DEMO    = demo
 BIN     = $(VENV)/bin
 STAMP   = $(VENV)/.installed
-SOURCES = $(shell find native -name "*.h" -o -name "*.cpp") CMakeLists.txt pyproject.toml constraints.txt
+SOURCES = $(shell find native src/vdgs/kernels/shared -name "*.h" -o -name "*.cpp") CMakeLists.txt pyproject.toml constraints.txt
 
 # torch's threads block instead of spinning beside the kernels' own.
 export OMP_WAIT_POLICY = PASSIVE

@@ -1,52 +1,110 @@
-"""What runs on an NVIDIA GPU, against the same on the processor: first whether it agrees, then how long it takes.
+"""What a card does, within a few minutes: whether it computes what the processor computes, and how long that takes.
 
-    python benchmarks/gpu.py [--rounds 20]
+    python benchmarks/gpu.py [--minutes 8] [--capture PLACE] [--small]
 
-Prints a table of the operations that have a CUDA implementation and names those that have none. Exit codes: 0 all
-agree, 1 one does not, 2 there is no GPU here that can be used.
+In this order: what the kernels take of the card, parity of every operation with the processor, a generated town trained
+and measured on both, milliseconds and bytes of a training step by each rasteriser, and a capture of one's own if it is
+named. What there is no time left for is named. Exit codes: 0 all agrees, 1 something does not, 2 there is no GPU here
+that can be used.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
+import json
+import os
 import statistics
 import sys
+import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
 
+import gpu_parity
+import step
 from machine import describe
-from stopwatch import medians_ms
-from vdgs.kernels import native
-from vdgs.kernels.cuda import photometric_loss as loss_on_card
+from vdgs.cli import main as vdgs
+from vdgs.kernels.composed import rasteriser
 from vdgs.kernels.cuda.driver import CudaUnavailable, cuda_driver
-from vdgs.kernels.cuda.nvrtc import nvrtc
-from vdgs.kernels.gsplat import rasterise as rasterise_by_gsplat
-from vdgs.kernels.operations import missing_on_cuda
-from vdgs.kernels.types import Splats
+from vdgs.kernels.cuda.nvrtc import Target, nvrtc
+from vdgs.kernels.cuda.resources import resources_of
+from vdgs.kernels.gsplat.rasterise import GsplatUnavailable
 
-SIZES = [(400, 300), (800, 600), (1600, 1200)]
-#: Largest difference that counts as agreement, in the norm over that of the processor's result: sums are added in
-#: another order, and a pixel at a threshold may go either way.
-TOLERANCE = 1e-4
+#: Sources and the headers that they include.
+SOURCES = {
+    "decode.cu": ("gaussian_math.h", "image_formation.h"), "loss.cu": (), "rasterise.cu": ("image_formation.h",),
+}  # fmt: skip
+#: How many dB the town may come out better or worse than on the processor: two trainings differ by rounding.
+TOWN_DB = 0.5
 
 
 @dataclass(frozen=True)
-class Row:
-    """An operation at a size: relative difference, milliseconds on the card and on the processor."""
+class Machine:
+    """A device, and what is asked of it besides tensors. Tests put another in the place of the card."""
 
-    operation: str
-    size: str
-    difference: float
-    card_ms: float
-    native_ms: float
+    device: torch.device
+    synchronise: Callable[[], None]
+    forget_peak: Callable[[], None]
+    peak_bytes: Callable[[], int]
+    capability: tuple[int, int]
 
 
-def why_none() -> str:
-    """Why no GPU can be measured here; empty if one can."""
+@dataclass(frozen=True)
+class Sizes:
+    """How much is computed."""
+
+    parity: tuple[int, int, int]  # anchors, width, height
+    #: Visible anchors, width, height of the steps that are timed.
+    steps: tuple[tuple[int, int, int], ...]
+    rounds: int
+    #: Anchors by which the peak of memory is raised.
+    memory: int
+    town: tuple[str, ...]
+    iterations: int
+
+
+FULL = Sizes(
+    (20_000, 800, 600), ((20_000, 400, 300), (20_000, 800, 600), (200_000, 1600, 1200)), 15, 200_000,
+    ("--size", "village"), 1500,
+)  # fmt: skip
+SMALL = Sizes(
+    (60, 40, 32), ((60, 40, 32),), 1, 60, ("--size", "toy", "--images", "6", "--width", "48", "--height", "36"), 8
+)
+
+
+@dataclass
+class Report:
+    """What was found wrong, and what there was no time for."""
+
+    seconds: float
+    began: float = field(default_factory=time.monotonic)
+    wrong: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+
+    @contextmanager
+    def section(self, title: str) -> Iterator[bool]:
+        """Gives whether there is time for it; an error in one section is told, and the next one goes on."""
+        if time.monotonic() - self.began > self.seconds:
+            self.left_out.append(title)
+            yield False
+            return
+        print(f"\n{title}", flush=True)
+        try:
+            yield True
+        except Exception as error:
+            traceback.print_exc()
+            self.wrong.append(f"{title}: {type(error).__name__}: {error}")
+
+
+def find_card() -> Machine | str:
+    """The first card, or why none can be used."""
     try:
         driver = cuda_driver()
         compiler = nvrtc()
@@ -59,87 +117,151 @@ def why_none() -> str:
         major, minor = card.capability
         print(f"card         {card.name}, {card.memory_bytes / 1e9:.1f} GB, compute capability {major}.{minor}")
     print(f"NVRTC        {compiler.version[0]}.{compiler.version[1]}, from {compiler.found.origin}")
-    return ""
-
-
-def card_ms(run: Callable[[], object], rounds: int) -> float:
-    """Median milliseconds of `run` on the card, once all that it queued is done."""
-    run()
-    times = []
-    for _ in range(rounds):
-        torch.cuda.synchronize()
-        start = time.perf_counter()
-        run()
-        torch.cuda.synchronize()
-        times.append(1e3 * (time.perf_counter() - start))
-    return statistics.median(times)
-
-
-def compare(name: str, size: str, card: Callable[[], tuple], processor: Callable[[], tuple], rounds: int) -> Row:
-    """Both results, number by number, and both times."""
-    worst = 0.0
-    for ours, theirs in zip(card(), processor(), strict=True):
-        error = (ours.detach().cpu() - theirs.detach()).double().norm()
-        worst = max(worst, float(error / (theirs.detach().double().norm() + 1e-12)))
-    return Row(name, size, worst, card_ms(card, rounds), medians_ms({"native": processor}, rounds)["native"])
-
-
-def loss(width: int, height: int, rounds: int) -> Row:
-    g = torch.Generator().manual_seed(0)
-    image = torch.rand(height, width, 3, generator=g)
-    target = torch.randint(256, (height, width, 3), generator=g, dtype=torch.uint8)
-    mask = (torch.rand(height, width, generator=g) < 0.9).byte()
-
-    def step(operation: Callable, device: str) -> Callable[[], tuple]:
-        leaf, goal, kept = image.to(device).requires_grad_(), target.to(device), mask.to(device)
-
-        def run() -> tuple:
-            result = operation(leaf, goal, kept)
-            return (*result, *torch.autograd.grad(result.loss, leaf))
-
-        return run
-
-    run_card, run_native = step(loss_on_card, "cuda"), step(native.photometric_loss, "cpu")
-    return compare("SSIM + L1 with gradient", f"{width}x{height}", run_card, run_native, rounds)
-
-
-def raster(width: int, height: int, rounds: int, splats: int = 200_000) -> Row:
-    """gsplat's rasteriser, forward: not an own kernel, a second opinion."""
-    g = torch.Generator().manual_seed(0)
-    spread = 0.3 + 3 * torch.rand(splats, generator=g)
-    conics = torch.stack([1 / spread, torch.zeros(splats), 1 / spread], dim=1)
-    here = Splats(
-        torch.rand(splats, 2, generator=g) * torch.tensor([float(width), float(height)]), conics,
-        1 + torch.rand(splats, generator=g), torch.rand(splats, 3, generator=g), torch.rand(splats, generator=g),
-    )  # fmt: skip
-    there = Splats(**{name: tensor.cuda() for name, tensor in vars(here).items()})
-    return compare(
-        "gsplat: rasterise", f"{width}x{height}",
-        lambda: rasterise_by_gsplat(there, torch.zeros(3).cuda(), width, height)[:2],
-        lambda: native.rasterise(here, torch.zeros(3), width, height)[:2],
-        rounds,
+    return Machine(
+        torch.device("cuda"), torch.cuda.synchronize, torch.cuda.reset_peak_memory_stats,
+        torch.cuda.max_memory_allocated, cards[0].capability,
     )  # fmt: skip
 
 
-def main() -> int:
+def print_resources(machine: Machine) -> None:
+    target: Target = nvrtc().target_for(machine.capability)
+    if target.is_ptx:
+        print(f"this NVRTC is older than the card: {target.name}, which the driver compiles on")
+        return
+    for source, headers in SOURCES.items():
+        for found in resources_of(source, target, headers):
+            print(
+                f"{found.kernel:22} {found.registers:4} registers {found.shared_bytes:6} B shared "
+                f"{found.spilled_bytes:4} B spilled"
+            )
+
+
+def print_parity(machine: Machine, sizes: Sizes, report: Report) -> None:
+    for found in gpu_parity.differences(machine.device, *sizes.parity):
+        name = f"{found.operation}{f' by {found.by}' if found.by else ''}: {found.result}"
+        print(f"{name:56} {found.size:9.1e} {'' if found.agrees else 'TOO FAR'}", flush=True)
+        if not found.agrees:
+            report.wrong.append(f"{name} differs by {found.size:.1e}")
+
+
+def train_town(sizes: Sizes, report: Report) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        capture = Path(folder) / "capture"
+        command("synth", str(capture), *sizes.town)
+        found = {
+            device: trained(capture, Path(folder) / device, device, sizes.iterations, "--seed", "1")
+            for device in ("cpu", "cuda")
+        }
+    for device, (psnr, seconds) in found.items():
+        print(
+            f"{device:6} {psnr:6.2f} dB after {sizes.iterations} iterations, {seconds:6.1f} s with all that is around"
+        )
+    off = abs(found["cpu"][0] - found["cuda"][0])
+    if not off <= TOWN_DB:
+        report.wrong.append(f"the town differs by {off:.2f} dB")
+
+
+def trained(capture: Path, run: Path, device: str, iterations: int, *options: str) -> tuple[float, float]:
+    """PSNR of the test views after a coarse stage, and its seconds."""
+    begin = time.monotonic()
+    command(
+        "coarse", str(capture), "--output", str(run), "--iterations", str(iterations), "--device", device, *options
+    )  # fmt: skip
+    seconds = time.monotonic() - begin
+    command("eval", str(run), "--model", "coarse", "--device", device)
+    return json.loads((run / "coarse" / "evaluation" / "metrics.json").read_text())["psnr"], seconds
+
+
+def command(*arguments: str) -> None:
+    """A verb of vdgs in this process. Raises RuntimeError where it fails."""
+    try:
+        vdgs(list(arguments))
+    except SystemExit as ended:
+        if ended.code:
+            raise RuntimeError(f"vdgs {' '.join(arguments)} ended with {ended.code}") from ended
+
+
+def time_steps(machine: Machine, sizes: Sizes) -> None:
+    for name in rasterisers():
+        os.environ[rasteriser.VARIABLE] = name
+        for visible, width, height in sizes.steps:
+            state, camera, target = step.prepare(visible, width, height, device=machine.device)
+            times: dict[str, list[float]] = {phase: [] for phase in step.PHASES}
+            for number in range(1, sizes.rounds + 4):
+                seen, splats = step.one_step(state, camera, target, number, times, machine.synchronise)
+            medians = {phase: statistics.median(values[3:]) for phase, values in times.items()}
+            parts = "  ".join(f"{phase} {value:.2f}" for phase, value in medians.items())
+            print(
+                f"{name:7} {width}x{height}, {seen} visible anchors, {splats} splats: {sum(medians.values()):.2f} ms "
+                f"({parts})", flush=True,
+            )  # fmt: skip
+    os.environ.pop(rasteriser.VARIABLE, None)
+
+
+def rasterisers() -> list[str]:
+    """Those that can be used."""
+    try:
+        rasteriser.chosen("gsplat")
+    except GsplatUnavailable as error:
+        print(f"without gsplat: {error}")
+        return ["cuda"]
+    return ["gsplat", "cuda"]
+
+
+def print_memory(machine: Machine, sizes: Sizes) -> None:
+    """Slopes of the peak over the number of anchors, in view and out of view, with the smallest pictures."""
+    _, width, height = sizes.steps[0]
+
+    def peak(visible: int, hidden: int) -> int:
+        machine.forget_peak()
+        state, camera, target = step.prepare(visible, width, height, hidden, device=machine.device)
+        for number in range(1, 4):
+            step.one_step(state, camera, target, number, {phase: [] for phase in step.PHASES}, machine.synchronise)
+        return machine.peak_bytes()
+
+    count = sizes.memory
+    base = peak(count, 0)
+    in_view, out_of_view = peak(2 * count, 0) - base, peak(count, 2 * count) - base
+    print(f"{in_view / count:.0f} B for each anchor in view, {out_of_view / (2 * count):.0f} B for each out of view")
+
+
+def train_capture(capture: Path, iterations: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        psnr, seconds = trained(capture, Path(folder) / "run", "cuda", iterations)
+    print(f"{capture.name}: {psnr:.2f} dB after {iterations} iterations, {seconds:.1f} s, reading included")
+
+
+def main(arguments: list[str] | None = None, machine: Machine | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=20)
-    arguments = parser.parse_args()
-    if reason := why_none():
-        print(f"No GPU to measure: {reason}", file=sys.stderr)
+    parser.add_argument("--minutes", type=float, default=8.0, help="no section begins after so long (default 8)")
+    parser.add_argument("--capture", type=Path, help="also train on this capture")
+    parser.add_argument("--iterations", type=int, default=1500, help="of that training (default 1500)")
+    parser.add_argument("--small", action="store_true", help="as little of everything as tries all of it")
+    asked = parser.parse_args(arguments)
+    found = machine or find_card()
+    if isinstance(found, str):
+        print(f"No GPU to measure: {found}", file=sys.stderr)
         return 2
     print(describe())
-    rows = [loss(*size, arguments.rounds) for size in SIZES]
-    if importlib.util.find_spec("gsplat"):
-        rows += [raster(*size, arguments.rounds) for size in SIZES]
-    print(f"{'operation':26} {'size':>10} {'difference':>11} {'card ms':>9} {'native ms':>10}")
-    for row in rows:
-        print(f"{row.operation:26} {row.size:>10} {row.difference:11.1e} {row.card_ms:9.3f} {row.native_ms:10.2f}")
-    print(f"no CUDA implementation: {', '.join(missing_on_cuda())}")
-    wrong = [row for row in rows if not row.difference < TOLERANCE]
-    for row in wrong:
-        print(f"{row.operation} at {row.size} differs by {row.difference:.1e}", file=sys.stderr)
-    return 1 if wrong else 0
+    sizes, report = SMALL if asked.small else FULL, Report(60 * asked.minutes)
+    sections: dict[str, Callable[[], None]] = {
+        "what the kernels take": lambda: print_resources(found),
+        "parity with the processor": lambda: print_parity(found, sizes, report),
+        "a generated town": lambda: train_town(sizes, report),
+        "a training step": lambda: time_steps(found, sizes),
+        "memory": lambda: print_memory(found, sizes),
+    }
+    if asked.capture is not None:
+        sections["a capture"] = lambda: train_capture(asked.capture, asked.iterations)
+    for title, work in sections.items():
+        with report.section(title) as has_time:
+            if has_time:
+                work()
+    for title in report.left_out:
+        print(f"no time was left for: {title}")
+    for line in report.wrong:
+        print(line, file=sys.stderr)
+    return 1 if report.wrong else 0
 
 
 if __name__ == "__main__":

@@ -68,54 +68,68 @@ def scene(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Ancho
     return anchors, Camera(pose, focal, focal, width / 2, height / 2, width, height)
 
 
-def timed(times: dict[str, list[float]], phase: str, work: Callable[[], Any]) -> Any:
+def timed_phase(
+    times: dict[str, list[float]], phase: str, work: Callable[[], Any], synchronise: Callable[[], None] | None
+) -> Any:
     begin = time.perf_counter()
     result = work()
+    if synchronise is not None:
+        synchronise()
     times[phase].append(1e3 * (time.perf_counter() - begin))
     return result
 
 
 def one_step(
-    state: Any, camera: Camera, target: torch.Tensor, step: int, times: dict[str, list[float]]
-) -> tuple[int, int]:
-    """The work of vdgs.training.train_step, phase by phase."""
-    kernels, rates = choose(torch.device("cpu")), rates_at(TrainConfig().rates, 0.1)
+    state: Any, camera: Camera, target: torch.Tensor, step: int, times: dict[str, list[float]],
+    synchronise: Callable[[], None] | None = None,
+) -> tuple[int, int]:  # fmt: skip
+    """The work of vdgs.training.train_step, phase by phase, where the anchors are; `synchronise` waits for it."""
+    device = state.anchors.positions.device
+    kernels, rates = choose(device), rates_at(TrainConfig().rates, 0.1)
+
+    def timed(phase: str, work: Callable[[], Any]) -> Any:
+        return timed_phase(times, phase, work, synchronise)
+
     weights = state.decoder.for_image(0)
     with torch.no_grad():
-        rows = timed(times, "cull", lambda: visible_rows(state.anchors, camera))
-        waiting = [timed(times, "decode", lambda: decode_rows(state.anchors, rows, weights, camera))]
-        view = timed(times, "rasterise", lambda: draw_view(waiting.pop(), camera, torch.zeros(3)))
+        rows = timed("cull", lambda: visible_rows(state.anchors, camera))
+        waiting = [timed("decode", lambda: decode_rows(state.anchors, rows, weights, camera))]
+        view = timed("rasterise", lambda: draw_view(waiting.pop(), camera, torch.zeros(3, device=device)))
     view.image.requires_grad_(True)
 
     def loss() -> torch.Tensor:
         photometric = kernels.photometric_loss(view.image, target, None)
         return torch.autograd.grad(photometric.loss, view.image)[0]
 
-    image_gradient = timed(times, "loss", loss)
-    whole = Target(target, None, torch.ones(target.shape[:2], dtype=torch.bool), camera)
-    _, alpha_gradient = timed(times, "solid", lambda: whole.transparency(view.alpha, 0.02))
-    gradients = timed(times, "backward", lambda: view.backward(image_gradient, alpha_gradient, 0.01))
+    image_gradient = timed("loss", loss)
+    whole = Target(target, None, torch.ones(target.shape[:2], dtype=torch.bool, device=device), camera)
+    _, alpha_gradient = timed("solid", lambda: whole.transparency(view.alpha, 0.02))
+    gradients = timed("backward", lambda: view.backward(image_gradient, alpha_gradient, 0.01))
 
     def move() -> None:
-        states = state.optimiser.anchor_states(state.anchors, rates)
+        states = state.optimiser.anchor_states(state.anchors, rates, TrainConfig().early)
         move_anchors(state.anchors, rows, gradients, weights, camera, states, state.optimiser.updates)
         state.optimiser.update_decoder(state.decoder, rates, step)
 
-    timed(times, "move", move)
-    timed(times, "statistics", lambda: kernels.add_view_statistics(
+    timed("move", move)
+    timed("statistics", lambda: kernels.add_view_statistics(
         state.statistics, rows, kernels.mark_visible(state.anchors.positions[rows], camera), view.source,
         view.opacities, gradients.means_px, camera.width, camera.height,
     ))  # fmt: skip
     return len(rows), len(view.source)
 
 
-def prepare(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Any, Camera, torch.Tensor]:
+def prepare(
+    visible: int, width: int, height: int, hidden: int = 0, device: torch.device | None = None
+) -> tuple[Any, Camera, torch.Tensor]:
+    device = device or torch.device("cpu")
     anchors, camera = scene(visible, width, height, hidden)
-    decoder = Decoder.initial(10, False, 0, 1, torch.Generator().manual_seed(0))
+    anchors = anchors.to(device)
+    decoder = Decoder.initial(10, False, 0, 1, torch.Generator().manual_seed(0)).to(device)
     nothing: Any = None  # no photographs: a random target instead
     state = start_state(anchors, decoder, Stage(TrainConfig(), nothing, 1, 1.0, 1.0))
     target = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
-    return state, camera, target
+    return state, camera, target.to(device)
 
 
 def measure(visible: int, width: int, height: int, repeats: int) -> None:

@@ -1,84 +1,182 @@
 // Runs a CUDA kernel on the processor, to check its arithmetic where there is no GPU. Include the source after this.
 //
-// The threads of a block are fibers that take turns: each runs until it ends or waits at __syncthreads(), and only when
-// all wait (or have ended) do they go on. One block runs at a time, so that `static` is what `__shared__` means. The
-// fibers take turns forwards or backwards: a kernel that lacks a __syncthreads() gives different results.
+// The threads of a block are fibers that take turns: each runs until it ends, or waits at a barrier of the block or in an
+// operation of its warp. Warps take turns too, and a warp goes on as long as it can: to the next barrier of the block.
+// Threads and warps take turns forwards, backwards or shuffled: a kernel that lacks a barrier gives different results.
+// One block runs at a time, so that `static` is what `__shared__` means.
 #pragma once
 
 #include <cmath>
+#include <cstdint>
+#include <cstring>
 #include <memory>
+#include <numeric>
 #include <utility>
 #include <vector>
 
+#include <setjmp.h>
 #include <ucontext.h>
 
+// What the headers that are shared with the processor go by.
+#define __CUDACC_RTC__
+#define __forceinline__ inline
+#define __host__
 #define __global__
 #define __device__
 #define __constant__
 #define __shared__ static
-#define __launch_bounds__(threads)
+#define __launch_bounds__(...)
 
 struct Index {
   unsigned x, y, z;
 };
 static Index threadIdx, blockIdx, blockDim, gridDim;
 
+inline unsigned __float_as_uint(float a) {
+  unsigned bits;
+  std::memcpy(&bits, &a, sizeof bits);
+  return bits;
+}
+
 namespace host {
 
 constexpr size_t kStackBytes = 64 * 1024;
+constexpr unsigned kWarp = 32;
+
+enum class State { ready, at_barrier, in_warp, ended };
 
 struct Fiber {
   ucontext_t context;
+  jmp_buf place;
+  bool begun;
   std::unique_ptr<char[]> stack{new char[kStackBytes]};
   Index index;
-  bool waiting, ended;
+  unsigned lane;
+  State state;
+  // What it brings to barriers that ask and to operations of the warp; every other one has its own place, so that
+  // nobody overwrites what another has not read yet.
+  unsigned barriers, exchanges;
+  bool vote[2];
+  uint32_t given[2];
 };
 
 using Kernel = void (*)(void** arguments);
-static ucontext_t scheduler;
+static ucontext_t scheduler_context;
+static jmp_buf scheduler;
+static std::vector<Fiber> fibers;
 static Fiber* running;
 static Kernel kernel_running;
 static void** arguments_given;
 
-inline void synchronise() {
-  running->waiting = true;
-  swapcontext(&running->context, &scheduler);
+// Fibers are begun by swapcontext and change by longjmp, which asks nothing of the system.
+inline void wait(State why) {
+  running->state = why;
+  if (!_setjmp(running->place)) _longjmp(scheduler, 1);
 }
 
 inline void begin_fiber() {
   kernel_running(arguments_given);
-  running->ended = true;
+  running->state = State::ended;
+  _longjmp(scheduler, 1);
 }
 
 inline void turn(Fiber& fiber) {
   running = &fiber;
   threadIdx = fiber.index;
-  fiber.waiting = false;
-  swapcontext(&scheduler, &fiber.context);
+  fiber.state = State::ready;
+  if (_setjmp(scheduler)) return;
+  if (fiber.begun) _longjmp(fiber.place, 1);
+  fiber.begun = true;
+  swapcontext(&scheduler_context, &fiber.context);
 }
 
-// False: some threads ended while others wait, which a GPU may not survive.
-inline bool run_block(std::vector<Fiber>& fibers, bool backwards) {
+template <class Join>
+bool ask(bool mine, bool start, Join join) {
+  const unsigned place = running->barriers++ % 2;
+  running->vote[place] = mine;
+  Fiber* me = running;
+  wait(State::at_barrier);
+  bool all = start;
+  for (Fiber& fiber : fibers) all = join(all, fiber.vote[place]);
+  running = me;
+  return all;
+}
+
+inline Fiber& lane_of_my_warp(unsigned lane) {
+  return fibers[(running - fibers.data()) / kWarp * kWarp + lane];
+}
+
+template <class T>
+unsigned exchange(T mine, bool vote) {
+  static_assert(sizeof mine == sizeof(uint32_t));
+  const unsigned place = running->exchanges++ % 2;
+  std::memcpy(&running->given[place], &mine, sizeof mine);
+  running->vote[place] = vote;  // barriers and warps never wait at once
+  wait(State::in_warp);
+  return place;
+}
+
+template <class T>
+T given_by(unsigned lane, unsigned place) {
+  T given;
+  std::memcpy(&given, &lane_of_my_warp(lane).given[place], sizeof given);
+  return given;
+}
+
+// All lanes that have not ended must take part, as the mask of all lanes says.
+inline bool release_warp(size_t warp) {
+  unsigned waiting = 0;
+  for (unsigned lane = 0; lane < kWarp; ++lane) waiting += fibers[warp * kWarp + lane].state == State::in_warp;
+  if (waiting != kWarp) return false;
+  for (unsigned lane = 0; lane < kWarp; ++lane) fibers[warp * kWarp + lane].state = State::ready;
+  return true;
+}
+
+// 0 forwards, 1 backwards, else a shuffle that the number stands for.
+inline std::vector<size_t> order_of(size_t count, unsigned turns) {
+  std::vector<size_t> order(count);
+  std::iota(order.begin(), order.end(), size_t{0});
+  if (turns == 1) return {order.rbegin(), order.rend()};
+  uint32_t state = turns;
+  for (size_t i = count; turns > 1 && i > 1; --i) {
+    state = state * 1664525u + 1013904223u;
+    std::swap(order[i - 1], order[(state >> 8) % i]);
+  }
+  return order;
+}
+
+// False: threads wait for others that never come, which a GPU may not survive.
+inline bool run_block(unsigned turns) {
   unsigned i = 0;
   for (Fiber& fiber : fibers) {
     fiber.index = {i % blockDim.x, i / blockDim.x % blockDim.y, i / (blockDim.x * blockDim.y)};
-    fiber.ended = fiber.waiting = false;
+    fiber.lane = i % kWarp;
+    fiber.state = State::ready;
+    fiber.begun = false;
+    fiber.barriers = fiber.exchanges = 0;
     getcontext(&fiber.context);
     fiber.context.uc_stack.ss_sp = fiber.stack.get();
     fiber.context.uc_stack.ss_size = kStackBytes;
-    fiber.context.uc_link = &scheduler;
+    fiber.context.uc_link = nullptr;
     makecontext(&fiber.context, begin_fiber, 0);
     ++i;
   }
+  const size_t warps = fibers.size() / kWarp;
+  const std::vector<size_t> by_warp = order_of(warps, turns), by_lane = order_of(kWarp, turns);
   for (;;) {
-    size_t ended = 0;
-    for (size_t f = 0; f < fibers.size(); ++f) {
-      Fiber& fiber = fibers[backwards ? fibers.size() - 1 - f : f];
-      turn(fiber);
-      ended += fiber.ended;
+    for (size_t warp : by_warp) {
+      do {
+        for (size_t lane : by_lane) {
+          Fiber& fiber = fibers[warp * kWarp + lane];
+          if (fiber.state == State::ready) turn(fiber);
+        }
+      } while (release_warp(warp));
     }
+    size_t ended = 0, waiting = 0;
+    for (Fiber& fiber : fibers) ended += fiber.state == State::ended, waiting += fiber.state == State::at_barrier;
     if (ended == fibers.size()) return true;
-    if (ended) return false;
+    if (waiting != fibers.size()) return false;
+    for (Fiber& fiber : fibers) fiber.state = State::ready;
   }
 }
 
@@ -96,23 +194,54 @@ struct Caller<kernel> {
 
 }  // namespace host
 
-#define __syncthreads host::synchronise
+inline void __syncthreads() { host::ask(false, false, [](bool a, bool b) { return a || b; }); }
+inline int __syncthreads_or(int mine) {
+  return host::ask(mine, false, [](bool a, bool b) { return a || b; });
+}
+inline int __syncthreads_and(int mine) {
+  return host::ask(mine, true, [](bool a, bool b) { return a && b; });
+}
+inline float __shfl_xor_sync(unsigned, float mine, int lanes) {
+  const unsigned place = host::exchange(mine, false);
+  return host::given_by<float>(host::running->lane ^ lanes, place);
+}
+inline float __shfl_sync(unsigned, float mine, int lane) {
+  const unsigned place = host::exchange(mine, false);
+  return host::given_by<float>(lane, place);
+}
+inline void __syncwarp() { host::exchange(0.0f, false); }
+inline unsigned __ballot_sync(unsigned, int mine) {
+  const unsigned place = host::exchange(0.0f, mine);
+  unsigned all = 0;
+  for (unsigned lane = 0; lane < host::kWarp; ++lane) all |= unsigned{host::lane_of_my_warp(lane).vote[place]} << lane;
+  return all;
+}
+inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
+inline int __any_sync(unsigned, int mine) {
+  const unsigned place = host::exchange(0.0f, mine);
+  for (unsigned lane = 0; lane < host::kWarp; ++lane)
+    if (host::lane_of_my_warp(lane).vote[place]) return 1;
+  return 0;
+}
+
 #define HOST_KERNEL(name) \
   extern "C" void host_##name(void** arguments) { host::Caller<name>::call(arguments); }
 
-// Grid and block: three sides each. Returns false for a kernel whose threads do not all reach a barrier.
+// Grid and block: three sides each; a block is whole warps. Returns false for a kernel whose threads wait in vain.
 extern "C" int host_launch(host::Kernel kernel, const unsigned* grid, const unsigned* block, void** arguments,
-                           int backwards) {
+                           unsigned turns) {
   gridDim = {grid[0], grid[1], grid[2]};
   blockDim = {block[0], block[1], block[2]};
   host::kernel_running = kernel;
   host::arguments_given = arguments;
-  std::vector<host::Fiber> fibers(block[0] * block[1] * block[2]);
+  const size_t threads = block[0] * block[1] * block[2];
+  if (threads % host::kWarp) return 0;
+  if (host::fibers.size() != threads) host::fibers = std::vector<host::Fiber>(threads);
   for (unsigned z = 0; z < grid[2]; ++z)
     for (unsigned y = 0; y < grid[1]; ++y)
       for (unsigned x = 0; x < grid[0]; ++x) {
         blockIdx = {x, y, z};
-        if (!host::run_block(fibers, backwards)) return 0;
+        if (!host::run_block(turns)) return 0;
       }
   return 1;
 }

@@ -12,10 +12,14 @@ from typing import Any
 
 import torch
 
+from vdgs.kernels.cuda import launching
 from vdgs.kernels.cuda.driver import Grid
 from vdgs.kernels.cuda.launching import read_source
 
 HERE = Path(__file__).parent
+SHARED = Path(launching.__file__).parents[1] / "shared"
+#: Orders in which threads and warps take turns: forwards, backwards, and two shuffles.
+ORDERS = (0, 1, 2, 3)
 
 
 def host_compiler() -> str | None:
@@ -29,24 +33,28 @@ def build_on_host(source: str, folder: Path, text: str | None = None) -> ctypes.
     `text` is compiled instead of the source's own.
     """
     text = text or read_source(source)
-    kernels = re.findall(r'extern "C" __global__ void(?: __launch_bounds__\(\w+\))?\s+(\w+)\(', text)
+    kernels = re.findall(r'extern "C" __global__ void(?: __launch_bounds__\([\w, ]+\))?\s+(\w+)\(', text)
     assert kernels, f"no kernel in {source}"
     exported = "\n".join(f"HOST_KERNEL({name})" for name in kernels)
     (folder / "host.cpp").write_text(f'#include "cuda_on_host.h"\n{text}\n{exported}\n')
     library = folder / "host.so"
-    command = [str(host_compiler()), "-std=c++17", "-O1", "-fPIC", "-shared", "-I", str(HERE), str(folder / "host.cpp")]
+    # Fibers jump between stacks, which fortified longjmp takes for an attack.
+    command = [str(host_compiler()), "-std=c++17", "-O1", "-U_FORTIFY_SOURCE", "-fPIC", "-shared"]
+    command += ["-I", str(HERE), "-I", str(SHARED), str(folder / "host.cpp")]
     done = subprocess.run([*command, "-o", str(library)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return ctypes.CDLL(str(library))
 
 
+class Stuck(Exception):
+    """A kernel that a GPU may not survive."""
+
+
 class HostDriver:
-    """`vdgs.kernels.cuda.driver.Driver` on tensors in main memory."""
+    """`vdgs.kernels.cuda.driver.Driver` on tensors in main memory, whatever device they say that they are on."""
 
-    device_type = "cpu"
-
-    def __init__(self, library: ctypes.CDLL, backwards: bool = False):
-        self._library, self.backwards = library, backwards
+    def __init__(self, library: ctypes.CDLL, order: int = 0, device_type: str = "cpu"):
+        self._library, self.order, self.device_type = library, order, device_type
         #: Modules loaded and kernels launched: (name, grid, block).
         self.loaded: list[bytes] = []
         self.launched: list[tuple[str, Grid, Grid]] = []
@@ -69,6 +77,7 @@ class HostDriver:
         self.launched.append((self._names[function], grid, block))
         whole = self._library.host_launch(
             ctypes.c_void_p(function), (ctypes.c_uint * 3)(*grid), (ctypes.c_uint * 3)(*block), arguments,
-            int(self.backwards),
+            ctypes.c_uint(self.order),
         )  # fmt: skip
-        assert whole, "some threads of a block ended while others wait for them"
+        if not whole:
+            raise Stuck("threads of a block wait for others that never come")

@@ -1,93 +1,123 @@
-"""gsplat 1.5.3's three functions as documented, in torch: shapes are checked as it checks them, tiles are kept to.
+"""Stands in for the compiled part of gsplat 1.5.3, on the processor: the four functions that its Python calls for tiles
+and pixels, with the arguments and results of its C++ (`gsplat/cuda/_wrapper.py`, `csrc/Intersect.cpp`,
+`csrc/Rasterization.cpp`).
 
-A splat is drawn only in tiles that its radii reach, so that radii that are too small show in the picture.
+A splat is drawn only in tiles that its radii reach, so that radii that are too small show in the picture. All the rest
+of gsplat is its own.
 """
 
 from __future__ import annotations
 
+import importlib.util
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
 import torch
 from torch import Tensor
 
+from pretended_device import unseen
 
-def isect_tiles(
-    means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Tiles of each Gaussian [1, N], ids (tile << 32 | depth) and indices of Gaussians, sorted by id."""
-    (images, n, two), dtype = means2d.shape, radii.dtype
-    assert (images, two, dtype) == (1, 2, torch.int32)
-    assert radii.shape == (1, n, 2)
-    assert depths.shape == (1, n)
-    assert not means2d.requires_grad
-    counts = torch.zeros(1, n, dtype=torch.int32)
-    found = []
-    for i in range(n):
-        if (radii[0, i] <= 0).any():
-            continue
-        centre, reach = means2d[0, i] / tile_size, radii[0, i] / tile_size
-        low, high = torch.floor(centre - reach).long(), torch.ceil(centre + reach).long()
-        for row in range(max(0, int(low[1])), min(tile_height, int(high[1]))):
-            for column in range(max(0, int(low[0])), min(tile_width, int(high[0]))):
-                bits = int(depths[0, i].view(torch.int32))
-                found.append(((row * tile_width + column) << 32 | bits, i))
-                counts[0, i] += 1
-    found.sort(key=lambda pair: pair[0])  # stable, as gsplat's radix sort
-    ids = torch.tensor([key for key, _ in found], dtype=torch.int64)
-    return counts, ids, torch.tensor([i for _, i in found], dtype=torch.int32)
+needs_gsplat = pytest.mark.skipif(
+    importlib.util.find_spec("gsplat") is None, reason="gsplat: pip install 'vdgs[gsplat]'"
+)
 
 
-def isect_offset_encode(isect_ids: Tensor, n_images: int, tile_width: int, tile_height: int) -> Tensor:
+def install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put it where gsplat looks for what it has compiled."""
+    functions = (intersect_tile, intersect_offset, rasterize_to_pixels_3dgs_fwd, rasterize_to_pixels_3dgs_bwd)
+    compiled = SimpleNamespace(**{function.__name__: unseen(function) for function in functions})
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", SimpleNamespace(_C=compiled))  # type: ignore[arg-type]
+
+
+def intersect_tile(
+    means2d: Tensor, radii: Tensor, depths: Tensor, image_ids: None, gaussian_ids: None, images: int, tile_size: int,
+    tile_width: int, tile_height: int, sort: bool, segmented: bool,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Tiles of each Gaussian [1, N], ids (tile << 32 | bits of the depth) and indices of Gaussians, sorted by id."""
+    assert (image_ids, gaussian_ids, images, sort, segmented) == (None, None, 1, True, False)
+    assert radii.dtype == torch.int32
+    assert all(tensor.is_contiguous() for tensor in (means2d, radii, depths))
+    most = torch.tensor([tile_width, tile_height], dtype=torch.float32)
+    centre, reach = means2d[0] / tile_size, radii[0].float() / tile_size
+    low = torch.minimum(torch.floor(centre - reach).nan_to_num().clamp(min=0), most).long()
+    high = torch.minimum(torch.ceil(centre + reach).nan_to_num().clamp(min=0), most).long()
+    sides = torch.where((radii[0] > 0).all(1, keepdim=True), high - low, 0)
+    counts = sides.prod(1)
+    owner = torch.repeat_interleave(torch.arange(len(counts)), counts)
+    place = torch.arange(len(owner)) - (counts.cumsum(0) - counts)[owner]
+    row, column = low[owner, 1] + place // sides[owner, 0], low[owner, 0] + place % sides[owner, 0]
+    bits = depths[0].contiguous().view(torch.int32).long() & 0xFFFFFFFF
+    ids, order = torch.sort((row * tile_width + column) << 32 | bits[owner], stable=True)
+    return counts.to(torch.int32)[None], ids, owner[order].to(torch.int32)
+
+
+def intersect_offset(isect_ids: Tensor, images: int, tile_width: int, tile_height: int) -> Tensor:
     """Where each tile begins among the ids, [I, tile_height, tile_width]."""
-    assert n_images == 1
+    assert images == 1
     tiles = torch.arange(tile_width * tile_height)
     return torch.searchsorted(isect_ids >> 32, tiles).to(torch.int32).reshape(1, tile_height, tile_width)
 
 
-def rasterize_to_pixels(
-    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, image_width: int, image_height: int,
-    tile_size: int, isect_offsets: Tensor, flatten_ids: Tensor, backgrounds: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Colours [1, h, w, channels] and alphas [1, h, w, 1], differentiable."""
-    (_, n, _), channels = means2d.shape, colors.shape[-1]
-    assert conics.shape == (1, n, 3)
-    assert colors.shape == (1, n, channels)
-    assert opacities.shape == (1, n)
-    assert backgrounds is not None
-    assert backgrounds.shape == (1, channels)
-    assert isect_offsets.ndim == 3
-    rows, columns = isect_offsets.shape[-2:]
-    assert rows * tile_size >= image_height
-    assert columns * tile_size >= image_width
-    ends = torch.cat([isect_offsets.reshape(-1)[1:], torch.tensor([len(flatten_ids)])])
+def rasterize_to_pixels_3dgs_fwd(
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: Tensor, masks: None, width: int,
+    height: int, tile_size: int, isect_offsets: Tensor, flatten_ids: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """Colours [1, h, w, channels], alphas [1, h, w, 1] and, as gsplat does, the last Gaussian of each pixel."""
+    assert masks is None
+    with torch.no_grad():
+        colours, alphas = _drawn(
+            (means2d, conics, colors, opacities), backgrounds, (width, height), tile_size, isect_offsets, flatten_ids
+        )
+    return colours, alphas, torch.zeros(1, height, width, dtype=torch.int32)
+
+
+def rasterize_to_pixels_3dgs_bwd(
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: Tensor, masks: None, width: int,
+    height: int, tile_size: int, isect_offsets: Tensor, flatten_ids: Tensor, render_alphas: Tensor, last_ids: Tensor,
+    v_render_colors: Tensor, v_render_alphas: Tensor, absgrad: bool,
+) -> tuple[None, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Gradients by means, conics, colours and opacities; the first place is that of absolute ones."""
+    assert not absgrad
+    assert render_alphas.shape == (*last_ids.shape, 1) == (1, height, width, 1)
+    leaves = [tensor.detach().requires_grad_() for tensor in (means2d, conics, colors, opacities)]
+    with torch.enable_grad():
+        drawn = _drawn(leaves, backgrounds.detach(), (width, height), tile_size, isect_offsets, flatten_ids)
+    found = torch.autograd.grad(drawn, leaves, (v_render_colors, v_render_alphas), materialize_grads=True)
+    return None, *found
+
+
+def _drawn(
+    splats: Any, backgrounds: Tensor, size: tuple[int, int], side: int, isect_offsets: Tensor, flatten_ids: Tensor
+) -> tuple[Tensor, Tensor]:
+    (width, height), (rows, columns), channels = size, isect_offsets.shape[-2:], splats[2].shape[-1]
+    bounds = [*isect_offsets.reshape(-1).tolist(), len(flatten_ids)]
     tiles = []
-    for tile, (begin, end) in enumerate(zip(isect_offsets.reshape(-1), ends, strict=True)):
-        chosen = flatten_ids[int(begin) : int(end)].long()
-        origin = torch.tensor([tile % columns, tile // columns]) * tile_size
-        own = [tensor[0, chosen] for tensor in (means2d, conics, colors, opacities)]
-        tiles.append(_tile(*own, backgrounds[0], origin, tile_size))
-    whole = torch.stack(tiles).reshape(rows, columns, tile_size, tile_size, channels + 1)
-    picture = whole.permute(0, 2, 1, 3, 4).reshape(rows * tile_size, columns * tile_size, channels + 1)
-    picture = picture[None, :image_height, :image_width]
-    return picture[..., :channels], picture[..., channels:]
+    for tile in range(rows * columns):
+        chosen = flatten_ids[bounds[tile] : bounds[tile + 1]].long()
+        origin = torch.tensor([tile % columns, tile // columns]) * side
+        tiles.append(_tile(*(tensor[0, chosen] for tensor in splats), backgrounds[0], origin, side))
+    whole = torch.stack(tiles).reshape(rows, columns, side, side, channels + 1)
+    picture = whole.permute(0, 2, 1, 3, 4).reshape(rows * side, columns * side, channels + 1)[None, :height, :width]
+    return picture[..., :channels].contiguous(), picture[..., channels:].contiguous()
 
 
 def _tile(
     means: Tensor, conics: Tensor, colours: Tensor, opacities: Tensor, background: Tensor, origin: Tensor, side: int
 ) -> Tensor:
     """Colours and alpha of a tile, [side, side, channels + 1]."""
-    through = torch.ones(side, side)
-    painted = torch.zeros(side, side, colours.shape[1])
-    open_ = torch.ones(side, side, dtype=torch.bool)
     y, x = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
     pixels = torch.stack([x, y], dim=-1) + origin + 0.5
-    for mean, (a, b, c), colour, opacity in zip(means, conics, colours, opacities, strict=True):
-        dx, dy = (mean - pixels).unbind(-1)
-        sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-        alpha = (opacity * torch.exp(-sigma)).clamp(max=0.999)
-        alpha = torch.where((sigma < 0) | (alpha < 1 / 255), torch.zeros_like(alpha), alpha)
-        ends = through * (1 - alpha) <= 1e-4
-        open_ = open_ & ~(ends & (alpha > 0))
-        alpha = alpha * open_
-        painted = painted + (alpha * through)[..., None] * colour
-        through = through * (1 - alpha)
-    painted = painted + through[..., None] * background
-    return torch.cat([painted, 1 - through[..., None]], dim=-1)
+    dx, dy = (means[:, None, None] - pixels).unbind(-1)
+    a, b, c = (conics[:, i, None, None] for i in range(3))
+    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    alpha = (opacities[:, None, None] * torch.exp(-sigma)).clamp(max=0.999)
+    alpha = torch.where((sigma < 0) | (alpha < 1 / 255), torch.zeros_like(alpha), alpha)
+    with torch.no_grad():
+        stopped = torch.cumprod(1 - alpha, dim=0) <= 1e-4
+    alpha = alpha.masked_fill(stopped, 0.0)
+    before = torch.cat([torch.ones(1, side, side), torch.cumprod(1 - alpha, dim=0)])
+    through = before[-1][..., None]
+    painted = torch.einsum("nhw,nc->hwc", alpha * before[:-1], colours) + through * background
+    return torch.cat([painted, 1 - through], dim=-1)

@@ -7,16 +7,21 @@ of the backward pass included, is checked as a card would check it: all tensors 
 
 from __future__ import annotations
 
+import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
 from torch.utils._pytree import tree_flatten
+
+import vdgs
 
 CARD = torch.device("cuda")
 ATEN = torch.ops.aten
@@ -24,14 +29,28 @@ ATEN = torch.ops.aten
 CROSSING = {ATEN.copy_.default, ATEN._to_copy.default}
 #: From here on it is autograd that calls operations.
 BACKWARD = {torch.autograd.grad, torch.autograd.backward, Tensor.backward}
-#: Questions that Python asks of the card, each of which waits for it.
-WAITING = {ATEN._local_scalar_dense.default, ATEN.nonzero.default, ATEN._unique2.default}
+#: Operations that wait for the card, most of them to know how large their result is.
+WAITING = {
+    ATEN._local_scalar_dense.default, ATEN.nonzero.default, ATEN._unique2.default, ATEN.unique_dim.default,
+    ATEN.unique_consecutive.default, ATEN.masked_select.default, ATEN.bincount.default, ATEN.equal.default,
+    ATEN.is_nonzero.default, ATEN.repeat_interleave.Tensor,
+}  # fmt: skip
+#: These wait where they are given a mask in place of indices.
+INDEXING = {ATEN.index.Tensor, ATEN.index_put.default, ATEN.index_put_.default}
+#: How a tensor of the card comes from numbers of Python.
+FROM_NUMBERS = {torch.tensor, torch.as_tensor, torch.asarray}
+#: Of the package that is tested.
+PACKAGE = str(Path(vdgs.__file__).parent)
 
 
 class Memory:
     """Which memory is the card's. What it holds is kept, so that no address is given out twice."""
 
-    def __init__(self) -> None:
+    #: That of the pretended card, while there is one.
+    current: Memory | None = None
+
+    def __init__(self, waits: Counter[str]) -> None:
+        self.waits = waits
         self._held: dict[int, Any] = {}
         self._neutral: dict[int, Any] = {}
         #: Whether the operation that runs was called from Python, and not by autograd.
@@ -41,6 +60,15 @@ class Memory:
         storage = tensor.untyped_storage()
         self._held[storage._cdata] = storage
         return tensor
+
+    def wait(self, what: str) -> None:
+        """Count that what Python does waits for the card, by where it is written."""
+        frame = sys._getframe(1)
+        while frame.f_back is not None and not frame.f_code.co_filename.startswith(PACKAGE):
+            frame = frame.f_back
+        place = Path(frame.f_code.co_filename)
+        where = f"{place.relative_to(PACKAGE)}: {frame.f_code.co_name}" if place.is_relative_to(PACKAGE) else "a test"
+        self.waits[f"{where}: {what}"] += 1
 
     def mark_neutral(self, tensor: Tensor) -> None:
         """Autograd made it on the device of its gradients, which it takes for the CPU."""
@@ -61,9 +89,9 @@ def tensors_in(values: Any) -> list[Tensor]:
 class Checked(TorchDispatchMode):
     """Every operation: its tensors are on one device, and so is what comes of them."""
 
-    def __init__(self, memory: Memory, waits: Counter[str]) -> None:
+    def __init__(self, memory: Memory) -> None:
         super().__init__()
-        self.memory, self.waits = memory, waits
+        self.memory = memory
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         given = tensors_in((args, kwargs))
@@ -71,8 +99,9 @@ class Checked(TorchDispatchMode):
         elsewhere = [tensor for tensor in given if tensor.dim() and self.memory.is_elsewhere(tensor)]
         if there and elsewhere and func not in CROSSING:
             raise RuntimeError(f"{func}: tensors on cuda and of shape {list(elsewhere[0].shape)} on the CPU")
-        if there and func in WAITING:
-            self.waits[str(func)] += 1
+        masked = func in INDEXING and any(t.dtype in (torch.bool, torch.uint8) for t in tensors_in(args[1]))
+        if there and (func in WAITING or masked):
+            self.memory.wait("a mask as index" if masked else func.name().removeprefix("aten::"))
         made = func(*args, **(kwargs or {}))
         if there and func is not ATEN.copy_.default:
             for tensor in tensors_in(made):
@@ -108,8 +137,17 @@ class Told(TorchFunctionMode):
             return self._to(*args, **kwargs)
         if func is Tensor.new_tensor:
             made = torch.tensor(*args[1:], dtype=kwargs.get("dtype", args[0].dtype))
-            return self.memory.mark(made) if self.memory.holds(args[0]) else made
+            if not self.memory.holds(args[0]):
+                return made
+            self.memory.wait("new_tensor")
+            return self.memory.mark(made)
+        if func is Tensor.pin_memory:
+            return args[0]
+        if func is Tensor.tolist and self.memory.holds(args[0]):
+            self.memory.wait("tolist")
         device = kwargs.get("device")
+        if device is not None and torch.device(device).type == "cuda" and func in FROM_NUMBERS:
+            self.memory.wait(func.__name__)
         if device is not None and torch.device(device).type == "cuda":
             return self.memory.mark(func(*args, **kwargs | {"device": "cpu"}))
         return func(*args, **kwargs)
@@ -127,11 +165,13 @@ class Told(TorchFunctionMode):
         made = tensor if dtype is None else tensor.to(dtype)
         there = self.memory.holds(tensor) if device is None else torch.device(device).type == "cuda"
         if there != self.memory.holds(tensor):
-            return self._copied(made, CARD if there else None)
+            return self._copied(made, CARD if there else None, bool(named.get("non_blocking")))
         return self.memory.mark(made) if there else made
 
-    def _copied(self, tensor: Tensor, device: torch.device | None) -> Tensor:
+    def _copied(self, tensor: Tensor, device: torch.device | None, without_waiting: bool = False) -> Tensor:
         """A differentiable copy of a tensor on the card or, with None, in main memory."""
+        if device is None or not without_waiting:
+            self.memory.wait("to the card" if device else "to main memory")
         copy: Tensor = _Crossing.apply(tensor, self.memory, device is not None)
         return copy
 
@@ -140,7 +180,11 @@ class _Crossing(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, tensor: Tensor, memory: Memory, to_card: bool) -> Tensor:
         ctx.memory, ctx.to_card = memory, to_card
-        copy = torch.from_numpy(tensor.detach().numpy().copy()) if tensor.numel() else torch.empty_like(tensor)
+        copy = (
+            torch.from_numpy(tensor.detach().numpy().copy())
+            if tensor.numel()
+            else torch.empty(tensor.shape, dtype=tensor.dtype)
+        )
         return memory.mark(copy) if to_card else copy
 
     @staticmethod
@@ -151,7 +195,30 @@ class _Crossing(torch.autograd.Function):
 
 @contextmanager
 def pretended_card() -> Iterator[Counter[str]]:
-    """Inside, `cuda` is a device like any other. Gives how often Python waited for it, by operation."""
-    memory, waits = Memory(), Counter[str]()
-    with Told(memory), Checked(memory, waits):
-        yield waits
+    """Inside, `cuda` is a device like any other. Gives how often Python waited for it, by place and operation."""
+    waits = Counter[str]()
+    Memory.current = memory = Memory(waits)
+    try:
+        with Told(memory), Checked(memory):
+            yield waits
+    finally:
+        Memory.current = None
+
+
+def unseen(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that stands in for compiled code: how it computes is not looked at, what it makes is on the card."""
+
+    @wraps(function)
+    def run(*args: Any) -> Any:
+        memory = Memory.current
+        if memory is None:
+            return function(*args)
+        if any(memory.is_elsewhere(tensor) for tensor in tensors_in(args)):
+            raise RuntimeError(f"{function.__name__}: a tensor is not on cuda")
+        with torch._C.DisableTorchFunction(), _disable_current_modes():
+            made = function(*args)
+        for tensor in tensors_in(made):
+            memory.mark(tensor)
+        return made
+
+    return run

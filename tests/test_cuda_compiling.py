@@ -12,6 +12,7 @@ from cli_support import python_begun
 from vdgs.errors import VdgsError
 from vdgs.kernels.cuda import cache, launching, nvrtc
 from vdgs.kernels.cuda.nvrtc import CompileError, CudaUnavailable, Found, Nvrtc, Target
+from vdgs.kernels.cuda.resources import resources_of
 
 try:
     COMPILER: Nvrtc | None = nvrtc.nvrtc()
@@ -19,7 +20,6 @@ except CudaUnavailable:
     COMPILER = None
 needs_nvrtc = pytest.mark.skipif(COMPILER is None, reason="NVRTC is not installed: pip install nvidia-cuda-nvrtc")
 ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
-NATIVE = Path(__file__).parents[1] / "native"
 
 
 @pytest.fixture(autouse=True)
@@ -46,13 +46,37 @@ class StandIn:
         return 0
 
 
+#: By source: its shared headers and its kernels.
+SOURCES = {
+    "decode.cu": (("gaussian_math.h", "image_formation.h"), {"decode_anchors", "move_anchors"}),
+    "loss.cu": ((), {"photometric_forward", "photometric_backward", "photometric_total"}),
+    "rasterise.cu": (
+        ("image_formation.h",),
+        {"splat_tiles", "splat_entries", "rasterise_forward", "rasterise_backward", "gather_gradients"},
+    ),
+}
+
+
 @needs_nvrtc
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
-def test_the_loss_compiles_for_every_card(architecture):
-    code = launching.compile_source("loss.cu", Target(f"sm_{architecture}"))
+@pytest.mark.parametrize("source", SOURCES)
+def test_every_source_compiles_for_every_card_and_spills_nothing(source, architecture):
+    """Of 64 registers, four blocks of 256 threads fit on every card, of 128 two; of 16 KiB shared memory four."""
+    headers, kernels = SOURCES[source]
+    found = resources_of(source, Target(f"sm_{architecture}"), headers, COMPILER)
+    assert {each.kernel for each in found} == kernels
+    for each in found:
+        print(f"sm_{architecture} {each}")
+    assert all(each.spilled_bytes == 0 for each in found)
+    assert all(0 < each.registers <= (128 if each.kernel == "move_anchors" else 64) for each in found)
+    assert all(each.shared_bytes <= 16384 for each in found)
+
+
+@needs_nvrtc
+def test_compiled_code_names_its_kernels():
+    code = launching.compile_source("loss.cu", Target("sm_86"))
     assert code[:4] == b"\x7fELF"
-    for kernel in ("photometric_forward", "photometric_backward", "photometric_total"):
-        assert kernel.encode() in code
+    assert all(kernel.encode() in code for kernel in SOURCES["loss.cu"][1])
 
 
 @needs_nvrtc
@@ -66,7 +90,7 @@ def test_ptx_names_the_kernels():
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_the_mathematics_of_the_processor_compiles_for_every_card(architecture):
     """gaussian_math.h is written once for both: every function of it in one kernel."""
-    headers = {name: (NATIVE / name).read_text() for name in ("gaussian_math.h", "image_formation.h")}
+    headers = {name: launching.read_header(name) for name in ("gaussian_math.h", "image_formation.h")}
     code = COMPILER.compile("gaussian.cu", GAUSSIAN, headers, Target(f"sm_{architecture}"), launching.OPTIONS)
     assert b"there_and_back" in code
 
@@ -201,6 +225,9 @@ class TestCache:
     @needs_nvrtc
     def test_another_header_is_another_entry(self, monkeypatch):
         monkeypatch.setattr(launching, "read_source", lambda name: '#include "h.h"\n__device__ int f() { return N; }')
-        first = launching.compile_source("s.cu", Target("compute_80"), headers={"h.h": "#define N 1"})
-        second = launching.compile_source("s.cu", Target("compute_80"), headers={"h.h": "#define N 2"})
+        made = []
+        for text in ("#define N 1", "#define N 2"):
+            monkeypatch.setattr(launching, "read_header", lambda name, text=text: text)
+            made.append(launching.compile_source("s.cu", Target("compute_80"), headers=("h.h",)))
+        first, second = made
         assert first != second or len(list(cache.cache_folder().iterdir())) == 2

@@ -87,7 +87,7 @@ def test_no_barrier_is_missing(program, library):
     """The order in which the threads of a block take turns changes no bit."""
     image, target, mask = scene(40, 35, kept=0.8)
     result, gradient = on_host(program, image, target, mask)
-    turned = Program("loss.cu", driver=HostDriver(library, backwards=True))
+    turned = Program("loss.cu", driver=HostDriver(library, order=1))
     again, gradient_again = on_host(turned, image, target, mask)
     assert torch.equal(gradient, gradient_again)
     assert [float(value.detach()) for value in result] == [float(value.detach()) for value in again]
@@ -100,13 +100,13 @@ def test_a_missing_barrier_would_be_noticed(barrier, numbered):
     image, target, _ = scene(18, 17)
     left_out = ctypes.c_int.in_dll(numbered, "left_out")
 
-    def loss_and_gradient(left: int, turned: bool) -> tuple[float, bytes]:
+    def loss_and_gradient(left: int, order: int) -> tuple[float, bytes]:
         left_out.value = left
-        result, gradient = on_host(Program("loss.cu", driver=HostDriver(numbered, turned)), image, target)
+        result, gradient = on_host(Program("loss.cu", driver=HostDriver(numbered, order)), image, target)
         return float(result.loss.detach()), gradient.numpy().tobytes()
 
-    assert loss_and_gradient(barrier, False) != loss_and_gradient(barrier, True)
-    assert loss_and_gradient(-1, False) == loss_and_gradient(-1, True)
+    assert loss_and_gradient(barrier, 0) != loss_and_gradient(barrier, 1)
+    assert loss_and_gradient(-1, 0) == loss_and_gradient(-1, 1)
 
 
 @needs_a_compiler

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib import import_module
 from types import SimpleNamespace
 
 import pytest
@@ -11,43 +12,80 @@ import torch
 
 from vdgs.doctor import cuda as doctor_cuda
 from vdgs.errors import VdgsError
-from vdgs.kernels import cuda, devices, native, operations, reference
+from vdgs.kernels import composed, cuda, devices, gsplat, native, operations, reference
+from vdgs.kernels.composed import rasteriser
 from vdgs.kernels.cuda import driver
 from vdgs.kernels.cuda import nvrtc as nvrtc_module
 from vdgs.kernels.cuda.driver import Card, CudaUnavailable
 from vdgs.kernels.devices import Choice, DeviceUnavailable, choose
+from vdgs.kernels.gsplat.rasterise import GsplatUnavailable
 
 
 @pytest.fixture
-def _everything_on_cuda(monkeypatch: pytest.MonkeyPatch):
-    """As if every operation had a CUDA implementation, on a machine with two cards."""
+def _two_cards(monkeypatch: pytest.MonkeyPatch):
+    """As if this were a machine with two cards."""
     cards = [Card(index, "Card", 8 * 10**9, (8, 6)) for index in (0, 1)]
-    monkeypatch.setattr(devices, "missing_on_cuda", lambda: ())
     monkeypatch.setattr(driver, "cuda_driver", lambda: SimpleNamespace(cards=lambda: cards))
     monkeypatch.setattr(nvrtc_module, "nvrtc", lambda: None)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
 
 
-def test_the_list_of_operations_is_what_there_is():
+def test_the_sets_are_complete():
     assert operations.OPERATIONS == tuple(sorted(native.__all__)) == tuple(sorted(reference.__all__))
-    assert tuple(sorted(cuda.__all__)) == operations.CUDA_OPERATIONS
-    assert set(operations.missing_on_cuda()) == set(native.__all__) - set(cuda.__all__)
+    assert operations.OPERATIONS == tuple(sorted(composed.__all__)) == tuple(sorted(operations.ON_A_CARD))
 
 
-def test_today_the_processor_does_everything():
-    assert choose("auto") == Choice("cpu", "1 of 17 operations run on GPUs so far")
-    assert choose("cpu").device == "cpu"
+@pytest.mark.parametrize("operation", operations.OPERATIONS)
+def test_the_table_says_who_does_what(operation):
+    """Each operation of the composed set is the one that the table names; where it names two, both have it."""
+    ways = [import_module(f"vdgs.kernels.{way}") for way in operations.taken(operation, "cuda")]
+    found = getattr(composed, operation)
+    assert all(hasattr(way, operation) for way in ways)
+    if len(ways) == 1:
+        assert found is getattr(ways[0], operation)
+    else:
+        assert found.__module__ == "vdgs.kernels.composed.rasteriser"
+    assert operations.taken(operation, "cpu") == ("native",)
+    assert operations.taken(operation, "mps") == ("reference",)
+
+
+class TestWhichRasteriserDraws:
+    @pytest.fixture(autouse=True)
+    def _asked_anew(self):
+        rasteriser.chosen.cache_clear()
+        yield
+        rasteriser.chosen.cache_clear()
+
+    def test_gsplat_where_it_can_be_used_but_not_for_depth(self, monkeypatch):
+        monkeypatch.delenv(rasteriser.VARIABLE, raising=False)
+        monkeypatch.setattr(rasteriser, "load", lambda: None)
+        assert rasteriser._drawing(depth=False) is gsplat
+        assert rasteriser._drawing(depth=True) is cuda
+
+    def test_the_own_kernels_elsewhere(self, monkeypatch):
+        def none() -> None:
+            raise GsplatUnavailable("gsplat is not here")
+
+        monkeypatch.setattr(rasteriser, "load", none)
+        assert rasteriser.chosen("") is rasteriser.chosen("cuda") is cuda
+        with pytest.raises(GsplatUnavailable, match="not here"):
+            rasteriser.chosen("gsplat")
+
+    def test_another_word_is_refused(self):
+        with pytest.raises(VdgsError, match="VDGS_RASTERISER must be gsplat, cuda or not set"):
+            rasteriser.chosen("native")
+
+
+def test_auto_takes_the_processor_until_a_card_has_run_it():
+    assert choose("auto") == Choice("cpu", "vdgs has not been run on a GPU yet; --device cuda asks for the card")
     assert choose("cpu") == Choice("cpu", "as asked for")
 
 
 @pytest.mark.parametrize("asked", ["cuda", "cuda:1"])
-def test_a_card_is_refused_with_what_is_missing(asked):
-    with pytest.raises(
-        DeviceUnavailable, match=rf"--device {asked}: .*photometric_loss is there; .*rasterise"
-    ) as raised:
+def test_a_card_that_cannot_be_used_is_refused(asked, monkeypatch):
+    monkeypatch.setattr(devices, "_no_card", lambda index: f"there is no card {index}")
+    with pytest.raises(DeviceUnavailable, match=rf"--device {asked}: there is no card \d\. Use --device cpu"):
         choose(asked)
-    assert "--device cpu" in str(raised.value)
-    assert all(name in str(raised.value) for name in operations.missing_on_cuda())
 
 
 @pytest.mark.parametrize("asked", ["gpu", "cuda:", "cuda:x", "CPU", "", "cuda:0 "])
@@ -56,11 +94,16 @@ def test_other_words_are_refused(asked):
         choose(asked)
 
 
-@pytest.mark.usefixtures("_everything_on_cuda")
-class TestOnceEverythingIsThere:
-    def test_auto_takes_the_first_card(self):
-        assert choose("auto") == Choice("cuda:0", "every operation runs on it")
+@pytest.mark.usefixtures("_two_cards")
+class TestWithCards:
+    def test_the_card_that_is_asked_for(self):
+        assert choose("cuda") == Choice("cuda:0", "as asked for")
         assert choose("cuda:1").device == "cuda:1"
+        assert choose("auto").device == "cpu"
+
+    def test_auto_takes_the_first_card_once_one_has_run_it(self, monkeypatch):
+        monkeypatch.setattr(devices, "RUN_ON_A_CARD", True)
+        assert choose("auto") == Choice("cuda:0", "there is a card that can be used")
 
     def test_a_card_that_is_not_there(self):
         with pytest.raises(DeviceUnavailable, match="no card 2; the driver knows 2"):
@@ -71,13 +114,15 @@ class TestOnceEverythingIsThere:
             raise CudaUnavailable("There is no NVIDIA driver here")
 
         monkeypatch.setattr(driver, "cuda_driver", none)
+        monkeypatch.setattr(devices, "RUN_ON_A_CARD", True)
         assert choose("auto") == Choice("cpu", "There is no NVIDIA driver here")
         with pytest.raises(DeviceUnavailable, match="no NVIDIA driver here"):
             choose("cuda")
 
     def test_a_torch_without_cuda(self, monkeypatch):
         monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-        assert "this torch" in choose("auto").why
+        with pytest.raises(DeviceUnavailable, match="this torch"):
+            choose("cuda")
 
 
 def test_deciding_needs_no_torch():
@@ -130,9 +175,13 @@ def test_doctor_says_what_there_is(monkeypatch: pytest.MonkeyPatch, tmp_path):
     lines = {check.name: check for check in doctor_cuda.looks()}
     assert lines["CUDA card 0"].value == "A card, 24.0 GB, compute capability 8.6; driver for CUDA 12.8"
     assert lines["NVRTC"].value == "13.0, from the wheel nvidia-cuda-nvrtc: /somewhere/libnvrtc.so.13"
-    assert lines["CUDA kernels"].value.startswith("1 of 17 operations: photometric_loss; compiled code in")
+    assert lines["CUDA kernels"].value.startswith("compiled code in")
     assert lines["CUDA kernels"].value.endswith("1 entries")
-    assert lines["--device auto"].value.startswith("cpu: 1 of 17 operations")
+    assert lines["on cpu: native"].value == "all 17 operations"
+    assert lines["on cuda: cuda"].value == "decode, decode_backward_adam, photometric_loss"
+    assert lines["on cuda: gsplat or cuda"].value == "rasterise, rasterise_vjp"
+    assert "adam_rows" in lines["on cuda: reference"].value
+    assert lines["--device auto"].value.startswith("cpu: vdgs has not been run on a GPU")
     assert all(check.works for check in lines.values())
 
 

@@ -1,8 +1,9 @@
-"""gsplat behind the own operation. gsplat needs a GPU: what it is asked is tried on a stand-in (gsplat_stand_in.py)."""
+"""gsplat behind the own operations: its own Python, with a stand-in for what it compiles (gsplat_stand_in.py)."""
 
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,9 +12,11 @@ import gsplat_stand_in
 from rasterise_scenes import make_scene, splats_of
 from test_rasterise import assert_close, loss_of, smooth
 from vdgs.errors import VdgsError
-from vdgs.kernels.gsplat import rasterise
-from vdgs.kernels.gsplat.rasterise import GsplatUnavailable, reach_px
+from vdgs.kernels.gsplat import rasterise, rasterise_vjp
+from vdgs.kernels.gsplat.rasterise import GsplatUnavailable, load, reach_px
 from vdgs.kernels.reference.rasterise import rasterise as reference
+from vdgs.kernels.reference.rasterise import rasterise_vjp as reference_vjp
+from vdgs.kernels.types import Splats
 
 SCENES = {
     "ordinary": make_scene(120, 37, 29),
@@ -27,10 +30,17 @@ SCENES = {
 }
 
 
+@pytest.fixture
+def _compiled(monkeypatch: pytest.MonkeyPatch):
+    gsplat_stand_in.install(monkeypatch)
+
+
+@gsplat_stand_in.needs_gsplat
+@pytest.mark.usefixtures("_compiled")
 @pytest.mark.parametrize("name", SCENES)
 def test_it_draws_and_differentiates_what_the_reference_does(name):
     scene = SCENES[name]
-    ours = rasterise(*splats_of(scene.tensors), scene.width, scene.height, depth=True, engine=gsplat_stand_in)
+    ours = rasterise(*splats_of(scene.tensors), scene.width, scene.height, depth=True)
     exact_scene = scene.to(torch.float64)
     exact = reference(*splats_of(exact_scene.tensors), scene.width, scene.height, depth=True)
     for actual, expected in zip(smooth(ours), smooth(exact), strict=True):
@@ -43,11 +53,41 @@ def test_it_draws_and_differentiates_what_the_reference_does(name):
         assert_close(actual, expected, 1e-3)
 
 
-def test_without_depth_there_is_none():
-    scene = SCENES["ordinary"]
-    raster = rasterise(*splats_of(scene.tensors), scene.width, scene.height, engine=gsplat_stand_in)
-    assert raster.depth is None
-    assert raster.image.shape == (29, 37, 3)
+@gsplat_stand_in.needs_gsplat
+@pytest.mark.usefixtures("_compiled")
+def test_the_way_back_gives_what_training_asks_for():
+    """Gradients of the means in pixels and of the conics go where they are wanted; a picture without depth has none."""
+    scene, exact = SCENES["ordinary"], SCENES["ordinary"].to(torch.float64)
+    raster, pullback = rasterise_vjp(*splats_of(scene.tensors), scene.width, scene.height)
+    _, exactly = reference_vjp(*splats_of(exact.tensors), scene.width, scene.height)
+    assert (raster.depth, raster.median_depth) == (None, None)
+    assert not raster.image.requires_grad
+    g = torch.Generator().manual_seed(3)
+    by_image, by_alpha = torch.randn(29, 37, 3, generator=g), torch.randn(29, 37, generator=g)
+    room = torch.zeros(len(scene.tensors[0]), 2), torch.zeros(len(scene.tensors[0]), 3)
+    found = pullback(by_image, by_alpha, over=room)
+    assert found.means_px is room[0]
+    assert found.conics is room[1]
+    assert found.depths is None
+    for name, expected in exactly(by_image.double(), by_alpha.double())._asdict().items():
+        if expected is not None:
+            assert_close(getattr(found, name), expected, 1e-4)
+
+
+@pytest.mark.parametrize(
+    ("tensor", "error"), [(torch.zeros(5, 3), ValueError), (torch.zeros(5, 2).double(), TypeError)]
+)
+def test_unsuitable_tensors_are_refused(tensor, error):
+    splats = Splats(tensor, torch.zeros(5, 3), torch.zeros(5), torch.zeros(5, 3), torch.zeros(5))
+    with pytest.raises(error, match="means_px"):
+        rasterise(splats, torch.zeros(3), 10, 10, engine=SimpleNamespace())
+
+
+def test_without_compiled_kernels_the_error_says_so(monkeypatch: pytest.MonkeyPatch):
+    for name in ("gsplat", "gsplat.cuda._backend"):
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(_C=None))  # type: ignore[arg-type]
+    with pytest.raises(GsplatUnavailable, match="no CUDA toolkit"):
+        load()
 
 
 @pytest.mark.parametrize("column", range(5))

@@ -7,12 +7,12 @@ from vdgs.kernels.cuda.cache import VARIABLE, cache_folder
 from vdgs.kernels.cuda.driver import CudaDriver, cuda_driver
 from vdgs.kernels.cuda.nvrtc import CudaUnavailable, Nvrtc, nvrtc
 from vdgs.kernels.devices import choose
-from vdgs.kernels.operations import CUDA_OPERATIONS, OPERATIONS
+from vdgs.kernels.operations import OPERATIONS, taken
 
 
 def looks() -> list[Check]:
     """Every line about CUDA. None is essential: the processor does everything."""
-    return [*_cards(), _compiler(), _kernels(), _device()]
+    return [*_cards(), _compiler(), _kernels(), *_operations(), _device()]
 
 
 def _cards() -> list[Check]:
@@ -44,11 +44,16 @@ def _compiler() -> Check:
 def _kernels() -> Check:
     folder = cache_folder()
     kept = len(list(folder.glob("*.bin"))) if folder.is_dir() else 0
-    return Check(
-        "CUDA kernels", "note",
-        f"{len(CUDA_OPERATIONS)} of {len(OPERATIONS)} operations: {', '.join(CUDA_OPERATIONS)}; compiled code in "
-        f"{folder} ({VARIABLE}), {kept} entries",
-    )  # fmt: skip
+    return Check("CUDA kernels", "note", f"compiled code in {folder} ({VARIABLE}), {kept} entries")
+
+
+def _operations() -> list[Check]:
+    """Who does which operation: a line for each way."""
+    ways: dict[tuple[str, ...], list[str]] = {}
+    for name in OPERATIONS:
+        ways.setdefault(taken(name, "cuda"), []).append(name)
+    by_card = [Check(f"on cuda: {' or '.join(way)}", "note", ", ".join(names)) for way, names in ways.items()]
+    return [Check("on cpu: native", "note", f"all {len(OPERATIONS)} operations"), *by_card]
 
 
 def _device() -> Check:

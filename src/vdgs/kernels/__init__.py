@@ -1,8 +1,9 @@
 """The numerical operations, in interchangeable implementations, behind one door: `choose(device)`.
 
 `native` is C++ for the CPU, `reference` readable torch for any device (and the oracle of the tests). `Operations` in
-`operations.py` is the typed set that both offer; "d" marks those that torch can differentiate. `cuda` is for NVIDIA
-GPUs and has some of them so far. Code outside this folder names no implementation.
+`operations.py` is the typed set that both offer; "d" marks those that torch can differentiate. `composed` is the set
+for NVIDIA GPUs, of `reference`, own kernels (`cuda`) and `gsplat`; a table in `operations.py` says which is which.
+Code outside this folder names no implementation.
 
 Names and dimensions, fixed once for all files in this folder:
 
@@ -40,13 +41,13 @@ if TYPE_CHECKING:
 
     from vdgs.kernels.operations import Operations
 
-#: Environment variable that takes another implementation than the device's own: `reference`, for tests and doubts.
+#: Environment variable that takes another set than the device's own: `reference` or `composed`, for tests and doubts.
 VARIABLE = "VDGS_KERNELS"
 
 
 def choose(device: torch.device) -> Operations:
-    """The operations for tensors on `device`: C++ on the CPU, torch elsewhere; torch everywhere if VDGS_KERNELS is
-    `reference`.
+    """The operations for tensors on `device`: C++ on the CPU, the composed set on NVIDIA GPUs, torch elsewhere; on any
+    device those that VDGS_KERNELS names, if it does.
 
     Raises VdgsError for another value of that variable.
     """
@@ -55,14 +56,18 @@ def choose(device: torch.device) -> Operations:
 
 @cache
 def _implementation(device_type: str, wanted: str) -> Operations:
-    if wanted not in ("", "native", "reference"):
+    if wanted not in ("", "native", "reference", "composed"):
         from vdgs.errors import VdgsError
 
-        raise VdgsError(f"{VARIABLE} must be native, reference or not set, not {wanted!r}.")
-    if device_type != "cpu" or wanted == "reference":
+        raise VdgsError(f"{VARIABLE} must be native, reference, composed or not set, not {wanted!r}.")
+    if wanted == "reference" or (wanted != "composed" and device_type not in ("cpu", "cuda")):
         from vdgs.kernels import reference
 
         return reference
+    if wanted == "composed" or device_type == "cuda":
+        from vdgs.kernels import composed
+
+        return composed
     from vdgs.kernels import native
 
     return native

@@ -1,6 +1,6 @@
 """Constants of the image formation model, shared by every implementation.
 
-They are repeated in native/image_formation.h; a test holds the two against each other.
+They are repeated in kernels/shared/image_formation.h; a test holds the two against each other.
 """
 
 #: A splat contributes to a pixel where its alpha is at least this.

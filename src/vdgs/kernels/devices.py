@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass
 
 from vdgs.errors import VdgsError
-from vdgs.kernels.operations import CUDA_OPERATIONS, OPERATIONS, missing_on_cuda
+from vdgs.kernels.operations import RUN_ON_A_CARD
 
 
 class DeviceUnavailable(VdgsError):
@@ -27,28 +27,22 @@ class Choice:
 def choose(asked: str) -> Choice:
     """The device to use for `auto`, `cpu`, `cuda` or `cuda:i`.
 
-    `auto` takes a card only where every operation runs on it. Raises DeviceUnavailable for a card that is not there
-    or on which operations are missing, VdgsError for another word.
+    `auto` takes a card only once everything has been run on one. Raises DeviceUnavailable for a card that is not there
+    or cannot be used, VdgsError for another word.
     """
     named = re.fullmatch(r"auto|cpu|cuda(?::(\d+))?", asked)
     if named is None:
         raise VdgsError(f"--device {asked}: choose auto, cpu, cuda or cuda:0 (the number is that of the card)")
     if asked == "cpu":
         return Choice("cpu", "as asked for")
+    if asked == "auto" and not RUN_ON_A_CARD:
+        return Choice("cpu", "vdgs has not been run on a GPU yet; --device cuda asks for the card")
     index = int(named.group(1) or 0)
-    missing = missing_on_cuda()
-    reason = (
-        f"{len(CUDA_OPERATIONS)} of {len(OPERATIONS)} operations run on GPUs so far" if missing else _no_card(index)
-    )
+    reason = _no_card(index)
     if not reason:
-        return Choice(f"cuda:{index}", "every operation runs on it")
+        return Choice(f"cuda:{index}", "as asked for" if asked != "auto" else "there is a card that can be used")
     if asked == "auto":
         return Choice("cpu", reason)
-    if missing:
-        reason = (
-            "vdgs cannot train, draw or measure on GPUs yet. Of its operations, "
-            f"{', '.join(CUDA_OPERATIONS)} is there; {', '.join(missing)} are not"
-        )
     raise DeviceUnavailable(f"--device {asked}: {reason}. Use --device cpu, which does everything, or leave it out.")
 
 
@@ -61,7 +55,7 @@ def _no_card(index: int) -> str:
         count = len(cuda_driver().cards())
         nvrtc()
     except CudaUnavailable as error:
-        return str(error)
+        return str(error).rstrip(".")
     import torch
 
     if not torch.cuda.is_available():

@@ -1,4 +1,4 @@
-"""The typed set of operations that every implementation offers, and which of them have a CUDA kernel.
+"""The typed set of operations that every implementation offers, and who does which on which device.
 
 What each does is said where it is written most readably: in `vdgs.kernels.reference`. Names and dimensions as in
 `vdgs.kernels`.
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         AdamState,
         AnchorSplats,
         DecoderWeights,
+        Finite,
         Photometric,
         Projected,
         Raster,
@@ -52,7 +53,7 @@ class Operations(Protocol):
         rows: Tensor,
         gradients: SplatGradients,
         updates: Tensor,
-    ) -> tuple[bool, tuple[Tensor, ...] | None]: ...
+    ) -> tuple[Finite, tuple[Tensor, ...] | None]: ...
 
     def project(self, means: Tensor, scales: Tensor, quaternions: Tensor, camera: Camera) -> Projected: ...
 
@@ -71,7 +72,7 @@ class Operations(Protocol):
     def adam_rows(
         self, state: AdamState, rows: Tensor | None, gradient: Tensor, step: int | Tensor, *, beta1: float = 0.9,
         beta2: float = 0.999, epsilon: float = 1e-15,
-    ) -> bool: ...  # fmt: skip
+    ) -> Finite: ...  # fmt: skip
 
     def add_view_statistics(
         self,
@@ -105,10 +106,21 @@ class Operations(Protocol):
 #: The names of the operations.
 OPERATIONS = tuple(sorted(name for name in vars(Operations) if not name.startswith("_")))
 
-#: Those that `vdgs.kernels.cuda` has.
-CUDA_OPERATIONS = ("photometric_loss",)
+#: By which implementation (a folder of `vdgs.kernels`) each operation is done on an NVIDIA card: torch's own arithmetic
+#: (`reference`), own kernels (`cuda`) or gsplat's. Of several the first that can be used; gsplat cannot tell median
+#: depth, so that pictures with depth are always drawn by the own kernels.
+ON_A_CARD: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATIONS, ("reference",)) | {
+    "decode": ("cuda",),
+    "decode_backward_adam": ("cuda",),
+    "photometric_loss": ("cuda",),
+    "rasterise": ("gsplat", "cuda"),
+    "rasterise_vjp": ("gsplat", "cuda"),
+}
+
+#: Whether all that has been run on a card. Until it is, `--device auto` takes the processor.
+RUN_ON_A_CARD = False
 
 
-def missing_on_cuda() -> tuple[str, ...]:
-    """The operations without a CUDA implementation."""
-    return tuple(name for name in OPERATIONS if name not in CUDA_OPERATIONS)
+def taken(operation: str, device_type: str) -> tuple[str, ...]:
+    """The implementations of an operation on a kind of device, the preferred one first."""
+    return ("native",) if device_type == "cpu" else ON_A_CARD[operation] if device_type == "cuda" else ("reference",)

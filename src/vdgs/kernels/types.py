@@ -13,6 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
+#: Whether all was finite: a bool, or on a card, which nobody has asked yet, a tensor that holds one.
+Finite = bool | Bool[Tensor, ""]
+
 #: Numbers in an anchor's feature, and units in the hidden layer of every head.
 FEATURE_SIZE = 32
 HIDDEN_SIZE = 32

@@ -16,8 +16,8 @@ from vdgs.inspection.starting import refuse_unworkable
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.ground import solid_cells_of_all
 from vdgs.model.exposure import neutral_exposures
+from vdgs.model.ground import solid_cells_of_all
 from vdgs.model.sizes import largest_log_scales
 from vdgs.model.start import initial_anchors
 from vdgs.runs.flight import keep_flight

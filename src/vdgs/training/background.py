@@ -23,10 +23,10 @@ def mean_colour(images: TrainingImages, count: int, downscale: int, at_most: int
 
 def background_at(stage: Stage, iteration: int) -> Tensor:
     """Colour [3] behind the scene at this iteration (from 0)."""
-    colour = torch.tensor(stage.background, device=stage.device)
+    colour = torch.tensor(stage.background)
     noise = stage.config.loss.background_noise * (1 - iteration / stage.config.iterations)
-    if noise == 0:
-        return colour
-    generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)
-    # Drawn on the CPU: the same colours for any device.
-    return colour + noise * (2 * torch.rand(3, generator=generator).to(stage.device) - 1)
+    if noise:
+        generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)
+        # Drawn on the CPU: the same colours for any device.
+        colour = colour + noise * (2 * torch.rand(3, generator=generator) - 1)
+    return colour.to(stage.device, non_blocking=True)

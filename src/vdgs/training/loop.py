@@ -62,7 +62,8 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     volume_weight, loss = _volume_weight(stage), compared.loss
     if volume_weight and len(drawn.source):
         loss = loss + volume_weight * drawn.volume
-    value = float(loss)
+    # Read at once: on a card, each number that is asked for waits for everything before it.
+    value, l1, ssim = torch.stack([loss, compared.l1, compared.ssim]).tolist()
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
     gradients = drawn.backward(compared.image, compared.alpha, volume_weight, compared.depth)
@@ -79,7 +80,7 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
             state.statistics, rows, inside, drawn.source, drawn.opacities, gradients.means_px, *camera.whole_size
         )
     state.iteration += 1
-    report = StepReport(value, float(compared.l1), float(compared.ssim), len(rows), len(drawn.source))
+    report = StepReport(value, l1, ssim, len(rows), len(drawn.source))
     if growing and state.iteration >= config.growth.start and state.iteration % config.growth.interval == 0:
         report = replace(report, **grow(state, stage))
     if state.iteration % REORDER_INTERVAL == 0:
@@ -138,7 +139,7 @@ def _move(
     if dense:
         coast_anchors(state.anchors, rows, states, step, stage.mobility)
         updates.fill_(step)
-    finite &= state.optimiser.update_decoder(state.decoder, rates, step)
+    finite = state.optimiser.update_decoder(state.decoder, rates, step) & finite
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")
 

@@ -9,7 +9,7 @@ from jaxtyping import Int32
 from torch import Tensor
 
 from vdgs.kernels import choose
-from vdgs.kernels.types import AdamState
+from vdgs.kernels.types import AdamState, Finite
 from vdgs.model.anchors import TRAINED, Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.settings.method import RateConfig
@@ -54,17 +54,17 @@ class Optimiser:
             for name in TRAINED
         ]
 
-    def update_decoder(self, decoder: Decoder, rates: dict[str, float], step: int) -> bool:
+    def update_decoder(self, decoder: Decoder, rates: dict[str, float], step: int) -> Finite:
         """Move the decoder's tensors by their `.grad`, in place; `step` counts from 1.
 
         False: a gradient is not finite.
         """
-        finite = True
+        finite: Finite = True
         for name, tensor in decoder.tensors().items():
             if tensor.grad is not None:
                 moments = self.decoder.first[name], self.decoder.second[name]
                 state = AdamState(tensor.detach(), *moments, rates[name.split("_")[0]])
-                finite &= choose(tensor.device).adam_rows(state, None, tensor.grad, step)
+                finite = choose(tensor.device).adam_rows(state, None, tensor.grad, step) & finite
                 tensor.grad = None
         return finite
 

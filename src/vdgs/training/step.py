@@ -16,7 +16,7 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels import choose
-from vdgs.kernels.types import AdamState, AnchorSplats, DecoderWeights, RasterPullback, SplatGradients, Splats
+from vdgs.kernels.types import AdamState, AnchorSplats, DecoderWeights, Finite, RasterPullback, SplatGradients, Splats
 from vdgs.model.anchors import TRAINED, Anchors
 from vdgs.model.render import joined
 
@@ -87,7 +87,7 @@ def move_anchors(
     states: Sequence[AdamState],
     updates: Int32[Tensor, " n"],
     mobility: Callable[[Tensor], Tensor] | None = None,
-) -> bool:
+) -> Finite:
     """Move the anchors of the given rows in place, and leave the decoder's gradients in its `.grad`.
 
     `weights` are the decoder's as the view saw them, `states` those of `TRAINED`; `updates` counts how often each
@@ -145,7 +145,7 @@ class _SlowAnchors:
     @staticmethod
     def of(anchors: Anchors, rows: Tensor, mobility: Callable[[Tensor], Tensor]) -> _SlowAnchors:
         share = mobility(anchors.positions[rows])
-        slow = share < 1
+        slow = (share < 1).nonzero()[:, 0]
         return _SlowAnchors(rows[slow], share[slow], anchors.select(rows[slow]))
 
     def hold_back(self, anchors: Anchors) -> None:

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from vdgs.cameras import Camera
+from vdgs.kernels.moving import upload
 from vdgs.model.ground import at_size
 from vdgs.training.crops import WHOLE, crop_at
 from vdgs.training.depths import PixelDepths
@@ -31,6 +32,8 @@ class Target:
     #: over the part become those of a mean over the whole picture, in which thresholds of growth are given (but for
     #: SSIM within its window of the part's border, where it sees nothing beyond).
     share: float = 1.0
+    #: How many pixels count, at least 1; None: asked of the mask.
+    counted: int | None = None
     #: Pixels with the depth of sparse points, and how seldom each pixel's place is seen; None: of depth nothing is
     #: asked.
     depths: PixelDepths | None = None
@@ -46,7 +49,7 @@ class Target:
         what is far from it (choice; docs/findings.md).
         """
         assert self.ground is not None
-        counted = alpha.numel() if self.mask is None else max(int(self.mask.count_nonzero()), 1)
+        counted = self.counted or max(counted_in(self.mask, self.camera), 1)
         root = (1.0 - alpha).clamp(min=0.0).add(NEARLY_OPAQUE).sqrt()
         shown = self.ground.to(alpha.dtype) * (weight / counted)
         return (shown * (root - NEARLY_OPAQUE**0.5)).sum(), shown / (-2.0 * root)
@@ -55,36 +58,43 @@ class Target:
 def target_at(stage: Stage, view: int, downscale: int, iteration: int) -> Target:
     """What iteration (from 0) is to draw of a view, on the stage's device."""
     image, mask = stage.images.get(view, downscale)
-    image, mask = image.to(stage.device), None if mask is None else mask.to(stage.device)
-    camera = stage.images.camera(view, downscale)
-    ground, seldom = _ground(stage, view, mask, camera), _seldom(stage, view, camera)
-    crop = crop_at(stage.crops, view, iteration)
-    if crop == WHOLE:
-        return Target(image, mask, ground, camera, depths=_depths(stage, view, mask, camera), seldom=seldom)
-    left, top, right, bottom = crop.pixels(camera.width, camera.height)
-    inside = (slice(top, bottom), slice(left, right))
-    part = camera.cropped(left, top, right, bottom)
-    ground, seldom = (None if each is None else each[inside] for each in (ground, seldom))
-    kept = None if mask is None else mask[inside]
-    if mask is None or kept is None:
-        share = part.width * part.height / (camera.width * camera.height)
-    else:
-        share = int(kept.count_nonzero()) / max(int(mask.count_nonzero()), 1)
-    return Target(image[inside], kept, ground, part, share, _depths(stage, view, kept, part), seldom)
+    camera = whole = stage.images.camera(view, downscale)
+    crop, inside = crop_at(stage.crops, view, iteration), (slice(None), slice(None))
+    # Counted and cut where the photograph is, before it is brought to the device.
+    of_whole = counted_in(mask, whole)
+    if crop != WHOLE:
+        left, top, right, bottom = crop.pixels(whole.width, whole.height)
+        inside, camera = (slice(top, bottom), slice(left, right)), whole.cropped(left, top, right, bottom)
+    mask = None if mask is None else mask[inside]
+    counted = of_whole if crop == WHOLE else counted_in(mask, camera)
+    image = upload(image[inside], stage.device)
+    mask = None if mask is None else upload(mask, stage.device)
+    return Target(
+        image, mask, _ground(stage, view, mask, inside, whole), camera,
+        share=counted / max(of_whole, 1) if crop != WHOLE else 1.0, counted=max(counted, 1),
+        depths=_depths(stage, view, mask, camera), seldom=_seldom(stage, view, inside, whole),
+    )  # fmt: skip
 
 
-def _ground(stage: Stage, view: int, mask: Tensor | None, camera: Camera) -> Bool[Tensor, "h w"] | None:
+def counted_in(mask: UInt8[Tensor, "h w"] | None, camera: Camera) -> int:
+    """How many pixels of a picture count."""
+    return camera.width * camera.height if mask is None else int(mask.count_nonzero())
+
+
+def _ground(
+    stage: Stage, view: int, mask: Tensor | None, inside: tuple[slice, slice], whole: Camera
+) -> Bool[Tensor, "h w"] | None:
     if stage.ground is None or not stage.config.loss.alpha_weight:
         return None
-    ground = at_size(stage.ground[view], camera.width, camera.height)
+    ground = at_size(stage.ground[view], whole.width, whole.height)[inside]
     return ground if mask is None else ground & (mask > 0)
 
 
-def _seldom(stage: Stage, view: int, camera: Camera) -> Float[Tensor, "h w"] | None:
+def _seldom(stage: Stage, view: int, inside: tuple[slice, slice], whole: Camera) -> Float[Tensor, "h w"] | None:
     """How seldom each pixel's place is seen, where depth is asked to be smooth."""
     if stage.seldom_cells is None:
         return None
-    return at_size(stage.seldom_cells[view], camera.width, camera.height)
+    return at_size(stage.seldom_cells[view], whole.width, whole.height)[inside]
 
 
 def _depths(stage: Stage, view: int, mask: Tensor | None, camera: Camera) -> PixelDepths | None:

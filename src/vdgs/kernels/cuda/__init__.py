@@ -1,8 +1,11 @@
-"""CUDA implementations: compiled when first used, by NVRTC, for the card at hand (docs/cuda.md).
+"""Own CUDA kernels: compiled when first used, by NVRTC, for the card at hand (docs/cuda.md).
 
-Not all operations of `vdgs.kernels` are here yet: `vdgs.kernels.operations` names those that are.
+Not all operations of `vdgs.kernels` are here: `vdgs.kernels.composed` adds what a card needs besides.
 """
 
+from vdgs.kernels.cuda.decode import decode
+from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.loss import photometric_loss
+from vdgs.kernels.cuda.rasterise import rasterise, rasterise_vjp
 
-__all__ = ["photometric_loss"]
+__all__ = ["decode", "decode_backward_adam", "photometric_loss", "rasterise", "rasterise_vjp"]

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -20,8 +21,8 @@ OPTIONS = ("--std=c++17",)
 MOST_BLOCKS: Grid = (2**31 - 1, 65535, 65535)
 MOST_THREADS = 1024
 
-#: What a kernel may be given: a tensor (its data pointer), nothing (a null pointer), or a ctypes number.
-Argument = Tensor | ctypes._SimpleCData | None
+#: What a kernel may be given: a tensor (its data pointer), nothing (a null pointer), a ctypes number or a structure.
+Argument = Tensor | ctypes._SimpleCData | ctypes.Structure | None
 
 
 def read_source(name: str) -> str:
@@ -29,15 +30,21 @@ def read_source(name: str) -> str:
     return resources.files(__package__).joinpath("source", name).read_text(encoding="utf-8")
 
 
-def compile_source(
-    name: str, target: Target, *, headers: Mapping[str, str] | None = None, compiler: Nvrtc | None = None
-) -> bytes:
-    """A source of this package, compiled, from the cache if it is there. Raises CompileError, CudaUnavailable."""
+def read_header(name: str) -> str:
+    """A header that the C++ of the processor is made of too."""
+    return (Path(__file__).parents[1] / "shared" / name).read_text(encoding="utf-8")
+
+
+def compile_source(name: str, target: Target, *, headers: Sequence[str] = (), compiler: Nvrtc | None = None) -> bytes:
+    """A source of this package with these shared headers, compiled, from the cache if it is there.
+
+    Raises CompileError, CudaUnavailable.
+    """
     compiler = compiler or nvrtc()
-    source, headers = read_source(name), dict(headers or {})
-    parts = {f"header {title}": text for title, text in headers.items()}
+    source, texts = read_source(name), {title: read_header(title) for title in headers}
+    parts = {f"header {title}": text for title, text in texts.items()}
     parts |= {"source": source, "options": "\n".join(OPTIONS), "target": target.name, "NVRTC": str(compiler.version)}
-    return cached(f"{name}-{target.name}", parts, lambda: compiler.compile(name, source, headers, target, OPTIONS))
+    return cached(f"{name}-{target.name}", parts, lambda: compiler.compile(name, source, texts, target, OPTIONS))
 
 
 @dataclass(eq=False)
@@ -47,7 +54,8 @@ class Program:
     name: str
     #: Stands in for the driver of this machine.
     driver: Driver | None = None
-    headers: Mapping[str, str] = field(default_factory=dict)
+    #: Names of shared headers that it includes.
+    headers: Sequence[str] = ()
     _functions: dict[tuple[torch.device, str], int] = field(default_factory=dict)
     _modules: dict[torch.device, int] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -82,7 +90,9 @@ class Program:
             return self._functions[key]
 
 
-def pack(arguments: Sequence[Argument]) -> tuple[list[ctypes._SimpleCData], ctypes.Array[ctypes.c_void_p]]:
+def pack(
+    arguments: Sequence[Argument],
+) -> tuple[list[ctypes._SimpleCData | ctypes.Structure], ctypes.Array[ctypes.c_void_p]]:
     """What a launch is given: the values, which must outlive the call, and an array of pointers to them."""
     values = [_value(argument) for argument in arguments]
     pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
@@ -105,7 +115,7 @@ def common_device(arguments: Sequence[Argument], device_type: str) -> torch.devi
     return tensors[0].device
 
 
-def _value(argument: Argument) -> ctypes._SimpleCData:
+def _value(argument: Argument) -> ctypes._SimpleCData | ctypes.Structure:
     if argument is None:
         return ctypes.c_void_p(0)
     if isinstance(argument, Tensor):

@@ -122,6 +122,12 @@ class Nvrtc:
         self, name: str, source: str, headers: Mapping[str, str], target: Target, options: Sequence[str]
     ) -> bytes:
         """Cubin or PTX of a source whose `#include`s are among `headers`. Raises CompileError with the log."""
+        return self.compile_and_tell(name, source, headers, target, options)[0]
+
+    def compile_and_tell(
+        self, name: str, source: str, headers: Mapping[str, str], target: Target, options: Sequence[str]
+    ) -> tuple[bytes, str]:
+        """`compile`, and the compiler's log."""
         program = ctypes.c_void_p()
         count = len(headers)
         self._call(
@@ -133,15 +139,14 @@ class Nvrtc:
             given = [f"--gpu-architecture={target.name}", *options]
             array = (ctypes.c_char_p * len(given))(*(option.encode() for option in given))
             code = self._library.nvrtcCompileProgram(program, len(given), array)
+            log = self._read(program, "nvrtcGetProgramLogSize", "nvrtcGetProgramLog").decode(errors="replace")
             if code:
-                log = self._read(program, "nvrtcGetProgramLogSize", "nvrtcGetProgramLog").decode(errors="replace")
                 raise CompileError(
                     f"{name}: NVRTC {self.version[0]}.{self.version[1]} cannot compile it for {target.name} "
                     f"({self._explain(code)}):\n{log.strip(chr(0)).strip()}"
                 )
-            if target.is_ptx:
-                return self._read(program, "nvrtcGetPTXSize", "nvrtcGetPTX")
-            return self._read(program, "nvrtcGetCUBINSize", "nvrtcGetCUBIN")
+            kind = "PTX" if target.is_ptx else "CUBIN"
+            return self._read(program, f"nvrtcGet{kind}Size", f"nvrtcGet{kind}"), log
         finally:
             self._call("nvrtcDestroyProgram", ctypes.byref(program))
 

@@ -1,9 +1,9 @@
-"""The rasteriser of gsplat (Apache-2.0, the extra `gsplat`) behind `vdgs.kernels`' own operation, on a GPU.
+"""The rasteriser of gsplat (Apache-2.0, the extra `gsplat`) behind `vdgs.kernels`' own operations, on a GPU.
 
-It is not what training uses. It is a second opinion: an implementation by others, to compare the own ones with. It was
-written to gsplat 1.5.3's documented interface and has not been run on a GPU (docs/cuda.md).
+Many cards have run it, and none the own kernels so far: where it is installed, it draws and differentiates the pictures
+of training (`vdgs.kernels.composed`). It follows gsplat 1.5.3 (docs/cuda.md).
 """
 
-from vdgs.kernels.gsplat.rasterise import rasterise
+from vdgs.kernels.gsplat.rasterise import rasterise, rasterise_vjp
 
-__all__ = ["rasterise"]
+__all__ = ["rasterise", "rasterise_vjp"]

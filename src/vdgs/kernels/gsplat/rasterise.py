@@ -9,6 +9,8 @@ None.
 from __future__ import annotations
 
 import importlib
+import sys
+from contextlib import redirect_stdout
 from typing import Any
 
 import torch
@@ -17,7 +19,8 @@ from torch import Tensor
 
 from vdgs.errors import VdgsError
 from vdgs.kernels.constants import ALPHA_MIN
-from vdgs.kernels.types import Raster, Splats
+from vdgs.kernels.reference.rasterise import check_splats, pulled_back
+from vdgs.kernels.types import Raster, RasterPullback, Splats
 
 #: Side of gsplat's tiles, in pixels (its default).
 TILE_PX = 16
@@ -38,10 +41,14 @@ def rasterise(
 ) -> Raster:
     """As `native.rasterise`, for tensors on a GPU; depths must be positive (gsplat sorts by their bits).
 
-    `engine` offers gsplat's three functions (default: gsplat, which compiles its kernels when first used; that takes
-    minutes and a CUDA toolkit). Raises GsplatUnavailable without gsplat.
+    Waits for the device once, in `isect_tiles`: for how many tiles the splats reach. `engine` offers gsplat's three
+    functions (default: gsplat, which compiles its kernels when first used; that takes minutes and a CUDA toolkit).
+    Raises GsplatUnavailable without gsplat, TypeError or ValueError for unsuitable tensors.
     """
     engine = engine or load()
+    check_splats(
+        (splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths, background), width, height
+    )
     means_px, conics, colours, opacities, depths = (
         splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths,
     )  # fmt: skip
@@ -61,6 +68,23 @@ def rasterise(
         backgrounds=behind[None],
     )  # fmt: skip
     return Raster(picture[0, ..., :3], alpha[0, ..., 0], picture[0, ..., 3] if depth else None)
+
+
+def rasterise_vjp(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    *,
+    depth: bool = False,
+    engine: Any = None,
+) -> tuple[Raster, RasterPullback]:
+    """`rasterise`, and the way back from it: gsplat's own derivative, those of the means in pixels among it."""
+
+    def draw(splats: Splats, background: Tensor) -> Raster:
+        return rasterise(splats, background, width, height, depth=depth, engine=engine)
+
+    return pulled_back(draw, splats, background)
 
 
 @torch.no_grad()
@@ -85,14 +109,19 @@ def reach_px(splats: Splats) -> Int32[Tensor, "m 2"]:
 
 
 def load() -> Any:
-    """gsplat, as installed. Raises GsplatUnavailable, with what to do, if it cannot be imported."""
+    """gsplat, as installed, its kernels compiled. Raises GsplatUnavailable, with what to do, if it cannot be used."""
     try:
-        return importlib.import_module("gsplat")
+        engine = importlib.import_module("gsplat")
+        with redirect_stdout(sys.stderr):  # it tells the terminal how compiling goes; output belongs to the verbs
+            backend = importlib.import_module("gsplat.cuda._backend")
     except Exception as error:  # its import may also fail for want of a compiler or of a fitting torch
         raise GsplatUnavailable(
             f"gsplat cannot be used ({type(error).__name__}: {error}). Install it: pip install 'vdgs[gsplat]'. It "
             "needs an NVIDIA GPU, and a CUDA toolkit to compile its kernels."
         ) from error
+    if backend._C is None:  # it prints a line and goes on
+        raise GsplatUnavailable("gsplat has no kernels: it found no CUDA toolkit (nvcc) to compile them.")
+    return engine
 
 
 def _empty(background: Tensor, width: int, height: int, depth: bool) -> Raster:

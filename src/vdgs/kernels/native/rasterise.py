@@ -11,10 +11,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from vdgs.kernels.native import module as native_module
+from vdgs.kernels.reference.rasterise import check_splats
 from vdgs.kernels.types import Raster, RasterGradients, RasterPullback, Splats
-
-#: The largest picture side: tiles are numbered with 16 bits.
-MAX_SIDE = 16 * 32767
 
 
 def rasterise(
@@ -125,16 +123,7 @@ def _tensors(splats: Splats) -> tuple[Tensor, ...]:
 
 
 def _check(tensors: tuple[Tensor, ...], width: int, height: int) -> None:
-    for name, side in (("width", width), ("height", height)):
-        if not 1 <= side <= MAX_SIDE:
-            raise ValueError(f"{name} must be from 1 to {MAX_SIDE} pixels, not {side}")
-    n = len(tensors[0]) if tensors[0].dim() else 0
-    shapes = ((n, 2), (n, 3), (n, 3), (n,), (n,), (3,))
-    names = ("means_px", "conics", "colours", "opacities", "depths", "background")
-    for name, tensor, shape in zip(names, tensors, shapes, strict=True):
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            raise TypeError(f"{name} must be float32 on the CPU, not {tensor.dtype} on {tensor.device}")
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")
+    check_splats(tensors, width, height, "cpu")
+    n = len(tensors[0])
     if n >= 2**31:
         raise ValueError(f"at most 2^31 - 1 splats can be drawn at once, not {n}")

@@ -20,7 +20,8 @@ import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
-from vdgs.kernels.types import AdamState
+from vdgs.kernels.moving import may_look
+from vdgs.kernels.types import AdamState, Finite
 
 
 class StepFactors(NamedTuple):
@@ -46,36 +47,57 @@ def adam_rows(
     beta1: float = 0.9,
     beta2: float = 0.999,
     epsilon: float = 1e-15,
-) -> bool:
+) -> Finite:
     """One step of Adam (Kingma and Ba 2015, algorithm 1) on the given rows, in place.
 
     `gradient` holds one row for each of `rows`, which ascend without repetition; None means all rows.
     `step` counts from 1: for all rows, or for each of them the updates that it has had, this one included.
-    Returns whether every gradient was finite; if not, nothing is changed.
+    Returns whether every gradient was finite; if not, nothing is changed. On a card the answer stays there.
 
     Raises IndexError for a row outside the parameter, ValueError for rows that do not ascend, shapes that
-    do not match or settings out of range, TypeError for other types of elements: before any change.
+    do not match or settings out of range, TypeError for other types of elements: before any change. Numbers that are
+    on a card are not looked at.
     """
     check_rows(state, rows, gradient)
     factors = check_step(state, step, len(gradient), beta1, beta2, epsilon)
-    if not bool(torch.isfinite(gradient).all()):
-        return False
+    finite = torch.isfinite(gradient).all()
+    if may_look(gradient):
+        if not bool(finite):
+            return False
+        finite = None
     index = slice(None) if rows is None else rows
-    first = beta1 * state.first[index] + (1 - beta1) * gradient
-    second = beta2 * state.second[index] + (1 - beta2) * gradient**2
-    state.first[index] = first
-    state.second[index] = second
-    rate, root = (_of_rows(table, step, gradient) for table in (factors.rates, factors.roots))
-    state.parameter[index] -= rate * first / (second.sqrt() * root + epsilon)
-    return True
+    before = state.first[index], state.second[index], state.parameter[index]
+    first = beta1 * before[0] + (1 - beta1) * gradient
+    second = beta2 * before[1] + (1 - beta2) * gradient**2
+    rate, root = _of_rows(factors, state, step, gradient)
+    moved = before[2] - rate * first / (second.sqrt() * root + epsilon)
+    for tensor, old, new in zip(
+        (state.first, state.second, state.parameter), before, (first, second, moved), strict=True
+    ):
+        tensor[index] = new if finite is None else torch.where(finite, new, old)
+    return True if finite is None else finite
 
 
-def _of_rows(table: Float[np.ndarray, " t"], step: int | Tensor, gradient: Tensor) -> Tensor:
-    """The entry of each row of the gradient, shaped so that it multiplies them; one number for all if they share it."""
-    entries = torch.from_numpy(table).to(gradient)
+def _of_rows(
+    factors: StepFactors, state: AdamState, step: int | Tensor, gradient: Tensor
+) -> tuple[float | Tensor, float | Tensor]:
+    """Rate and root of each row of the gradient, shaped so that they multiply them; numbers if all share them."""
     if isinstance(step, int):
-        return entries[0]
-    return entries[(step.long() - 1).clamp(max=len(entries) - 1)].reshape(-1, *[1] * (gradient.ndim - 1))
+        return float(factors.rates[0]), float(factors.roots[0])
+    # The rate changes with every step, these tables never: so they are on the card but once.
+    lacking, roots = tables_on(factors.beta1, factors.beta2, gradient.device)
+    place = (step.long() - 1).clamp(max=len(roots) - 1)
+    root = roots[place]
+    rate = root.clamp(max=state.early) * state.learning_rate / lacking[place]
+    shape = (-1, *[1] * (gradient.ndim - 1))
+    return rate.to(gradient.dtype).reshape(shape), root.to(gradient.dtype).reshape(shape)
+
+
+@cache
+def tables_on(beta1: float, beta2: float, device: torch.device) -> tuple[Tensor, Tensor]:
+    """1 - beta1^u and 1 / sqrt(1 - beta2^u) for u = 1, 2, ... updates, in float64."""
+    first, second = _lacking(beta1, beta2)
+    return torch.from_numpy(first).to(device), torch.from_numpy(1 / np.sqrt(second)).to(device)
 
 
 def check_step(
@@ -156,7 +178,7 @@ def check_updates(updates: Tensor, count: int, least: int = 0) -> None:
         raise TypeError(f"updates must be int32, not {updates.dtype}")
     if updates.shape != (count,):
         raise ValueError(f"updates must be [{count}], not {list(updates.shape)}")
-    if count and int(updates.min()) < least:
+    if may_look(updates) and count and int(updates.min()) < least:
         raise ValueError(f"updates count from {least}, got {int(updates.min())}")
 
 
@@ -166,7 +188,7 @@ def check_indices(rows: Tensor, count: int) -> None:
         raise TypeError(f"rows must be int64, not {rows.dtype}")
     if rows.ndim != 1:
         raise ValueError(f"rows must be [v], not {list(rows.shape)}")
-    if not len(rows):
+    if not len(rows) or not may_look(rows):
         return
     if not bool((rows[1:] > rows[:-1]).all()):
         raise ValueError("rows must ascend without repetition")

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from vdgs.cameras import NEAR, Camera
 from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
+from vdgs.kernels.moving import beside
 
 
 @torch.no_grad()
@@ -20,8 +21,8 @@ def cull(positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], came
     (u = clamp(x/z)) as in `project`; along y likewise. Choice: no anchor is dropped whose projected
     ellipse touches the image; a few are kept whose ellipse does not.
     """
-    rigid = torch.as_tensor(camera.camera_from_world)
-    local = positions @ rigid[:3, :3].T.to(positions) + rigid[:3, 3].to(positions)
+    rigid = beside(camera.camera_from_world, positions)
+    local = positions @ rigid[:3, :3].T + rigid[:3, 3]
     sigma_squared = torch.exp(2 * log_scales[:, :3].amax(-1))
     z = local[:, 2]
     near_enough = z > NEAR

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels.constants import ALPHA_MIN
+from vdgs.kernels.moving import beside
 from vdgs.kernels.reference.project import project_with_variances
-from vdgs.kernels.types import AnchorSplats, DecoderWeights
+from vdgs.kernels.types import AnchorSplats, DecoderWeights, Projected
 
 
 def decode(
@@ -34,46 +37,91 @@ def decode(
     k = offsets.shape[1]
     if rows is not None:
         positions, features, offsets, log_scales = (t[rows] for t in (positions, features, offsets, log_scales))
-    positions = positions.detach()
-    viewing = _viewing(positions, camera)
-    finite = _finite_rows(positions, viewing, features, log_scales.exp())
-    # Replaced before the arithmetic: 0 · NaN would enter the gradients of the weights.
-    positions, viewing, features, log_scales = (
-        torch.where(finite[:, None], t, torch.zeros_like(t)) for t in (positions, viewing, features, log_scales)
-    )
-    inputs = torch.cat([features, viewing], -1)
-
-    opacities = torch.tanh(weights.opacity.outputs(inputs))
-    usable = (opacities > 0) & finite[:, None] & torch.isfinite(offsets).all(-1)
+    anchors = _Anchors.of(positions, features, offsets, log_scales, weights, camera)
+    usable = (anchors.opacities > 0) & anchors.finite[:, None] & torch.isfinite(offsets).all(-1)
     anchor, offset = usable.nonzero(as_tuple=True)
-    opacity = opacities[anchor, offset]
-    covariance = weights.covariance.outputs(inputs).unflatten(1, (k, 7))[anchor, offset]
-    colour = torch.sigmoid(weights.colour.outputs(inputs).unflatten(1, (k, 3))[anchor, offset])
-
-    extent = torch.exp(log_scales)[anchor]
-    means = positions[anchor] + offsets[anchor, offset] * extent[:, :3]
-    scales = extent[:, 3:] * torch.sigmoid(covariance[:, :3])
-    projected, variances = project_with_variances(means, scales, covariance[:, 3:], camera)
-    kept = (projected.valid & _on_image(projected.means_px, variances, opacity, camera)).nonzero()[:, 0]
+    projected, variances, drawn = _spawned(anchors, anchor, offset, weights, camera)
+    kept = (projected.valid & _on_image(projected.means_px, variances, drawn.opacities, camera)).nonzero()[:, 0]
     return AnchorSplats(
-        means_px=projected.means_px[kept],
-        conics=projected.conics[kept],
-        depths=projected.depths[kept],
-        colours=colour[kept],
-        opacities=opacity[kept],
-        volumes=scales[kept].prod(-1),
+        **{name: getattr(drawn, name)[kept] for name in ("means_px", "conics", "depths", "colours", "opacities")},
+        volumes=drawn.volumes[kept],
         source=(anchor * k + offset)[kept].to(torch.int32),
     )
 
 
+def decode_chosen(
+    positions: Float[Tensor, "v 3"],
+    features: Float[Tensor, "v 32"],
+    offsets: Float[Tensor, "v k 3"],
+    log_scales: Float[Tensor, "v 6"],
+    weights: DecoderWeights,
+    camera: Camera,
+    source: Int32[Tensor, "m"],
+) -> AnchorSplats:
+    """`decode` once more for those splats that it has kept: as their number is known, nothing waits for a card."""
+    k = offsets.shape[1]
+    anchors = _Anchors.of(positions, features, offsets, log_scales, weights, camera)
+    chosen = source.long()
+    _, _, drawn = _spawned(anchors, chosen // k, chosen % k, weights, camera)
+    return replace(drawn, source=source)
+
+
+@dataclass(frozen=True)
+class _Anchors:
+    """Anchors as a camera sees them. What is not finite is replaced by zeros before the arithmetic: 0 · NaN would enter
+    the gradients of the weights."""
+
+    positions: Float[Tensor, "v 3"]
+    offsets: Float[Tensor, "v k 3"]
+    log_scales: Float[Tensor, "v 6"]
+    inputs: Float[Tensor, "v 36"]
+    opacities: Float[Tensor, "v k"]
+    finite: Bool[Tensor, "v"]
+
+    @staticmethod
+    def of(
+        positions: Tensor,
+        features: Tensor,
+        offsets: Tensor,
+        log_scales: Tensor,
+        weights: DecoderWeights,
+        camera: Camera,
+    ) -> _Anchors:
+        positions = positions.detach()
+        viewing = _viewing(positions, camera)
+        finite = _finite_rows(positions, viewing, features, log_scales.exp())
+        positions, viewing, features, log_scales = (
+            torch.where(finite[:, None], t, torch.zeros_like(t)) for t in (positions, viewing, features, log_scales)
+        )
+        inputs = torch.cat([features, viewing], -1)
+        opacities = torch.tanh(weights.opacity.outputs(inputs))
+        return _Anchors(positions, offsets, log_scales, inputs, opacities, finite)
+
+
+def _spawned(
+    anchors: _Anchors, anchor: Int64[Tensor, "m"], offset: Int64[Tensor, "m"], weights: DecoderWeights, camera: Camera
+) -> tuple[Projected, Float[Tensor, "m 2"], AnchorSplats]:
+    """What these offsets of these anchors become: projected, their variances along x and y, and all of it as splats."""
+    k = anchors.offsets.shape[1]
+    covariance = weights.covariance.outputs(anchors.inputs).unflatten(1, (k, 7))[anchor, offset]
+    colour = torch.sigmoid(weights.colour.outputs(anchors.inputs).unflatten(1, (k, 3))[anchor, offset])
+    extent = torch.exp(anchors.log_scales)[anchor]
+    means = anchors.positions[anchor] + anchors.offsets[anchor, offset] * extent[:, :3]
+    scales = extent[:, 3:] * torch.sigmoid(covariance[:, :3])
+    projected, variances = project_with_variances(means, scales, covariance[:, 3:], camera)
+    splats = AnchorSplats(
+        projected.means_px, projected.conics, projected.depths, colour, anchors.opacities[anchor, offset],
+        volumes=scales.prod(-1), source=(anchor * k + offset).to(torch.int32),
+    )  # fmt: skip
+    return projected, variances, splats
+
+
 def _viewing(positions: Tensor, camera: Camera) -> Float[Tensor, "v 4"]:
     """Viewing direction and distance of every anchor."""
-    ray = positions - torch.as_tensor(camera.position).to(positions)
+    ray = positions - beside(camera.position, positions)
     distance = ray.norm(dim=-1, keepdim=True)
-    if camera.model == "orthographic":
-        direction = torch.as_tensor(camera.forward).to(positions).expand_as(ray)
-    else:
-        direction = ray / distance
+    level = camera.model == "orthographic"
+    direction = beside(camera.forward, positions).expand_as(ray) if level else ray / distance
     return torch.cat([direction, distance], -1)
 
 
@@ -91,6 +139,6 @@ def _on_image(means_px: Tensor, variances: Tensor, opacity: Tensor, camera: Came
     """
     level = 2 * torch.log(opacity / ALPHA_MIN)
     reach = torch.sqrt(level.clamp(min=0)[:, None] * variances)
-    size = means_px.new_tensor([camera.width, camera.height])
+    size = beside([camera.width, camera.height], means_px)
     touches = (means_px + reach >= 0.5) & (means_px - reach <= size - 0.5)
     return touches.all(-1) & (level >= 0)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels.reference.adam import adam_rows, check_updates
-from vdgs.kernels.reference.decode import decode
-from vdgs.kernels.types import AdamState, DecoderWeights, SplatGradients
+from vdgs.kernels.reference.decode import decode_chosen
+from vdgs.kernels.types import AdamState, DecoderWeights, Finite, SplatGradients
 
 
 def decode_backward_adam(
@@ -22,7 +22,7 @@ def decode_backward_adam(
     rows: Int64[Tensor, "v"],
     gradients: SplatGradients,
     updates: Int32[Tensor, "n"],
-) -> tuple[bool, tuple[Tensor, ...] | None]:
+) -> tuple[Finite, tuple[Tensor, ...] | None]:
     """Differentiate `decode(positions, *parameters, weights, camera, rows)`, and move these rows, in place.
 
     `moved` are features, offsets and log-scales; `gradients` are those of the splats that decoding gave. `updates` says
@@ -34,7 +34,7 @@ def decode_backward_adam(
     leaves = [state.parameter[rows].detach().requires_grad_(True) for state in moved]
     decoder = weights.map(lambda t: t.detach().requires_grad_(True))
     with torch.enable_grad():
-        again = decode(positions[rows], leaves[0], leaves[1], leaves[2], decoder, camera)
+        again = decode_chosen(positions[rows], leaves[0], leaves[1], leaves[2], decoder, camera, gradients.source)
         outputs = [again.means_px, again.conics, again.colours, again.opacities, again.volumes]
     received = [gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
                 torch.full_like(again.volumes, gradients.volume)]  # fmt: skip
@@ -42,8 +42,8 @@ def decode_backward_adam(
         outputs, received = [*outputs, again.depths], [*received, gradients.depths]
     found = torch.autograd.grad(outputs, [*leaves, *decoder.tensors()], received)
     counted = updates[rows] + 1
-    finite = True
+    finite: Finite = True
     for state, gradient in zip(moved, found, strict=False):
-        finite &= adam_rows(state, rows, gradient, counted)
+        finite = adam_rows(state, rows, gradient, counted) & finite
     updates[rows] = counted
     return finite, found[3:] if any(t.requires_grad for t in weights.tensors()) else None

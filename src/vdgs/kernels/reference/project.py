@@ -12,6 +12,7 @@ from torch import Tensor
 
 from vdgs.cameras import NEAR, Camera
 from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
+from vdgs.kernels.moving import beside
 from vdgs.kernels.rotations import rotation_matrices
 from vdgs.kernels.types import Projected
 
@@ -42,16 +43,16 @@ def project_with_variances(
     camera: Camera,
 ) -> tuple[Projected, Float[Tensor, "m 2"]]:
     """`project`, and the dilated variances along x and y in px² (one where not valid)."""
-    rotation = torch.as_tensor(camera.camera_from_world[:3, :3]).to(means)
-    translation = torch.as_tensor(camera.camera_from_world[:3, 3]).to(means)
+    rigid = beside(camera.camera_from_world, means)
+    rotation, translation = rigid[:3, :3], rigid[:3, 3]
     local = means @ rotation.T + translation
     with torch.no_grad():
         valid = _is_valid(local, scales, quaternions, rotation, camera)
     # What is not valid is replaced before the arithmetic, so that 0 · NaN never enters a gradient.
     shown = valid[:, None]
-    local = torch.where(shown, local, local.new_tensor([0.0, 0.0, 1.0]))
+    local = torch.where(shown, local, beside([0.0, 0.0, 1.0], local))
     scales = torch.where(shown, scales, torch.ones_like(scales))
-    quaternions = torch.where(shown, quaternions, quaternions.new_tensor([1.0, 0.0, 0.0, 0.0]))
+    quaternions = torch.where(shown, quaternions, beside([1.0, 0.0, 0.0, 0.0], quaternions))
 
     conics, variances = _conics(*_axes_px(local, scales, quaternions, rotation, camera))
     projected = Projected(

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.kernels.constants import ALPHA_MAX, ALPHA_MIN, MEDIAN_TRANSMITTANCE, TRANSMITTANCE_MIN
 from vdgs.kernels.types import Raster, RasterGradients, RasterPullback, Splats
+
+#: The largest picture side: tiles are numbered with 16 bits.
+MAX_SIDE = 16 * 32767
 
 
 def rasterise(
@@ -53,11 +58,22 @@ def rasterise_vjp(
     depth: bool = False,
 ) -> tuple[Raster, RasterPullback]:
     """`rasterise` without autograd for the caller: the picture, and the way back from it (by autograd in here)."""
+
+    def draw(splats: Splats, background: Tensor) -> Raster:
+        return rasterise(splats, background, width, height, depth=depth)
+
+    return pulled_back(draw, splats, background)
+
+
+def pulled_back(
+    draw: Callable[[Splats, Tensor], Raster], splats: Splats, background: Float[Tensor, "3"]
+) -> tuple[Raster, RasterPullback]:
+    """What a function draws that autograd can differentiate, and the way back, with autograd kept in here."""
     inputs = (splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths, background)
     leaves = [tensor.detach().clone().requires_grad_(True) for tensor in inputs]
     means_px, conics, colours, opacities, depths, behind = leaves
     with torch.enable_grad():
-        drawn = rasterise(Splats(means_px, conics, depths, colours, opacities), behind, width, height, depth=depth)
+        drawn = draw(Splats(means_px, conics, depths, colours, opacities), behind)
 
     def pullback(
         image: Tensor | None,
@@ -107,3 +123,20 @@ def _alphas(
     falloff = torch.exp(-0.5 * (a * dx * dx + 2 * b * dx * dy + c * dy * dy))
     alpha = (opacities[:, None, None] * falloff).clamp(max=ALPHA_MAX)
     return torch.where(alpha >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
+
+
+def check_splats(tensors: tuple[Tensor, ...], width: int, height: int, device_type: str | None = None) -> None:
+    """Raise a clear error unless these are means_px, conics, colours, opacities, depths and a background, float32 (and
+    on a kind of device, if one is named), and the sides those of a picture that can be drawn."""
+    for name, side in (("width", width), ("height", height)):
+        if not 1 <= side <= MAX_SIDE:
+            raise ValueError(f"{name} must be from 1 to {MAX_SIDE} pixels, not {side}")
+    n = len(tensors[0]) if tensors[0].dim() else 0
+    shapes = ((n, 2), (n, 3), (n, 3), (n,), (n,), (3,))
+    names = ("means_px", "conics", "colours", "opacities", "depths", "background")
+    for name, tensor, shape in zip(names, tensors, shapes, strict=True):
+        if tensor.dtype != torch.float32 or device_type not in (None, tensor.device.type):
+            where = {None: "", "cpu": " on the CPU"}.get(device_type, f" on {device_type}")
+            raise TypeError(f"{name} must be float32{where}, not {tensor.dtype} on {tensor.device}")
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
+from vdgs.kernels.moving import may_look
 from vdgs.kernels.types import Statistics
 
 
@@ -42,7 +43,7 @@ def add_view_statistics(
 
 def check_sources(source: Tensor, visible: Tensor, k: int) -> None:
     """Raise IndexError unless the ascending sources belong to the visible anchors."""
-    if len(source) and not (int(source[0]) >= 0 and int(source[-1]) < len(visible) * k):
+    if may_look(source) and len(source) and not (int(source[0]) >= 0 and int(source[-1]) < len(visible) * k):
         raise IndexError(f"a source lies outside the {len(visible)} visible anchors of {k} offsets")
 
 

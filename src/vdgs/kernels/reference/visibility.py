@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
 from vdgs.cameras import NEAR, Camera
+from vdgs.kernels.moving import beside
 
 
 def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int32[Tensor, "n"]:
@@ -33,7 +34,7 @@ def mark_visible(points: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, "
     check_points(points)
     exact = points.detach().to(torch.float64)
     finite = torch.isfinite(exact).all(dim=1)
-    rigid = torch.as_tensor(camera.camera_from_world).to(exact)
+    rigid = beside(camera.camera_from_world, exact)
     x, y, z = (torch.where(finite[:, None], exact, 0.0) @ rigid[:3, :3].T + rigid[:3, 3]).unbind(1)
     divisor = z if camera.model == "pinhole" else torch.ones_like(z)
     column, row = camera.fx * x / divisor + camera.cx, camera.fy * y / divisor + camera.cy

@@ -1,0 +1,272 @@
+"""Every operation on a card beside the same on the processor: pictures within 1e-4, gradients within 1e-3.
+
+Differences are norms over the norm of the processor's result; of whole numbers, the share that differs: what lies at a
+threshold may go either way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from step import scene
+from vdgs.kernels import cuda, gsplat
+from vdgs.kernels.gsplat.rasterise import GsplatUnavailable
+from vdgs.kernels.operations import Operations
+from vdgs.kernels.types import AdamState, AnchorSplats, DecoderWeights, SplatGradients, Splats, Statistics
+from vdgs.model.decoder import Decoder
+
+#: Largest difference of a value, of a gradient and share of whole numbers that differ.
+TOLERANCES = {"value": 1e-4, "gradient": 1e-3, "whole": 1e-3}
+Results = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How far a result of an operation is from that of the processor."""
+
+    operation: str
+    by: str
+    result: str
+    kind: str
+    size: float
+
+    @property
+    def agrees(self) -> bool:
+        return self.size <= TOLERANCES[self.kind]
+
+
+class Place:
+    """The same anchors, cameras and pictures on any device."""
+
+    def __init__(self, device: torch.device, anchors: int, width: int, height: int):
+        self.device, self.width, self.height = device, width, height
+        made, self.camera = scene(anchors, width, height, hidden=anchors)
+        self.anchors = made.to(device)
+        self.weights: DecoderWeights = Decoder.initial(10, False, 0, 1, generator()).to(device).weights
+        self.target = torch.randint(256, (height, width, 3), generator=generator(), dtype=torch.uint8).to(device)
+        self.mask = (torch.rand(height, width, generator=generator()) < 0.9).byte().to(device)
+        self.background = torch.tensor([0.2, 0.3, 0.4]).to(device)
+
+    def random(self, *shape: int, seed: int = 1) -> Tensor:
+        """The same numbers on any device."""
+        return torch.randn(shape, generator=generator(seed)).to(self.device)
+
+    def decoded(self, kernels: Operations, leaves: tuple[Tensor, ...] | None = None) -> tuple[Tensor, AnchorSplats]:
+        a = self.anchors
+        rows = kernels.cull(a.positions, a.log_scales, self.camera)
+        features, offsets, log_scales = leaves or (a.features, a.offsets, a.log_scales)
+        return rows, kernels.decode(a.positions, features, offsets, log_scales, self.weights, self.camera, rows)
+
+    def splats(self) -> Splats:
+        """Drawn numbers and not decoded ones: the same for every rasteriser."""
+        count = 4 * len(self.anchors)
+        g = generator(2)
+        spread = 0.3 + 3 * torch.rand(count, generator=g) ** 4 * 10
+        tensors = (
+            torch.rand(count, 2, generator=g) * torch.tensor([float(self.width), float(self.height)]),
+            torch.stack([1 / spread, 0.3 / spread, 1 / spread], dim=1),
+            1 + torch.rand(count, generator=g), torch.rand(count, 3, generator=g), torch.rand(count, generator=g),
+        )  # fmt: skip
+        return Splats(*(tensor.to(self.device) for tensor in tensors))
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def cull(kernels: Operations, place: Place) -> Results:
+    rows = kernels.cull(place.anchors.positions, place.anchors.log_scales, place.camera)
+    return {"whole rows": member(rows, len(place.anchors))}
+
+
+def decode(kernels: Operations, place: Place) -> Results:
+    a = place.anchors
+    leaves = tuple(t.detach().clone().requires_grad_(True) for t in (a.features, a.offsets, a.log_scales))
+    rows, splats = place.decoded(kernels, leaves)
+    count, k = len(a), a.offsets.shape[1]
+    drawn = (rows[splats.source.long() // k] * k + splats.source.long() % k).detach()
+    found: Results = {"whole splats": member(drawn, count * k)}
+    loss: Any = 0.0
+    for name in ("means_px", "conics", "colours", "opacities", "volumes"):
+        values = getattr(splats, name)
+        everywhere = values.new_zeros(count * k, *values.shape[1:])
+        everywhere[drawn] = values.detach()
+        found[name] = everywhere
+        weight = place.random(count * k, *values.shape[1:])[drawn] * (0.01 if name == "means_px" else 1.0)
+        loss = loss + (values * weight).sum()
+    gradients = torch.autograd.grad(loss, leaves)
+    return found | {f"gradient {i}": gradient for i, gradient in enumerate(gradients)}
+
+
+def decode_backward_adam(kernels: Operations, place: Place) -> Results:
+    """First moments say what the gradients were; how far Adam moves says nothing where a gradient is near zero."""
+    rows, splats = place.decoded(kernels)
+    a, k = place.anchors, place.anchors.offsets.shape[1]
+    drawn = rows[splats.source.long() // k] * k + splats.source.long() % k
+    count = len(a) * k
+    gradients = SplatGradients(
+        0.01 * place.random(count, 2)[drawn], place.random(count, 3)[drawn], place.random(count, 3)[drawn],
+        place.random(count)[drawn], 0.1, splats.source, splats.colours, splats.opacities,
+    )  # fmt: skip
+    states = [
+        AdamState(t.clone(), torch.zeros_like(t), torch.zeros_like(t), 1e-3)
+        for t in (a.features, a.offsets, a.log_scales)
+    ]
+    updates = torch.zeros(len(a), dtype=torch.int32).to(place.device)
+    weights = place.weights.map(lambda t: t.detach().clone().requires_grad_(True))
+    finite, of_weights = kernels.decode_backward_adam(
+        a.positions, states, weights, place.camera, rows, gradients, updates
+    )
+    assert finite
+    assert of_weights is not None
+    moments = {f"gradient of moved {i}": state.first for i, state in enumerate(states)}
+    decoder = {f"gradient of decoder {i}": gradient for i, gradient in enumerate(of_weights)}
+    return moments | decoder | {"whole updates": updates}
+
+
+def project(kernels: Operations, place: Place) -> Results:
+    a = place.anchors
+    leaves = tuple(
+        t.detach().clone().requires_grad_(True)
+        for t in (a.positions, a.log_scales[:, :3].exp(), place.random(len(a), 4, seed=3))
+    )
+    found = kernels.project(*leaves, place.camera)
+    values = {"means_px": found.means_px, "conics": found.conics, "depths": found.depths}
+    loss = sum((t * place.random(*t.shape)).sum() for t in values.values())
+    gradients = torch.autograd.grad(loss, leaves)
+    named = {f"gradient {i}": gradient for i, gradient in enumerate(gradients)}
+    return {name: t.detach() for name, t in values.items()} | {"whole valid": found.valid} | named
+
+
+def rasterise(kernels: Operations, place: Place) -> Results:
+    """With depth, as pictures for people are drawn; median depth jumps from splat to splat."""
+    raster = kernels.rasterise(place.splats(), place.background, place.width, place.height, depth=True)
+    assert raster.depth is not None
+    found = {"image": raster.image, "alpha": raster.alpha, "depth": raster.depth}
+    return found if raster.median_depth is None else found | {"whole median depth": raster.median_depth}
+
+
+def rasterise_vjp(kernels: Operations, place: Place) -> Results:
+    raster, pullback = kernels.rasterise_vjp(place.splats(), place.background, place.width, place.height)
+    shape = (place.height, place.width)
+    gradients = pullback(place.random(*shape, 3), place.random(*shape))._asdict()
+    named = {f"gradient {name}": gradient for name, gradient in gradients.items() if gradient is not None}
+    return {"image": raster.image, "alpha": raster.alpha} | named
+
+
+def photometric_loss(kernels: Operations, place: Place) -> Results:
+    image = place.random(place.height, place.width, 3).sigmoid().requires_grad_(True)
+    found = kernels.photometric_loss(image, place.target, place.mask)
+    (gradient,) = torch.autograd.grad(found.loss, image)
+    return {"loss": found.loss.detach(), "l1": found.l1, "ssim": found.ssim, "gradient": gradient}
+
+
+def adam_rows(kernels: Operations, place: Place) -> Results:
+    features = place.anchors.features.clone()
+    state = AdamState(features, torch.zeros_like(features), torch.zeros_like(features), 1e-2, early=5.0)
+    rows = torch.arange(0, len(features), 3).to(place.device)
+    step = (rows % 50 + 1).to(torch.int32)
+    assert kernels.adam_rows(state, rows, place.random(len(rows), features.shape[1]), step)
+    return {"parameter": state.parameter, "first": state.first, "second": state.second}
+
+
+def add_view_statistics(kernels: Operations, place: Place) -> Results:
+    rows, splats = place.decoded(kernels)
+    inside = kernels.mark_visible(place.anchors.positions[rows], place.camera)
+    sums = Statistics.zeros(len(place.anchors), place.anchors.offsets.shape[1], place.device)
+    by_px = splats.means_px * 1e-3
+    kernels.add_view_statistics(
+        sums, rows, inside, splats.source, splats.opacities, by_px, place.width, place.height
+    )  # fmt: skip
+    return sums.tensors()
+
+
+def count_visibility(kernels: Operations, place: Place) -> Results:
+    return {"whole V": kernels.count_visibility(place.anchors.positions, [place.camera] * 3)}
+
+
+def mark_visible(kernels: Operations, place: Place) -> Results:
+    return {"whole marks": kernels.mark_visible(place.anchors.positions, place.camera)}
+
+
+def cell_keys(kernels: Operations, place: Place) -> Results:
+    return {"whole keys": keys_of(kernels, place)}
+
+
+def cell_centres(kernels: Operations, place: Place) -> Results:
+    return {"centres": kernels.cell_centres(keys_of(kernels, place), 0.5, place.background)}
+
+
+def group_cells(kernels: Operations, place: Place) -> Results:
+    unique, group = kernels.group_cells(keys_of(kernels, place))
+    return {"whole keys": unique, "whole groups": group}
+
+
+def group_max(kernels: Operations, place: Place) -> Results:
+    unique, group = kernels.group_cells(keys_of(kernels, place))
+    return {"greatest": kernels.group_max(place.anchors.features, group, len(unique))}
+
+
+def contains(kernels: Operations, place: Place) -> Results:
+    keys = keys_of(kernels, place)
+    return {"whole": kernels.contains(keys[::2].contiguous(), keys)}
+
+
+def morton_order(kernels: Operations, place: Place) -> Results:
+    return {"whole order": kernels.morton_order(place.anchors.positions)}
+
+
+def keys_of(kernels: Operations, place: Place) -> Tensor:
+    return kernels.cell_keys(place.anchors.positions, 0.5, place.background)
+
+
+def member(rows: Tensor, count: int) -> Tensor:
+    """Which of so many are among the rows."""
+    found = torch.zeros(count, dtype=torch.bool).to(rows.device)
+    found[rows] = True
+    return found
+
+
+#: By the name of the operation.
+CASES: dict[str, Callable[[Operations, Place], Results]] = {
+    case.__name__: case
+    for case in (
+        adam_rows, add_view_statistics, cell_centres, cell_keys, contains, count_visibility, cull, decode,
+        decode_backward_adam, group_cells, group_max, mark_visible, morton_order, photometric_loss, project, rasterise,
+        rasterise_vjp,
+    )
+}  # fmt: skip
+
+
+def differences(device: torch.device, anchors: int, width: int, height: int) -> Iterator[Difference]:
+    """All results of all operations; those of the rasterisers by each of them."""
+    from vdgs.kernels import composed, native
+
+    here, there = Place(torch.device("cpu"), anchors, width, height), Place(device, anchors, width, height)
+    for name, case in CASES.items():
+        expected = case(native, here)
+        sets: dict[str, Any] = {"cuda": cuda, "gsplat": gsplat} if name.startswith("rasterise") else {"": composed}
+        for by, kernels in sets.items():
+            with suppress(GsplatUnavailable):
+                yield from compared(name, by, case(kernels, there), expected)
+
+
+def compared(operation: str, by: str, found: Results, expected: Results) -> Iterator[Difference]:
+    for name, value in found.items():
+        kind = next((kind for kind in ("gradient", "whole") if name.startswith(kind)), "value")
+        ours, theirs = value.detach().cpu(), expected[name].detach()
+        if ours.shape != theirs.shape:
+            size = float("inf")
+        elif kind == "whole":
+            size = float((ours != theirs).double().mean()) if ours.numel() else 0.0
+        else:
+            error, norm = ((t.double().norm()) for t in (ours.double() - theirs.double(), theirs))
+            size = float(error / norm.clamp(min=1e-12))
+        yield Difference(operation, by, name, kind, size if np.isfinite(size) else float("inf"))

@@ -1,0 +1,41 @@
+"""What a GPU computes with: torch, own CUDA kernels and gsplat, put together to the whole set of operations.
+
+`vdgs.kernels.operations.ON_A_CARD` says which operation is which.
+"""
+
+from vdgs.kernels.composed.rasteriser import rasterise, rasterise_vjp
+from vdgs.kernels.cuda import decode, decode_backward_adam, photometric_loss
+from vdgs.kernels.reference import (
+    adam_rows,
+    add_view_statistics,
+    cell_centres,
+    cell_keys,
+    contains,
+    count_visibility,
+    cull,
+    group_cells,
+    group_max,
+    mark_visible,
+    morton_order,
+    project,
+)
+
+__all__ = [
+    "adam_rows",
+    "add_view_statistics",
+    "cell_centres",
+    "cell_keys",
+    "contains",
+    "count_visibility",
+    "cull",
+    "decode",
+    "decode_backward_adam",
+    "group_cells",
+    "group_max",
+    "mark_visible",
+    "morton_order",
+    "photometric_loss",
+    "project",
+    "rasterise",
+    "rasterise_vjp",
+]

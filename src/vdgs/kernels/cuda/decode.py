@@ -1,0 +1,98 @@
+"""Anchors to splats in one step on a GPU (source/decode.cu)."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from vdgs.cameras import Camera
+from vdgs.kernels.constants import FRUSTUM_MARGIN
+from vdgs.kernels.cuda.launching import Argument, Program
+from vdgs.kernels.reference.decode import decode as by_torch
+from vdgs.kernels.types import FEATURE_SIZE, AnchorSplats, DecoderWeights
+
+#: Warps of a block, each with an anchor: kWarps of the source. A lane an offset.
+ANCHORS_OF_A_BLOCK, MOST_OFFSETS = 8, 32
+PROGRAM = Program("decode.cu", headers=("gaussian_math.h", "image_formation.h"))
+
+
+class PackedCamera(ctypes.Structure):
+    """`Camera` of gaussian_math.h, field by field."""
+
+    _fields_ = (
+        *((name, 3 * ctypes.c_float) for name in ("right", "down", "forward", "centre")),
+        *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "width", "height", "near", "limit_x", "limit_y")),
+        ("orthographic", ctypes.c_bool),
+    )  # fmt: skip
+
+    @staticmethod
+    def of(camera: Camera) -> PackedCamera:
+        """As `unpack_camera` of gaussian_math.h makes it of the same numbers."""
+        numbers = [float(each) for each in camera.packed]
+        axes, translation = [numbers[:3], numbers[3:6], numbers[6:9]], numbers[9:12]
+        centre = [-sum(axis[i] * shift for axis, shift in zip(axes, translation, strict=True)) for i in range(3)]
+        fx, fy, cx, cy, width, height, orthographic, near, whole_width, whole_height = numbers[12:]
+        limits = (FRUSTUM_MARGIN * 0.5 * side / focal for side, focal in ((whole_width, fx), (whole_height, fy)))
+        vectors = (tuple(vector) for vector in (*axes, centre))
+        return PackedCamera(*vectors, fx, fy, cx, cy, width, height, near, *limits, bool(orthographic))
+
+
+def decode(
+    positions: Float[Tensor, "n 3"],
+    features: Float[Tensor, "n 32"],
+    offsets: Float[Tensor, "n k 3"],
+    log_scales: Float[Tensor, "n 6"],
+    weights: DecoderWeights,
+    camera: Camera,
+    rows: Int64[Tensor, "v"] | None = None,
+    *,
+    program: Program = PROGRAM,
+) -> AnchorSplats:
+    """As `reference.decode.decode`, for float32 tensors on a CUDA device. Same bits every time.
+
+    Where autograd follows it is the reference that decodes: this has no derivative. Waits for the device once: for how
+    many splats room must be made. Nothing is kept between anchors and splats. Raises ValueError for more than 32
+    offsets, TypeError for other types of elements, CudaUnavailable where the kernel cannot be run.
+    """
+    anchors = (positions, features, offsets, log_scales)
+    if torch.is_grad_enabled() and any(t.requires_grad for t in (*anchors, *weights.tensors())):
+        return by_torch(*anchors, weights, camera, rows)
+    k, inputs = offsets.shape[1], weights.opacity.w1.shape[1]
+    check_decoder(k, weights, anchors)
+    # Neighbouring lanes read neighbouring weights.
+    heads = [t.detach().t().contiguous() if t.ndim == 2 else t.detach().contiguous() for t in weights.tensors()]
+    count = len(positions) if rows is None else len(rows)
+    given: list[Argument] = [
+        *(t.detach().contiguous() for t in anchors), *heads, PackedCamera.of(camera),
+        None if rows is None else rows.contiguous(), ctypes.c_longlong(count), ctypes.c_int(k),
+        ctypes.c_int(inputs == FEATURE_SIZE + 4),
+    ]  # fmt: skip
+    grid, block = (-(-count // ANCHORS_OF_A_BLOCK),), (32 * ANCHORS_OF_A_BLOCK,)
+    counts = positions.new_empty(count, dtype=torch.int64)
+    program.launch("decode_anchors", grid, block, *given, None, counts, *[None] * 7)
+    ends = counts.cumsum(0)
+    m = int(ends[-1]) if count else 0
+    splats = AnchorSplats(
+        *(positions.new_empty(shape) for shape in ((m, 2), (m, 3), (m,), (m, 3), (m,), (m,))),
+        source=positions.new_empty(m, dtype=torch.int32),
+    )
+    program.launch(
+        "decode_anchors", grid, block, *given, ends, None, splats.means_px, splats.conics, splats.depths,
+        splats.colours, splats.opacities, splats.volumes, splats.source,
+    )  # fmt: skip
+    return splats
+
+
+def check_decoder(k: int, weights: DecoderWeights, anchors: Sequence[Tensor]) -> None:
+    """Raise a clear error unless a warp can decode anchors of so many offsets, and all numbers are float32."""
+    inputs = weights.opacity.w1.shape[1]
+    if not 1 <= k <= MOST_OFFSETS:
+        raise ValueError(f"offsets per anchor must be 1 to {MOST_OFFSETS}, not {k}")
+    if inputs not in (FEATURE_SIZE + 3, FEATURE_SIZE + 4):
+        raise ValueError(f"a head's first layer must be 35 or 36 wide, not {inputs}")
+    if any(t.dtype != torch.float32 for t in (*anchors, *weights.tensors())):
+        raise TypeError("anchors and decoder must be float32")

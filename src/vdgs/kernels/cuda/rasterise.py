@@ -1,0 +1,164 @@
+"""Splats to a picture on a GPU (source/rasterise.cu): `vdgs.kernels.reference.rasterise`, tile by tile."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int32, Int64
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from vdgs.kernels.cuda.launching import Argument, Program
+from vdgs.kernels.reference.rasterise import check_splats
+from vdgs.kernels.types import Raster, RasterGradients, RasterPullback, Splats
+
+#: Side of a tile, threads of a block and sums of an entry: kTile, kThreads and kSums of the source.
+TILE_PX, THREADS, SUMS = 16, 256, 10
+PROGRAM = Program("rasterise.cu", headers=("image_formation.h",))
+
+
+def rasterise(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    *,
+    depth: bool = False,
+    program: Program = PROGRAM,
+) -> Raster:
+    """As `native.rasterise`, for float32 tensors on a CUDA device; median depth included. Same bits every time.
+
+    Waits for the device once: how many entries (splats times the tiles that they reach) there is room to be made for.
+    Backward takes 52 bytes an entry. Raises TypeError or ValueError for unsuitable tensors, CudaUnavailable where the
+    kernels cannot be run.
+    """
+    return Raster(*_Rasterise.apply(width, height, depth, program, *_tensors(splats), background))
+
+
+def rasterise_vjp(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    *,
+    depth: bool = False,
+    program: Program = PROGRAM,
+) -> tuple[Raster, RasterPullback]:
+    """`rasterise` without autograd: the picture, and the way back from it, which reads the splats again."""
+    return _draw((*_tensors(splats), background), width, height, depth, program)
+
+
+@dataclass(frozen=True)
+class _Entries:
+    """What each tile shows, front to back: n entries, one for each splat and tile that it reaches."""
+
+    owners: Int32[Tensor, " n"]  # the splat of each entry, before sorting
+    order: Int64[Tensor, " n"]  # where each entry was before sorting
+    bounds: Int64[Tensor, " tiles_and_one"]  # where those of each tile begin
+    ends: Int64[Tensor, " m"]  # where those of each splat end, before sorting
+
+
+def _draw(
+    tensors: tuple[Tensor, ...], width: int, height: int, depth: bool, program: Program
+) -> tuple[Raster, RasterPullback]:
+    """The picture of means_px, conics, colours, opacities, depths before a background, and the way back."""
+    check_splats(tensors, width, height)
+    *splats, background = (t.detach().contiguous() for t in tensors)
+    grid = -(-width // TILE_PX), -(-height // TILE_PX)
+    entries = _entries(splats, grid, program)
+    image, transmittance = background.new_empty(height, width, 3), background.new_empty(height, width)
+    last = torch.empty_like(transmittance, dtype=torch.int32)
+    depths = (torch.empty_like(transmittance), torch.empty_like(transmittance)) if depth else (None, None)
+    program.launch(
+        "rasterise_forward", grid, (THREADS,), *splats, entries.owners, entries.order, entries.bounds, background,
+        ctypes.c_int(width), ctypes.c_int(height), image, transmittance, last, *depths,
+    )  # fmt: skip
+    raster = Raster(image, 1.0 - transmittance, *depths)
+    return raster, _Pullback(program, splats, background, entries, raster, transmittance, last)
+
+
+def _entries(splats: list[Tensor], grid: tuple[int, int], program: Program) -> _Entries:
+    means = splats[0]
+    count, (columns, rows) = len(means), grid
+    sides = ctypes.c_longlong(count), ctypes.c_int(columns), ctypes.c_int(rows)
+    tiles = means.new_empty(count, dtype=torch.int64)
+    program.launch("splat_tiles", _over(count), (THREADS,), *splats, *sides, tiles)
+    ends = tiles.cumsum(0)
+    # The one wait for the device in a picture: memory must be asked for by its size.
+    total = int(ends[-1]) if count else 0
+    keys, owners = means.new_empty(total, dtype=torch.int64), means.new_empty(total, dtype=torch.int32)
+    program.launch("splat_entries", _over(count), (THREADS,), *splats, *sides, ends, keys, owners)
+    ordered, order = torch.sort(keys, stable=True)
+    begins = torch.arange(columns * rows + 1, device=means.device) << 32
+    return _Entries(owners, order, torch.searchsorted(ordered, begins), ends)
+
+
+@dataclass(frozen=True)
+class _Pullback:
+    """What is kept of a picture for its backward pass: see `RasterPullback`."""
+
+    program: Program
+    splats: list[Tensor]
+    background: Tensor
+    entries: _Entries
+    raster: Raster
+    transmittance: Float[Tensor, "h w"]
+    last: Int32[Tensor, "h w"]
+
+    def __call__(
+        self,
+        image: Tensor | None,
+        alpha: Tensor | None = None,
+        depth: Tensor | None = None,
+        over: tuple[Tensor, Tensor] | None = None,
+    ) -> RasterGradients:
+        means, conics, colours, opacities, depths = self.splats
+        entries, (height, width) = self.entries, self.transmittance.shape
+        wanted = [None if g is None else g.contiguous() for g in (image, alpha, depth)]
+        sums = means.new_zeros(len(entries.owners), SUMS)
+        picture: list[Argument] = [self.raster.image, self.transmittance, self.last, self.raster.depth]
+        self.program.launch(
+            "rasterise_backward", (-(-width // TILE_PX), -(-height // TILE_PX)), (THREADS,), *self.splats,
+            entries.owners, entries.order, entries.bounds, ctypes.c_int(width), ctypes.c_int(height), *picture,
+            *wanted, sums,
+        )  # fmt: skip
+        by_means, by_conics = over or (torch.empty_like(means), torch.empty_like(conics))
+        by_colours, by_opacities = torch.empty_like(colours), torch.empty_like(opacities)
+        by_depths = None if self.raster.depth is None else torch.empty_like(depths)
+        self.program.launch(
+            "gather_gradients", _over(len(means)), (THREADS,), *self.splats, ctypes.c_longlong(len(means)),
+            entries.ends, sums, by_means, by_conics, by_colours, by_opacities, by_depths,
+        )  # fmt: skip
+        if wanted[0] is None:
+            by_background = torch.zeros_like(self.background)
+        else:
+            by_background = (self.transmittance[..., None] * wanted[0]).sum((0, 1))
+        return RasterGradients(by_means, by_conics, by_colours, by_opacities, by_depths, by_background)
+
+
+class _Rasterise(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, width: int, height: int, with_depth: bool, program: Program, *tensors: Tensor) -> Raster:
+        raster, ctx.pullback = _draw(tensors, width, height, with_depth, program)
+        if raster.median_depth is not None:
+            ctx.mark_non_differentiable(raster.median_depth)
+        ctx.set_materialize_grads(False)
+        return raster
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *picture_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        image, alpha, depth, _ = picture_gradients
+        return None, None, None, None, *ctx.pullback(image, alpha, depth)
+
+
+def _tensors(splats: Splats) -> tuple[Tensor, ...]:
+    return splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths
+
+
+def _over(count: int) -> tuple[int]:
+    """The grid of a kernel with a thread for each of so many."""
+    return (-(-count // THREADS),)

@@ -1,0 +1,333 @@
+// Splats to a picture and back: vdgs.kernels.reference.rasterise on a GPU.
+//
+//   splat_tiles         in how many tiles of 16x16 pixels each splat reaches a pixel
+//   splat_entries       one entry for each of them: a key (tile, depth) to sort by, and the splat that it is of
+//   rasterise_forward   a block of threads a tile, a thread a pixel: the tile's entries front to back
+//   rasterise_backward  the same entries in the same order once more: ten sums an entry
+//   gather_gradients    adds up the entries of each splat: its gradients
+//
+// Entries are made splat after splat and sorted in between (by torch, stable, so that equal depths keep the order of the
+// rows); the backward pass writes the sums of an entry to where the entry was before sorting, so that those of a splat
+// lie side by side. Nothing is added by several threads at once: the same bits every time.
+//
+// A conic is used by its Cholesky factor, u = ux dx + uy dy and v = vy dy with q = u^2 + v^2: for splats seen edge-on
+// a dx^2 + 2 b dx dy + c dy^2 would be all rounding.
+#include "image_formation.h"
+
+namespace {
+
+using namespace vdgs;
+
+constexpr int kTile = 16;
+constexpr int kThreads = kTile * kTile;
+constexpr int kWarp = 32;
+constexpr int kWarps = kThreads / kWarp;
+constexpr unsigned kAllLanes = 0xffffffffu;
+// Entries that the backward pass has in shared memory at a time.
+constexpr int kBatch = 32;
+// Of an entry: by log alpha; by u, v; by dx^2, dx dy, dy^2; by three colours; by depth.
+constexpr int kSums = 10;
+constexpr int kRoom = 16;  // kSums, and zeros up to a power of two
+
+struct Splats {
+  const float* means;      // [m, 2]
+  const float* conics;     // [m, 3]
+  const float* colours;    // [m, 3]
+  const float* opacities;  // [m]
+  const float* depths;     // [m]
+};
+
+struct Shape {
+  float x, y;        // the mean
+  float ux, uy, vy;  // the Cholesky factor of the conic
+  float opacity;
+  float reach;  // where q is larger, alpha is surely below 1/255
+};
+
+struct Entry {
+  Shape shape;
+  float colour[3];
+  float depth;
+};
+
+__device__ bool is_finite(float a) { return fabsf(a) <= 3.402823466e38f; }
+
+// False for a splat that is not drawn.
+__device__ bool shape_of(const Splats& splats, long long i, Shape& shape) {
+  const float x = splats.means[2 * i], y = splats.means[2 * i + 1], opacity = splats.opacities[i];
+  const float a = splats.conics[3 * i], b = splats.conics[3 * i + 1], c = splats.conics[3 * i + 2];
+  // a c - b^2 with the rounding of b^2 put back (Kahan): of a needle little else is left.
+  const float square = b * b;
+  const float determinant = fmaf(a, c, -square) + fmaf(-b, b, square);
+  const bool finite = is_finite(x) && is_finite(y) && is_finite(a) && is_finite(b) && is_finite(c) &&
+                      is_finite(opacity) && is_finite(splats.depths[i]) && is_finite(splats.colours[3 * i]) &&
+                      is_finite(splats.colours[3 * i + 1]) && is_finite(splats.colours[3 * i + 2]);
+  if (!(finite && a > 0.0f && c > 0.0f && determinant > 0.0f && opacity >= kAlphaMin)) return false;
+  const float ux = sqrtf(a);
+  shape = {x, y, ux, b / ux, sqrtf(determinant / a), opacity, fmaf(2.0002f, logf(opacity / kAlphaMin), 1e-3f)};
+  return true;
+}
+
+__device__ float along(const Shape& s, float dx, float dy) { return fmaf(s.ux, dx, s.uy * dy); }
+__device__ float square_of(float u, float v) { return fmaf(u, u, v * v); }
+__device__ float quadratic(const Shape& s, float dx, float dy) { return square_of(along(s, dx, dy), s.vy * dy); }
+__device__ float clamped(float a, float low, float high) { return fminf(fmaxf(a, low), high); }
+// Alpha before it is clamped.
+__device__ float alpha_of(const Shape& s, float q) { return s.opacity * expf(-0.5f * q); }
+
+// Whether a splat may reach a pixel's centre of a tile: the least q over the rectangle of centres lies at the mean or on
+// the border. The rectangle is widened a little, for rounding.
+__device__ bool touches(const Shape& s, int column, int row) {
+  const float slack = 0.01f;
+  const float left = static_cast<float>(column * kTile) + 0.5f - s.x - slack, right = left + (kTile - 1) + 2 * slack;
+  const float top = static_cast<float>(row * kTile) + 0.5f - s.y - slack, bottom = top + (kTile - 1) + 2 * slack;
+  if (left <= 0.0f && right >= 0.0f && top <= 0.0f && bottom >= 0.0f) return true;
+  const float tilt = -s.ux * s.uy / square_of(s.uy, s.vy), lean = -s.uy / s.ux;
+  const float nearest = fminf(fminf(quadratic(s, left, clamped(tilt * left, top, bottom)),
+                                    quadratic(s, right, clamped(tilt * right, top, bottom))),
+                              fminf(quadratic(s, clamped(lean * top, left, right), top),
+                                    quadratic(s, clamped(lean * bottom, left, right), bottom)));
+  return nearest <= s.reach;
+}
+
+struct Box {
+  int left, right, top, bottom;  // tiles, both ends included; empty if right < left or bottom < top
+};
+
+__device__ Box box_of(const Shape& s, int columns, int rows) {
+  const float across = sqrtf(s.reach * square_of(s.uy, s.vy)) / (s.ux * s.vy), down = sqrtf(s.reach) / s.vy;
+  const float side = kTile, most_columns = static_cast<float>(columns - 1), most_rows = static_cast<float>(rows - 1);
+  // Compared as floats: they may be infinite.
+  return {static_cast<int>(clamped(ceilf((s.x - across - side) / side), 0.0f, most_columns + 1.0f)),
+          static_cast<int>(clamped(floorf((s.x + across) / side), -1.0f, most_columns)),
+          static_cast<int>(clamped(ceilf((s.y - down - side) / side), 0.0f, most_rows + 1.0f)),
+          static_cast<int>(clamped(floorf((s.y + down) / side), -1.0f, most_rows))};
+}
+
+// Orders as the depth does; both zeros are one.
+__device__ unsigned depth_bits(float depth) {
+  const unsigned bits = __float_as_uint(depth + 0.0f);
+  return bits & 0x80000000u ? ~bits : bits | 0x80000000u;
+}
+
+// Pixels of a warp lie together, 8x4 of them.
+__device__ int pixel_column() { return blockIdx.x * kTile + threadIdx.x / kWarp % 2 * 8 + threadIdx.x % 8; }
+__device__ int pixel_row() { return blockIdx.y * kTile + threadIdx.x / kWarp / 2 * 4 + threadIdx.x % kWarp / 8; }
+
+__device__ void read_entry(const Splats& splats, long long i, Entry& entry) {
+  shape_of(splats, i, entry.shape);  // only splats that are drawn have entries
+  for (int k = 0; k < 3; ++k) entry.colour[k] = splats.colours[3 * i + k];
+  entry.depth = splats.depths[i];
+}
+
+// Adds kRoom numbers of each lane over the warp: lane l returns the sum of the number l / 2. Half of what a lane still
+// has goes to its partner at each step, so that 16 exchanges do for 16 numbers.
+__device__ float add_over_warp(float (&values)[kRoom]) {
+  const int lane = threadIdx.x % kWarp;
+#pragma unroll
+  for (int half = kRoom / 2; half >= 1; half /= 2) {
+    const bool upper = lane & (2 * half);
+#pragma unroll
+    for (int i = 0; i < half; ++i) {
+      const float kept = upper ? values[half + i] : values[i], given = upper ? values[i] : values[half + i];
+      values[i] = kept + __shfl_xor_sync(kAllLanes, given, 2 * half);
+    }
+  }
+  return values[0] + __shfl_xor_sync(kAllLanes, values[0], 1);
+}
+
+}  // namespace
+
+// A thread a splat. `tiles` [m].
+extern "C" __global__ void __launch_bounds__(kThreads)
+splat_tiles(const float* means, const float* conics, const float* colours, const float* opacities, const float* depths,
+            long long count, int columns, int rows, long long* tiles) {
+  const long long i = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= count) return;
+  const Splats splats{means, conics, colours, opacities, depths};
+  Shape shape;
+  long long found = 0;
+  if (shape_of(splats, i, shape)) {
+    const Box box = box_of(shape, columns, rows);
+    for (int row = box.top; row <= box.bottom; ++row)
+      for (int column = box.left; column <= box.right; ++column) found += touches(shape, column, row);
+  }
+  tiles[i] = found;
+}
+
+// A thread a splat. `ends` [m]: where the entries of each splat end. `keys` and `owners`: one for each entry.
+extern "C" __global__ void __launch_bounds__(kThreads)
+splat_entries(const float* means, const float* conics, const float* colours, const float* opacities,
+              const float* depths, long long count, int columns, int rows, const long long* ends, long long* keys,
+              int* owners) {
+  const long long i = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= count) return;
+  const Splats splats{means, conics, colours, opacities, depths};
+  Shape shape;
+  if (!shape_of(splats, i, shape)) return;
+  const Box box = box_of(shape, columns, rows);
+  const long long depth = depth_bits(depths[i]);
+  long long at = i ? ends[i - 1] : 0;
+  for (int row = box.top; row <= box.bottom; ++row)
+    for (int column = box.left; column <= box.right; ++column) {
+      if (!touches(shape, column, row)) continue;
+      keys[at] = (static_cast<long long>(row) * columns + column) << 32 | depth;
+      owners[at] = static_cast<int>(i);
+      ++at;
+    }
+}
+
+// A block a tile. `order`: where each sorted entry was before; `bounds` [tiles + 1]: where those of a tile begin.
+// `last` [h, w]: how many entries of its tile a pixel looks at before it is finished. Depth and median may be null.
+extern "C" __global__ void __launch_bounds__(kThreads)
+rasterise_forward(const float* means, const float* conics, const float* colours, const float* opacities,
+                  const float* depths, const int* owners, const long long* order, const long long* bounds,
+                  const float* background, int width, int height, float* image, float* transmittance, int* last,
+                  float* depth, float* median) {
+  __shared__ Entry batch[kThreads];
+  const Splats splats{means, conics, colours, opacities, depths};
+  const int column = pixel_column(), row = pixel_row();
+  const bool inside = column < width && row < height;
+  const float x = static_cast<float>(column) + 0.5f, y = static_cast<float>(row) + 0.5f;
+  const long long tile = static_cast<long long>(blockIdx.y) * gridDim.x + blockIdx.x;
+  const long long first = bounds[tile];
+  const int count = static_cast<int>(bounds[tile + 1] - first);
+  bool finished = !inside;
+  int looked_at = count;
+  float through = 1.0f, colour[3] = {0.0f, 0.0f, 0.0f}, mean_depth = 0.0f, half_depth = 0.0f;
+  for (int begin = 0; begin < count; begin += kThreads) {
+    if (__syncthreads_and(finished)) break;  // and before the batch is written anew
+    const int size = count - begin < kThreads ? count - begin : kThreads;
+    if (threadIdx.x < size) read_entry(splats, owners[order[first + begin + threadIdx.x]], batch[threadIdx.x]);
+    __syncthreads();
+    for (int i = 0; i < size && !finished; ++i) {
+      const Shape& s = batch[i].shape;
+      const float q = quadratic(s, x - s.x, y - s.y);
+      if (q > s.reach) continue;
+      const float alpha = fminf(alpha_of(s, q), kAlphaMax);
+      if (alpha < kAlphaMin) continue;
+      const float behind = through * (1.0f - alpha);
+      if (behind < kTransmittanceMin) {
+        finished = true;
+        looked_at = begin + i;
+        continue;
+      }
+      const float weight = alpha * through;
+      for (int k = 0; k < 3; ++k) colour[k] = fmaf(weight, batch[i].colour[k], colour[k]);
+      mean_depth = fmaf(weight, batch[i].depth, mean_depth);
+      if (through >= kMedianTransmittance && behind < kMedianTransmittance) half_depth = batch[i].depth;
+      through = behind;
+    }
+  }
+  if (!inside) return;
+  const long long pixel = static_cast<long long>(row) * width + column;
+  for (int k = 0; k < 3; ++k) image[3 * pixel + k] = fmaf(through, background[k], colour[k]);
+  transmittance[pixel] = through;
+  last[pixel] = looked_at;
+  if (depth) depth[pixel] = mean_depth;
+  if (median) median[pixel] = half_depth;
+}
+
+// A block a tile. Gradients by image, alpha and depth may be null; `sums` [entries, kSums] hold zeros.
+//
+// With `value` = colour . gradient (+ depth): the light behind a splat, as the gradient sees it, is what the whole pixel
+// shows without what is in front of it and itself: no transmittance has to be divided out of what was multiplied.
+extern "C" __global__ void __launch_bounds__(kThreads, 4)
+rasterise_backward(const float* means, const float* conics, const float* colours, const float* opacities,
+                   const float* depths, const int* owners, const long long* order, const long long* bounds, int width,
+                   int height, const float* image, const float* transmittance, const int* last, const float* depth,
+                   const float* by_image, const float* by_alpha, const float* by_depth, float* sums) {
+  __shared__ Entry batch[kBatch];
+  __shared__ long long slots[kBatch];
+  __shared__ float parts[kWarps][kBatch][kSums];
+  const Splats splats{means, conics, colours, opacities, depths};
+  const int column = pixel_column(), row = pixel_row();
+  const bool inside = column < width && row < height;
+  const float x = static_cast<float>(column) + 0.5f, y = static_cast<float>(row) + 0.5f;
+  const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
+  const long long first = bounds[static_cast<long long>(blockIdx.y) * gridDim.x + blockIdx.x];
+  float wanted[3] = {0.0f, 0.0f, 0.0f}, wanted_depth = 0.0f, rest = 0.0f, through = 1.0f;
+  int until = 0;
+  if (inside) {
+    const long long pixel = static_cast<long long>(row) * width + column;
+    until = last[pixel];
+    for (int k = 0; k < 3 && by_image; ++k) {
+      wanted[k] = by_image[3 * pixel + k];
+      rest = fmaf(image[3 * pixel + k], wanted[k], rest);
+    }
+    if (by_depth) {
+      wanted_depth = by_depth[pixel];
+      rest = fmaf(depth[pixel], wanted_depth, rest);
+    }
+    if (by_alpha) rest = fmaf(-transmittance[pixel], by_alpha[pixel], rest);
+  }
+  for (int begin = 0; __syncthreads_or(begin < until); begin += kBatch) {  // and before the batch is written anew
+    const long long end = bounds[static_cast<long long>(blockIdx.y) * gridDim.x + blockIdx.x + 1] - first;
+    const int size = end - begin < kBatch ? static_cast<int>(end - begin) : kBatch;
+    if (threadIdx.x < size) {
+      slots[threadIdx.x] = order[first + begin + threadIdx.x];
+      read_entry(splats, owners[slots[threadIdx.x]], batch[threadIdx.x]);
+    }
+    __syncthreads();
+    for (int i = 0; i < size; ++i) {
+      const Shape& s = batch[i].shape;
+      const float dx = x - s.x, dy = y - s.y;
+      const float u = along(s, dx, dy), v = s.vy * dy, q = square_of(u, v);
+      float values[kRoom] = {};
+      bool counts = begin + i < until && q <= s.reach;
+      if (counts) {
+        const float free = alpha_of(s, q), alpha = fminf(free, kAlphaMax);
+        counts = alpha >= kAlphaMin;
+        if (counts) {
+          const float weight = alpha * through;
+          float value = wanted_depth * batch[i].depth;
+          for (int k = 0; k < 3; ++k) {
+            value = fmaf(wanted[k], batch[i].colour[k], value);
+            values[6 + k] = weight * wanted[k];
+          }
+          values[9] = weight * wanted_depth;
+          rest = fmaf(-weight, value, rest);
+          const float by_alpha_here = through * value - rest / (1.0f - alpha);
+          through *= 1.0f - alpha;
+          if (free <= kAlphaMax) {
+            const float by_log = by_alpha_here * alpha, by_q = -0.5f * by_log;
+            values[0] = by_log;
+            values[1] = by_q * u, values[2] = by_q * v;
+            values[3] = by_q * dx * dx, values[4] = by_q * dx * dy, values[5] = by_q * dy * dy;
+          }
+        }
+      }
+      float sum = 0.0f;
+      if (__any_sync(kAllLanes, counts)) sum = add_over_warp(values);
+      if (lane % 2 == 0 && lane / 2 < kSums) parts[warp][i][lane / 2] = sum;
+    }
+    __syncthreads();
+    for (int k = threadIdx.x; k < size * kSums; k += kThreads) {
+      float total = 0.0f;
+      for (int w = 0; w < kWarps; ++w) total += parts[w][k / kSums][k % kSums];
+      sums[slots[k / kSums] * kSums + k % kSums] = total;
+    }
+  }
+}
+
+// A thread a splat. The gradients may overwrite means and conics; `by_depths` may be null.
+extern "C" __global__ void __launch_bounds__(kThreads)
+gather_gradients(const float* means, const float* conics, const float* colours, const float* opacities,
+                 const float* depths, long long count, const long long* ends, const float* sums, float* by_means,
+                 float* by_conics, float* by_colours, float* by_opacities, float* by_depths) {
+  const long long i = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= count) return;
+  float total[kSums] = {};
+  for (long long entry = i ? ends[i - 1] : 0; entry < ends[i]; ++entry)
+    for (int k = 0; k < kSums; ++k) total[k] += sums[entry * kSums + k];
+  Shape s{};
+  const bool drawn = shape_of({means, conics, colours, opacities, depths}, i, s);
+  by_means[2 * i] = -2.0f * s.ux * total[1];
+  by_means[2 * i + 1] = -2.0f * fmaf(s.uy, total[1], s.vy * total[2]);
+  by_conics[3 * i] = total[3];
+  by_conics[3 * i + 1] = 2.0f * total[4];
+  by_conics[3 * i + 2] = total[5];
+  for (int k = 0; k < 3; ++k) by_colours[3 * i + k] = total[6 + k];
+  by_opacities[i] = drawn ? total[0] / s.opacity : 0.0f;
+  if (by_depths) by_depths[i] = total[9];
+}

@@ -1,0 +1,68 @@
+"""The whole pipeline on a card that is not there, by the composed set of operations: `--device cuda`, from photographs
+to pictures and files, beside the same by the native set. Only what gsplat compiles is stood in for; own kernels run
+their own text on the processor."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from captures_support import tiny_scene, write_colmap
+from composition_on_host import build, install
+from cuda_on_host import host_compiler
+from gsplat_stand_in import needs_gsplat
+from pretended_device import pretended_card
+from test_cuda_compiling import needs_nvrtc
+from test_reference_set import BLOCK, CUT, SETTINGS, psnr, vdgs
+from vdgs.kernels import devices
+
+pytestmark = [
+    needs_nvrtc, needs_gsplat, pytest.mark.xdist_group("composition"),
+    pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler"),
+]  # fmt: skip
+
+
+def whole_run(capture: Path, run: Path, *device: str) -> None:
+    vdgs("coarse", capture, "--output", run, "--up", "z", *SETTINGS, *device)
+    vdgs("visibility", run)
+    vdgs("partition", run, *CUT)
+    for block in (0, 1):
+        vdgs("train", run, "--block", block, *BLOCK, *device)
+    vdgs("merge", run)
+    vdgs("eval", run, "--model", "coarse", *device)
+    vdgs("eval", run, "--model", "merged", *device)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory) -> tuple[Path, Path]:
+    """By the native set, and on the card."""
+    folder = tmp_path_factory.mktemp("composed")
+    drivers = build(folder / "kernels")
+    write_colmap(folder / "capture", tiny_scene(columns=3, rows=2, width=32, height=24, points=80))
+    native, card = folder / "native", folder / "card"
+    whole_run(folder / "capture", native)
+    with pytest.MonkeyPatch.context() as patch:
+        install(drivers, folder / "code", patch, "cuda", "gsplat")
+        patch.setattr(devices, "_no_card", lambda index: "")
+        with pretended_card():
+            whole_run(folder / "capture", card, "--device", "cuda")
+            vdgs("render", card, "--kind", "depth", "--output", folder / "depth", "--device", "cuda")
+            vdgs("export", card, "--to", folder / "scene.ply", "--device", "cuda")
+    return native, card
+
+
+def test_a_card_learns_the_place_as_the_processor_does(runs):
+    native, card = runs
+    for ours, theirs in zip(psnr(native), psnr(card), strict=True):
+        assert ours > 13  # 12.0 for a plain grey picture
+        assert theirs == pytest.approx(ours, abs=0.6)
+    first, same = (json.loads((run / "coarse" / "log.jsonl").read_text().splitlines()[0]) for run in runs)
+    assert first["loss"] == pytest.approx(same["loss"], rel=0.05)
+
+
+def test_pictures_of_depth_and_explicit_gaussians_come_from_the_card_too(runs):
+    folder = runs[1].parent
+    assert any(path.is_file() for path in (folder / "depth").rglob("*"))
+    assert (folder / "scene.ply").stat().st_size > 1000

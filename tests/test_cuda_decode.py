@@ -1,0 +1,232 @@
+"""The CUDA decoder without a GPU: its own kernel, run on the processor by a stand-in driver, against the reference."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import fields
+from functools import partial
+
+import pytest
+import torch
+
+from cuda_on_host import ORDERS, HostDriver, build_on_host, host_compiler
+from decode_scenes import Scene, looking_down, turned
+from test_cuda_compiling import needs_nvrtc
+from vdgs.cameras import Camera
+from vdgs.kernels import native
+from vdgs.kernels.cuda import cache
+from vdgs.kernels.cuda.decode import PROGRAM, PackedCamera, decode
+from vdgs.kernels.cuda.decode_adam import decode_backward_adam
+from vdgs.kernels.cuda.driver import cuda_driver
+from vdgs.kernels.cuda.launching import Program, read_header
+from vdgs.kernels.reference.decode import decode as reference
+from vdgs.kernels.reference.decode_adam import decode_backward_adam as by_reference
+from vdgs.kernels.types import AdamState, AnchorSplats, SplatGradients
+
+pytestmark = [needs_nvrtc, pytest.mark.xdist_group("cuda_decode")]
+needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
+CAMERAS = {
+    "down": looking_down(),
+    "turned": turned(),
+    "orthographic": looking_down("orthographic"),
+    "part": turned(width=96, height=64).cropped(20, 10, 70, 50),
+}
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    return build_on_host(PROGRAM.name, tmp_path_factory.mktemp("host"))
+
+
+@pytest.fixture(scope="module")
+def code(tmp_path_factory):
+    """Where compiled code is kept, so that NVRTC runs once (that it is never wrong: test_cuda_compiling.py)."""
+    return tmp_path_factory.mktemp("code")
+
+
+@pytest.fixture(autouse=True)
+def _compiled_once(code, monkeypatch):
+    monkeypatch.setenv(cache.VARIABLE, str(code))
+
+
+def decoded(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order: int = 0) -> AnchorSplats:
+    program = Program(PROGRAM.name, HostDriver(library, order), PROGRAM.headers)
+    anchors = scene.positions, scene.features, scene.offsets, scene.log_scales
+    with torch.no_grad():
+        return decode(*anchors, scene.weights, camera, rows, program=program)
+
+
+def exactly(scene: Scene, camera: Camera, rows=None) -> AnchorSplats:
+    exact = scene.to(torch.float64)
+    with torch.no_grad():
+        return reference(
+            exact.positions.double(), exact.features, exact.offsets, exact.log_scales, exact.weights, camera, rows
+        )
+
+
+def assert_same(found: AnchorSplats, exact: AnchorSplats) -> None:
+    assert torch.equal(found.source, exact.source)
+    for field in fields(AnchorSplats):
+        ours, theirs = getattr(found, field.name), getattr(exact, field.name)
+        scale = float(theirs.double().abs().max()) if theirs.numel() else 0.0
+        torch.testing.assert_close(ours.double(), theirs.double(), rtol=2e-4, atol=1e-5 * scale, msg=field.name)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize(("k", "with_distance"), [(10, False), (3, True)])
+def test_it_equals_the_reference(name, k, with_distance, library):
+    scene = Scene.random(40, k, with_distance=with_distance)
+    exact = exactly(scene, CAMERAS[name])
+    assert 5 < len(exact.source) < 40 * k
+    assert_same(decoded(scene, CAMERAS[name], library), exact)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize(("v", "k"), [(1, 1), (9, 32), (0, 10)])
+def test_any_number_of_anchors_and_offsets(v, k, library):
+    scene = Scene.random(v, k, log_scale=-0.5)
+    assert_same(decoded(scene, looking_down(), library), exactly(scene, looking_down()))
+
+
+@needs_a_compiler
+def test_rows_are_read_where_they_stand(library):
+    scene, rows = Scene.random(30, 10), torch.tensor([0, 3, 4, 17, 29])
+    assert_same(decoded(scene, turned(), library, rows), exactly(scene, turned(), rows))
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("name", ["positions", "features", "offsets", "log_scales"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_what_is_not_finite_spawns_nothing(name, value, library):
+    scene = Scene.random(20, 4)
+    getattr(scene, name)[7].view(-1)[1] = value
+    found = decoded(scene, looking_down(), library)
+    assert_same(found, exactly(scene, looking_down()))
+    assert all(getattr(found, field.name).isfinite().all() for field in fields(AnchorSplats))
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("order", ORDERS[1:])
+def test_the_order_in_which_threads_take_turns_changes_no_bit(order, library):
+    one, other = (decoded(Scene.random(21, 10), turned(), library, order=turns) for turns in (0, order))
+    assert all(torch.equal(getattr(one, field.name), getattr(other, field.name)) for field in fields(AnchorSplats))
+
+
+@needs_a_compiler
+def test_where_autograd_follows_the_reference_decodes(library):
+    scene = Scene.random(10, 4).to(torch.float32)
+    program = Program(PROGRAM.name, HostDriver(library), PROGRAM.headers)
+    anchors = scene.positions, scene.features, scene.offsets, scene.log_scales
+    splats = decode(*anchors, scene.weights, turned(), program=program)
+    assert splats.opacities.requires_grad
+    assert program.driver.launched == []
+
+
+def test_unsuitable_anchors_are_refused():
+    for scene, error in ((Scene.random(2, 33), ValueError), (Scene.random(2, 4).to(torch.float64), TypeError)):
+        with pytest.raises(error), torch.no_grad():
+            decode(scene.positions, scene.features, scene.offsets, scene.log_scales, scene.weights, turned())
+
+
+def test_the_camera_is_laid_out_as_the_header_says():
+    """Field by field, in the header's own order."""
+    text = read_header("gaussian_math.h").split("struct Camera {")[1].split("};")[0]
+    named = [name for line in text.splitlines() if ";" in line for name in _names(line.split("//")[0])]
+    assert named == [name for name, _ in PackedCamera._fields_]
+
+
+def _names(declaration: str) -> list[str]:
+    return [each.strip().split()[-1] for each in declaration.strip().rstrip(";").split(",")]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", CAMERAS)
+def test_a_card_gives_what_the_reference_gives(name):
+    cuda_driver()
+    scene = Scene.random(500, 10)
+    weights = scene.weights.map(lambda t: t.cuda())
+    anchors = (t.cuda() for t in (scene.positions, scene.features, scene.offsets, scene.log_scales))
+    with torch.no_grad():
+        found = decode(*anchors, weights, CAMERAS[name])
+    here = AnchorSplats(**{field.name: getattr(found, field.name).cpu() for field in fields(AnchorSplats)})
+    assert_same(here, exactly(scene, CAMERAS[name]))
+
+
+def moved_by(kernels, scene: Scene, camera: Camera, rows: torch.Tensor, frozen: bool = False, spoil: bool = False):
+    """Whether all was finite, and after a step of Adam: parameters and moments, updates, gradients of the decoder."""
+    with torch.no_grad():
+        splats = native.decode(scene.positions, *scene.trainable[:3], scene.weights, camera, rows)
+    g = torch.Generator().manual_seed(8)
+    m = len(splats.source)
+    gradients = SplatGradients(
+        0.1 * torch.randn(m, 2, generator=g), torch.randn(m, 3, generator=g), torch.randn(m, 3, generator=g),
+        torch.randn(m, generator=g), 0.3, splats.source, splats.colours, splats.opacities,
+    )  # fmt: skip
+    if spoil:
+        gradients.means_px[0] = torch.nan
+    states = [
+        AdamState(t.clone(), 0.1 * torch.randn(t.shape, generator=g), torch.rand(t.shape, generator=g), rate, 4.0)
+        for t, rate in zip(scene.trainable[:3], (0.01, 0.02, 0.005), strict=True)
+    ]
+    updates = (torch.arange(len(scene.positions)) ** 2 % 97).to(torch.int32)
+    updates[3] = 30_000  # more than the tables tell apart
+    weights = scene.weights.map(lambda t: t.clone().requires_grad_(not frozen))
+    finite, found = kernels(scene.positions, states, weights, camera, rows, gradients, updates)
+    return bool(finite), [t for state in states for t in state[:3]], updates, found
+
+
+@needs_a_compiler
+class TestMoving:
+    @pytest.fixture
+    def moving(self, library):
+        return partial(decode_backward_adam, program=Program(PROGRAM.name, HostDriver(library), PROGRAM.headers))
+
+    @pytest.mark.parametrize("name", CAMERAS)
+    @pytest.mark.parametrize(("k", "with_distance"), [(10, False), (3, True)])
+    def test_anchors_move_as_by_the_reference(self, name, k, with_distance, moving):
+        scene, rows = Scene.random(45, k, with_distance=with_distance), torch.arange(0, 45, 2)
+        ours, theirs = (moved_by(kernels, scene, CAMERAS[name], rows) for kernels in (moving, by_reference))
+        assert ours[0] is theirs[0] is True
+        assert torch.equal(ours[2], theirs[2])
+        for found, expected in zip((*ours[1], *ours[3]), (*theirs[1], *theirs[3]), strict=True):
+            error = float((found - expected).norm() / expected.norm().clamp(min=1e-6))
+            assert error < 1e-4, error
+
+    def test_a_frozen_decoder_costs_nothing(self, moving):
+        scene, rows = Scene.random(20, 4), torch.arange(20)
+        assert moved_by(moving, scene, turned(), rows, frozen=True)[3] is None
+
+    def test_a_gradient_that_is_no_number_is_told_and_moves_nothing_of_its_anchor(self, moving):
+        scene, rows = Scene.random(20, 4), torch.arange(20)
+        finite, tensors, updates, _ = moved_by(moving, scene, looking_down(), rows, spoil=True)
+        assert not finite
+        assert all(tensor.isfinite().all() for tensor in tensors)
+        assert int(updates[5]) == 26
+
+    @pytest.mark.parametrize("order", ORDERS[1:])
+    def test_the_order_in_which_threads_take_turns_changes_no_bit(self, order, library):
+        results = []
+        for turns in (0, order):
+            program = Program(PROGRAM.name, HostDriver(library, turns), PROGRAM.headers)
+            moving = partial(decode_backward_adam, program=program)
+            results.append(moved_by(moving, Scene.random(17, 10), turned(), torch.arange(17)))
+        assert all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
+        assert all(torch.equal(one, other) for one, other in zip(results[0][3], results[1][3], strict=True))
+
+    def test_states_that_anneal_apart_are_refused(self, moving):
+        scene = Scene.random(4, 3)
+        states = [AdamState(t, t, t, 0.1, early) for t, early in zip(scene.trainable[:3], (1.0, 2.0, 1.0), strict=True)]
+        nothing = torch.zeros(0)
+        none = SplatGradients(
+            torch.zeros(0, 2),
+            torch.zeros(0, 3),
+            torch.zeros(0, 3),
+            nothing,
+            0.0,
+            nothing.int(),
+            torch.zeros(0, 3),
+            nothing,
+        )
+        with pytest.raises(ValueError, match="annealed alike"):
+            moving(scene.positions, states, scene.weights, turned(), torch.arange(4), none, torch.zeros(4).int())

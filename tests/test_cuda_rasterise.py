@@ -1,0 +1,192 @@
+"""The CUDA rasteriser without a GPU: its kernels, run on the processor by a stand-in driver, against the reference."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+
+import pytest
+import torch
+
+from cuda_on_host import ORDERS, HostDriver, Stuck, build_on_host, host_compiler
+from rasterise_scenes import Scene, make_scene, splats_of
+from test_cuda_compiling import needs_nvrtc
+from test_rasterise import assert_close, assert_same_picture, loss_of
+from vdgs.kernels.cuda import cache
+from vdgs.kernels.cuda.driver import cuda_driver
+from vdgs.kernels.cuda.launching import Program, read_source
+from vdgs.kernels.cuda.rasterise import PROGRAM, rasterise, rasterise_vjp
+from vdgs.kernels.reference.rasterise import rasterise as reference
+from vdgs.kernels.types import Raster
+
+pytestmark = [needs_nvrtc, pytest.mark.xdist_group("cuda_rasterise")]
+needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
+#: Whatever makes the threads of a block wait for each other.
+BARRIER = re.compile(r"__syncthreads(?:_and|_or)?\(")
+BARRIERS = 5
+SCENES = {
+    "ordinary": make_scene(150, 37, 29),
+    "dense": make_scene(700, 20, 18, opacity=2.0),
+    "huge": make_scene(40, 33, 33, size=200.0, opacity=-2.0),
+    "tiny": make_scene(200, 20, 20, size=0.05),
+    "edge-on": make_scene(120, 25, 35, size=4.0, thinness=2.0),
+    "off-screen": make_scene(100, 20, 20, margin=4.0),
+    "opaque": make_scene(200, 33, 17, size=6.0, opacity=30.0),
+    "empty": make_scene(0, 20, 10),
+    "one pixel": make_scene(10, 1, 1, size=1.0),
+}
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    return build_on_host("rasterise.cu", tmp_path_factory.mktemp("host"))
+
+
+@pytest.fixture(scope="module")
+def numbered(tmp_path_factory):
+    """The kernels, of whose barriers one can be left out: that of the number `left_out`."""
+    text, number = read_source("rasterise.cu"), iter(range(BARRIERS))
+    text = BARRIER.sub(lambda found: f"{found[0][:-1].replace('__', 'maybe_')}({next(number)}, ", text)
+    assert next(number, None) is None
+    text = text.replace(", )", ")")
+    before = """
+extern "C" int left_out;
+int left_out = -1;
+void maybe_syncthreads(int number) { if (number != left_out) __syncthreads(); }
+int maybe_syncthreads_and(int number, int mine) { return number == left_out ? mine : __syncthreads_and(mine); }
+int maybe_syncthreads_or(int number, int mine) { return number == left_out ? mine : __syncthreads_or(mine); }
+"""
+    return build_on_host("rasterise.cu", tmp_path_factory.mktemp("numbered"), before + text)
+
+
+@pytest.fixture(scope="module")
+def code(tmp_path_factory):
+    """Where compiled code is kept, so that NVRTC runs once (that it is never wrong: test_cuda_compiling.py)."""
+    return tmp_path_factory.mktemp("code")
+
+
+@pytest.fixture(autouse=True)
+def _compiled_once(code, monkeypatch):
+    monkeypatch.setenv(cache.VARIABLE, str(code))
+
+
+def drawn(scene: Scene, library: ctypes.CDLL, order: int = 0, depth: bool = True) -> Raster:
+    program = Program("rasterise.cu", HostDriver(library, order), PROGRAM.headers)
+    return rasterise(*splats_of(scene.tensors), scene.width, scene.height, depth=depth, program=program)
+
+
+def bits_of(scene: Scene, library: ctypes.CDLL, order: int) -> list[bytes]:
+    """Everything that drawing and the way back give."""
+    scene = scene.to(torch.float32)
+    raster = drawn(scene, library, order)
+    gradients = torch.autograd.grad(loss_of(raster), scene.tensors)
+    return [tensor.detach().numpy().tobytes() for tensor in (*raster, *gradients)]
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("name", SCENES)
+def test_picture_and_gradients_equal_the_reference(name, library):
+    scene, exact_scene = SCENES[name].to(torch.float32), SCENES[name].to(torch.float64)
+    exact = reference(*splats_of(exact_scene.tensors), scene.width, scene.height, depth=True)
+    found = drawn(scene, library)
+    assert_same_picture(found, exact, 2e-5)
+    gradients = torch.autograd.grad(loss_of(found), scene.tensors)
+    for actual, expected in zip(gradients, torch.autograd.grad(loss_of(exact), exact_scene.tensors), strict=True):
+        # A mean or conic is known to 6e-8; a splat seen edge-on multiplies that.
+        assert_close(actual, expected, 2e-3 if name == "edge-on" else 1e-4)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("order", ORDERS[1:])
+def test_no_barrier_is_missing(order, library):
+    """The order in which threads and warps take turns changes no bit."""
+    assert bits_of(SCENES["ordinary"], library, order) == bits_of(SCENES["ordinary"], library, 0)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("barrier", range(BARRIERS))
+def test_a_missing_barrier_would_be_noticed(barrier, numbered):
+    """And every barrier is needed: without any one of them the order of turns changes the result, or threads wait in
+    vain for others."""
+    scene = make_scene(600, 17, 5, opacity=-1.0)  # more than fit into shared memory at once
+    left_out = ctypes.c_int.in_dll(numbered, "left_out")
+
+    def results(left: int) -> set[tuple[bytes, ...] | str]:
+        left_out.value = left
+        found: set[tuple[bytes, ...] | str] = set()
+        for order in ORDERS:
+            try:
+                found.add(tuple(bits_of(scene, numbered, order)))
+            except Stuck:
+                found.add("stuck")
+        return found
+
+    whole = results(-1)
+    assert len(whole) == 1
+    assert results(barrier) != whole
+
+
+@needs_a_compiler
+class TestMeaning:
+    def test_without_depth_there_is_none_and_the_picture_is_the_same(self, library):
+        scene = SCENES["ordinary"]
+        plain, whole = drawn(scene, library, depth=False), drawn(scene, library)
+        assert (plain.depth, plain.median_depth) == (None, None)
+        assert torch.equal(plain.image, whole.image)
+        assert torch.equal(plain.alpha, whole.alpha)
+
+    @pytest.mark.parametrize("column", range(5))
+    def test_rows_that_are_not_finite_are_not_drawn_and_get_no_gradient(self, column, library):
+        scene = SCENES["ordinary"].to(torch.float32)
+        with torch.no_grad():
+            scene.tensors[column].view(len(scene.tensors[column]), -1)[3, 0] = torch.nan
+        raster = drawn(scene, library)
+        assert all(tensor.isfinite().all() for tensor in raster)
+        gradients = torch.autograd.grad(loss_of(raster), scene.tensors)
+        assert all(tensor.isfinite().all() for tensor in gradients)
+        assert all((tensor[3] == 0).all() for tensor in gradients[:5])
+
+    def test_depths_of_either_sign_and_equal_ones_keep_the_order_of_the_rows(self, library):
+        scene = make_scene(60, 16, 16, opacity=2.0)
+        depths = torch.tensor([-3.0, -0.0, 0.0, 2.0, 2.0]).repeat(12)
+        scene = Scene((*scene.tensors[:4], depths, scene.tensors[5]), 16, 16)
+        exact = reference(*splats_of(scene.to(torch.float64).tensors), 16, 16)
+        assert_close(drawn(scene, library, depth=False).image, exact.image, 1e-5)
+
+    def test_the_way_back_overwrites_what_it_may(self, library):
+        scene, program = SCENES["ordinary"], Program("rasterise.cu", HostDriver(library), PROGRAM.headers)
+        splats, background = splats_of([tensor.detach().clone() for tensor in scene.tensors])
+        by_alpha = torch.randn(scene.height, scene.width, generator=torch.Generator().manual_seed(0))
+        expected = rasterise_vjp(splats, background, scene.width, scene.height, program=program)[1](None, by_alpha)
+        _, pullback = rasterise_vjp(splats, background, scene.width, scene.height, program=program)
+        found = pullback(None, by_alpha, over=(splats.means_px, splats.conics))
+        assert found.means_px is splats.means_px
+        assert found.depths is expected.depths is None
+        for ours, theirs in zip(found, expected, strict=True):
+            assert ours is theirs is None or torch.equal(ours, theirs)
+
+    def test_unsuitable_tensors_are_refused(self, library):
+        splats, background = splats_of(SCENES["ordinary"].to(torch.float64).tensors)
+        program = Program("rasterise.cu", HostDriver(library), PROGRAM.headers)
+        with pytest.raises(TypeError, match="float32"):
+            rasterise(splats, background, 37, 29, program=program)
+        with pytest.raises(ValueError, match="width"):
+            rasterise(*splats_of(SCENES["ordinary"].tensors), 0, 29, program=program)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", SCENES)
+def test_a_card_gives_what_the_reference_gives(name):
+    cuda_driver()
+    scene, exact_scene = SCENES[name].to(torch.float32), SCENES[name].to(torch.float64)
+    there = [tensor.detach().cuda().requires_grad_() for tensor in scene.tensors]
+    found = rasterise(*splats_of(there), scene.width, scene.height, depth=True)
+    exact = reference(*splats_of(exact_scene.tensors), scene.width, scene.height, depth=True)
+    here = Raster(*(tensor.cpu() for tensor in found))
+    assert_same_picture(here, exact, 1e-4)
+    gradients = torch.autograd.grad(loss_of(here), there)
+    once_more = rasterise(*splats_of(there), scene.width, scene.height, depth=True)
+    again = torch.autograd.grad(loss_of(Raster(*(tensor.cpu() for tensor in once_more))), there)
+    for ours, expected in zip(gradients, torch.autograd.grad(loss_of(exact), exact_scene.tensors), strict=True):
+        assert_close(ours.cpu(), expected, 2e-3 if name == "edge-on" else 1e-3)
+    assert all(torch.equal(one, other) for one, other in zip(gradients, again, strict=True))
