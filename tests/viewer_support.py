@@ -151,6 +151,17 @@ class Page:
     def evaluate(self, expression: str) -> Any:
         return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
 
+    def wait_until_loaded(self, address: str) -> None:
+        """Between one page and the next there is none that could be drawn."""
+        until = time.monotonic() + PATIENCE
+        while time.monotonic() < until:
+            with contextlib.suppress(AssertionError):
+                if self.evaluate("location.href + document.readyState").endswith("complete"):
+                    if self.evaluate("location.href").split("?")[0] == address.split("?")[0]:
+                        return
+            time.sleep(0.05)
+        raise AssertionError(f"the browser does not open {address}")
+
     def screenshot(self) -> np.ndarray:
         """What the page shows, RGB."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
@@ -169,8 +180,8 @@ class Page:
 
 
 @contextlib.contextmanager
-def open_page(address: str, width: int = 1000, height: int = 700) -> Iterator[Page]:
-    """A page of the machine's browser, without a window, drawn in software."""
+def open_page(address: str, width: int = 1000, height: int = 700, offline: bool = False) -> Iterator[Page]:
+    """A page of the machine's browser, without a window, drawn in software; `offline`: without any network."""
     command = browser()
     assert command is not None
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
@@ -191,7 +202,12 @@ def open_page(address: str, width: int = 1000, height: int = 700) -> Iterator[Pa
                 page.call(
                     "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
                 )
+                if offline:
+                    page.call("Network.enable")
+                    speed = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+                    page.call("Network.emulateNetworkConditions", offline=True, **speed)
                 page.call("Page.navigate", url=address)
+                page.wait_until_loaded(address)
                 yield page
         finally:
             process.terminate()

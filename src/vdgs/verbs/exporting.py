@@ -20,7 +20,8 @@ class ExportArguments(ExportRequest):
     """Run folder."""
     to: Annotated[tuple[Path, ...], UseAppendAction] = ()
     """A file to write, by its ending: .ply (3DGS), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles),
-    .points.ply, .laz, .las (point clouds). Give --to again for more: the scene is baked once (docs/export.md)."""
+    .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline). Give --to again for more: the
+    scene is baked once (docs/export.md)."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
 

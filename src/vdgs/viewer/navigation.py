@@ -11,10 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
-from vdgs.captures.heights import camera_height
+from vdgs.captures.overview import FOV_DEG, overview
 
-#: Angle of view of a new visitor, vertical (choice).
-FOV_DEG = 50.0
 #: Nearer to straight down than this, the direction on the map no longer follows from where one looks.
 _STEEP = 0.995
 #: How far a view from straight above is tilted, so that it knows which way is north.
@@ -51,18 +49,8 @@ def camera_of(wxyz: np.ndarray, position: np.ndarray, fov: float, width: int, he
 
 
 def whole_scene(capture: Capture) -> Stand:
-    """All of the flight from the south, half from above."""
-    middle, half = _extent(capture)
-    distance = max(1.5 * camera_height(capture), 1.3 * half / math.tan(math.radians(FOV_DEG / 2)))
-    return Stand(middle + distance * np.array([0.0, -math.sqrt(0.5), math.sqrt(0.5)]), middle)
-
-
-def _extent(capture: Capture) -> tuple[Float[np.ndarray, "3"], float]:
-    """The middle of what was flown over, on the ground, and half its longer side."""
-    flown = np.stack([view.camera.position for view in capture.train_views])[:, :2]
-    low, high = np.quantile(flown, (0.05, 0.95), axis=0)
-    ground = float(np.median(capture.points[:, 2])) if len(capture.points) else 0.0
-    return np.append((low + high) / 2, ground), max(float((high - low).max()) / 2, camera_height(capture) / 2)
+    """All of the flight."""
+    return Stand(*overview(capture))
 
 
 def from_above(stand: Stand) -> Stand:
