@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
@@ -41,11 +40,18 @@ def camera_of(wxyz: np.ndarray, position: np.ndarray, fov: float, width: int, he
     usable = np.isfinite(turn).all() and np.isfinite(place).all() and np.linalg.norm(turn) > 1e-6
     if not (usable and width > 0 and height > 0 and 1e-3 < fov < math.pi - 1e-3):
         raise ValueError("this is no camera")
-    rotation = Rotation.from_quat(np.roll(turn, -1)).as_matrix().T
+    rotation = _matrix_of(turn / np.linalg.norm(turn)).T
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ place
     focal = 0.5 * height / math.tan(0.5 * fov)
     return Camera(pose, focal, focal, width / 2, height / 2, width, height)
+
+
+def _matrix_of(wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation of a unit quaternion: v -> v + 2w (u × v) + 2u × (u × v)."""
+    w, (x, y, z) = wxyz[0], wxyz[1:]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + 2.0 * (w * cross + cross @ cross)
 
 
 def whole_scene(capture: Capture) -> Stand:
