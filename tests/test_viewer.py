@@ -387,7 +387,7 @@ def test_small_while_moving_and_full_at_rest(studio):
 def test_a_camera_that_moves_on_leaves_nothing_to_be_finished(studio):
     studio, clock = studio
     seat, frames, _ = sit(studio, Slow(clock, 1e-6))
-    for _ in range(2):  # the second picture is drawn in turns: the first one told how long they take
+    for x in range(2):  # the second picture is drawn in turns: the first one told how long they take
         studio.ask(seat, camera_at(x, 0, width=1280), Shown())
         studio.step()
         clock.now += REST
@@ -431,7 +431,7 @@ class Decoding(Slow):
         return super().paint(shown, camera, whole, most)
 
 
-@pytest.mark.parametrize(("moving", "drawn"), [(1, 20_000), (3, 20_000), (8, 6_666)])
+@pytest.mark.parametrize(("moving", "drawn"), [(1, 20_000), (2, 20_000), (8, 6_666)])
 def test_a_round_of_all_who_move_stays_short(studio, moving, drawn):
     studio, clock = studio
     painters = [Decoding(clock, 2e-6) for _ in range(moving)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import shutil
@@ -19,6 +20,8 @@ from rich.console import Console
 
 pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[viewer]')")
 
+import viser
+
 from captures_support import tiny_scene, write_colmap
 from cli_support import vdgs, wait_until
 from vdgs.cameras import Camera
@@ -31,7 +34,12 @@ from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
 from vdgs.viewer.door import Door
 from vdgs.viewer.following import newest, open_or_last_saved, standing_lines
+from vdgs.viewer.layers import Painter
+from vdgs.viewer.path_panel import PathPanel
+from vdgs.viewer.place_panel import PlacePanel
 from vdgs.viewer.serving import Viewer, free_port, serve
+from vdgs.viewer.studio import KEPT, Seat
+from vdgs.viewer.visitor import Visitor
 from viewer_support import Guest, browser, open_page
 
 pytestmark = pytest.mark.xdist_group("viewer")
@@ -115,6 +123,26 @@ def test_a_click_tells_the_place(viewer, guest):
 
 
 @quiet
+def test_a_double_click_turns_about_the_place(viewer, guest):
+    camera = above(width=640, height=480)
+    guest.stand(camera)
+    guest.full_picture(camera)
+    (visitor,) = viewer.visitors.values()
+    visitor.place.clock = lambda: 0.0  # all at the same time
+    x, y = camera.project(np.array([[0.8, -0.6, 0.0]]))[0][0]
+    guest.click(x / 640, y / 480)
+    guest.click(x / 640 + 0.1, y / 480)  # elsewhere
+    wait_until(lambda: visitor.place._place is not None)
+    assert visitor.camera.position == pytest.approx(camera.position)
+    guest.click(x / 640, y / 480)
+    guest.click(x / 640, y / 480)
+    wait_until(lambda: np.linalg.norm(visitor.stand.look_at[:2] - [0.8, -0.6]) < 0.15)
+    assert visitor.camera.position == pytest.approx(camera.position, abs=1e-6)
+    seen, _ = visitor.camera.project(visitor.stand.look_at[None])
+    assert seen[0] == pytest.approx((320.0, 240.0), abs=0.5)
+
+
+@quiet
 def test_a_path_is_set_and_saved(viewer, guest, tmp_path):
     frames = [above(), above(1.0, 0.0)]
     for count, camera in enumerate(frames, start=1):
@@ -152,6 +180,27 @@ def test_visitors_that_vanish_are_forgotten(viewer):
     guests[3].close()
     wait_until(lambda: not viewer.visitors)
     assert not viewer.studio._seats
+
+
+@quiet
+def test_many_visits_leave_nothing_behind(viewer):
+    """Counted in objects: what a process weighs depends on its allocator, and on what else was at work."""
+    kinds = (Visitor, Painter, Seat, PlacePanel, PathPanel, viser.ClientHandle)
+
+    def there() -> dict[type, int]:
+        gc.collect()
+        return {kind: sum(isinstance(each, kind) for each in gc.get_objects()) for kind in kinds}
+
+    wait_until(lambda: not viewer.visitors)
+    for number in range(6):
+        guest = Guest(viewer.door.address())
+        guest.stand(above(0.1 * number))
+        guest.full_picture(above(0.1 * number))
+        guest.choose("Layer", "Depth")
+        (guest.vanish if number % 2 else guest.close)()
+    wait_until(lambda: not viewer.visitors)
+    wait_until(lambda: not any(there().values()))
+    assert len(viewer.studio._full_pictures) <= KEPT
 
 
 @quiet

@@ -33,3 +33,8 @@ def export(arguments: list[str]) -> None:
     device = use_device(asked.device)
     use_threads(asked.threads)
     export_run(replace(asked, device=device), open_console(asked.quiet))
+    from vdgs.report.write import FILE, write_report
+    from vdgs.runs.folder import RunFolder
+
+    if any(path.suffix.lower() == ".html" for path in asked.to) and (asked.run / FILE).exists():
+        write_report(RunFolder(asked.run))  # it leads to the page

@@ -11,6 +11,7 @@ its seconds an anchor, and asks for as many as fit. Two visitors who rest at the
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from collections import OrderedDict, deque
@@ -163,6 +164,7 @@ class Studio:
                 told = self._changed.wait(IDLE if wait is None else wait)
                 if told or wait is not None or self._busy() or self._closed:
                     continue
+            gc.collect()  # who left is held by circles of theirs
             return_unused()
             with self._changed:
                 self._changed.wait_for(lambda: self._busy() or self._closed)
