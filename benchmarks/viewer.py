@@ -29,9 +29,10 @@ import psutil
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from vdgs.cameras import Camera
+from vdgs.captures.overview import FOV_DEG
 from vdgs.films.paths import look_at
 from vdgs.runs.opening import open_run
-from vdgs.viewer.navigation import FOV_DEG, whole_scene
+from vdgs.viewer.navigation import whole_scene
 from viewer_support import Guest
 
 SERVER = "import sys\nfrom vdgs.cli import main\nmain(sys.argv[1:])"
@@ -153,8 +154,8 @@ def load(address: str, camera, visitors: int, seconds: float, server: psutil.Pro
     rates = [each["rate"] for each in found[: len(stay)]]
     print(
         f"load: {visitors} visitors for {seconds:g} s, of whom {len(change)} came {sum(found[len(stay) :])} times and "
-        f"vanished half of them: those who stayed got {min(rates):.1f} to {max(rates):.1f} pictures a second; memory, MB: "
-        + " ".join(str(weight) for weight in weights)
+        f"vanished half of them: those who stayed got {min(rates):.1f} to {max(rates):.1f} pictures a second; "
+        "memory, MB: " + " ".join(str(weight) for weight in weights)
     )
     assert server.is_running()
 

@@ -32,7 +32,9 @@ PLACED = Facts(origin=(690_000.0, 5_334_000.25, 512.0), crs="EPSG:32632", geodet
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 300.0])
 def test_a_page_holds_the_scene_in_any_unit(tmp_path, scale):
     gaussians = random_gaussians(2000, 0)
-    gaussians = replace(gaussians, means=scale * gaussians.means, log_scales=gaussians.log_scales + float(np.log(scale)))
+    gaussians = replace(
+        gaussians, means=scale * gaussians.means, log_scales=gaussians.log_scales + float(np.log(scale))
+    )
     assert registry.write(tmp_path / "a.html", Scene.of(gaussians, PLACED)) == (
         "colours do not change with the viewing direction",
     )
@@ -57,7 +59,7 @@ def test_what_is_far_larger_than_all_else_is_held_as_large_as_it_can_be(tmp_path
 def test_what_is_too_large_is_thinned_until_it_fits(tmp_path):
     gaussians = random_gaussians(40_000, 1, reach=20.0)
     page = Page((0.0, -20.0, 20.0), (0.0, 0.0, 0.0), most_bytes=1_300_000)
-    (fixed, thinned) = registry.write(tmp_path / "a.html", replace(Scene.of(gaussians), page=page))
+    _, thinned = registry.write(tmp_path / "a.html", replace(Scene.of(gaussians), page=page))
     assert (tmp_path / "a.html").stat().st_size <= 1_300_000
     kept = len(registry.read(tmp_path / "a.html"))
     assert 40_000 // 8 < kept <= 40_000 // 2

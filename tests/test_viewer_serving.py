@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+from itertools import combinations
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
@@ -39,7 +40,7 @@ from vdgs.viewer.path_panel import PathPanel
 from vdgs.viewer.place_panel import PlacePanel
 from vdgs.viewer.serving import Viewer, free_port, serve
 from vdgs.viewer.studio import KEPT, Seat
-from vdgs.viewer.visitor import Visitor
+from vdgs.viewer.visitor import NAMES, Visitor
 from viewer_support import Guest, browser, open_page
 
 pytestmark = pytest.mark.xdist_group("viewer")
@@ -420,3 +421,36 @@ def test_a_browser_shows_the_scene(viewer):
         page.drag((340.0, 440.0), (430.0, 400.0))
         wait_until(lambda: not np.allclose(visitor.camera.position, camera.position))
         wait_until(lambda: differs() < 8)  # the mark of the place is in it now
+
+
+@quiet
+@pytest.mark.skipif(browser() is None, reason="no Chromium on this machine (apt-get install chromium)")
+def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
+    wait_until(lambda: not viewer.visitors)
+    part = slice(250, 650), slice(40, 600)  # beside the panel
+    with open_page(viewer.door.address(), 1000, 700) as page:
+        wait_until(lambda: viewer.visitors)
+        (visitor,) = viewer.visitors.values()
+        wait_until(lambda: visitor.camera is not None and visitor.camera.width == 1000)
+
+        def painted() -> np.ndarray:
+            """What the visitor should see now."""
+            camera = visitor.camera
+            return visitor.errand(lambda: visitor.painter.paint(visitor.shown, camera, camera))[part].astype(int)
+
+        shown = {}
+        for name in NAMES:
+            visitor._layer.value = name
+            wait_until(lambda name=name: visitor.shown.layer == NAMES[name])
+            wait_until(lambda: np.abs(page.screenshot()[part] - painted()).mean() < 8)
+            shown[name] = page.screenshot()[part].astype(int)
+        for one, other in combinations(shown, 2):
+            assert np.abs(shown[one] - shown[other]).mean() > 3, (one, other)
+        visitor._layer.value = "Colour"
+        for name, looks in (("From above", (0, 0, -1)), ("All", (0, 0.71, -0.71))):
+            wait_until(lambda name=name: page.press(name))
+            wait_until(lambda looks=looks: visitor.camera.forward == pytest.approx(looks, abs=0.02))
+            up = -visitor.camera.camera_from_world[1, :3]
+            assert up[1] > 0.7  # north is up
+            assert abs(up[0]) < 0.01
+            wait_until(lambda: np.abs(page.screenshot()[part] - painted()).mean() < 8)

@@ -155,10 +155,10 @@ class Page:
         """Between one page and the next there is none that could be drawn."""
         until = time.monotonic() + PATIENCE
         while time.monotonic() < until:
-            with contextlib.suppress(AssertionError):
-                if self.evaluate("location.href + document.readyState").endswith("complete"):
-                    if self.evaluate("location.href").split("?")[0] == address.split("?")[0]:
-                        return
+            with contextlib.suppress(AssertionError, TypeError):
+                there, state = self.evaluate("[location.href, document.readyState]")
+                if state == "complete" and there.split("?")[0] == address.split("?")[0]:
+                    return
             time.sleep(0.05)
         raise AssertionError(f"the browser does not open {address}")
 
@@ -170,6 +170,11 @@ class Page:
     def click(self, x: float, y: float) -> None:
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def press(self, words: str) -> bool:
+        """Press the button with these words; False while there is none."""
+        found = f"[...document.querySelectorAll('button')].find(each => each.textContent === {json.dumps(words)})"
+        return bool(self.evaluate(f"(() => {{const it = {found}; it?.click(); return it !== undefined;}})()"))
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8) -> None:
         mouse = {"button": "left", "buttons": 1, "clickCount": 1}

@@ -50,7 +50,9 @@ class _Baked:
         count = len(self.spool.means)
         corners = frame.scale * self.spool.means.astype(np.float64) @ frame.rotation.T + frame.translation
         low, high = tuple(corners.min(axis=0).tolist()), tuple(corners.max(axis=0).tolist())
-        return Scene(self._chunks(frame, count), count, self.degree, frame.facts, (low, high), _placed(self.page, frame))
+        return Scene(
+            self._chunks(frame, count), count, self.degree, frame.facts, (low, high), _placed(self.page, frame)
+        )
 
     def _chunks(self, frame: Frame, count: int) -> Iterator[Gaussians]:
         for first in range(0, count, ROWS):
@@ -194,9 +196,7 @@ def _check_scenes(frames: dict[Path, Frame], seen: Survey, kept: np.ndarray, deg
 
 
 @contextmanager
-def _baked(
-    seen: Survey, kept: np.ndarray, degree: int, page: Page, folder: Path, bar: Progress
-) -> Iterator[_Baked]:
+def _baked(seen: Survey, kept: np.ndarray, degree: int, page: Page, folder: Path, bar: Progress) -> Iterator[_Baked]:
     """The Gaussians in a temporary file beside the first output."""
     task = bar.add_task("fitting Gaussians", total=len(kept))
 

@@ -23,7 +23,9 @@ def page_link(shown: Shown) -> Html:
         if path.lower().endswith(".html") and os.path.isfile(path):
             address = quote(Path(os.path.relpath(path, run.path.resolve())).as_posix())
             size = (file.number("bytes") or 0) / 1e6
-            return link(address, "Move through the scene", f" ({os.path.basename(path)}, {size:,.1f} MB; opens offline)")
+            return link(
+                address, "Move through the scene", f" ({os.path.basename(path)}, {size:,.1f} MB; opens offline)"
+            )
     return Html("")
 
 

@@ -90,9 +90,7 @@ class Painter:
         both = shown.model == "both" and len(self._scene.names) > 1
         return sum(self._scene.level(name, camera)[1] for name in (self._scene.names if both else [self._model(shown)]))
 
-    def paint(
-        self, shown: Shown, camera: Camera, whole: Camera, most: int | None = None
-    ) -> UInt8[np.ndarray, "h w 3"]:
+    def paint(self, shown: Shown, camera: Camera, whole: Camera, most: int | None = None) -> UInt8[np.ndarray, "h w 3"]:
         """A picture, or rows of it: `camera` is `whole` or cropped from it, all columns. `most`: drawn from at most so
         many anchors."""
         self.drawn = 0

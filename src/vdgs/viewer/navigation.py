@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
-from vdgs.captures.overview import FOV_DEG, overview
+from vdgs.captures.overview import overview
 
 #: Nearer to straight down than this, the direction on the map no longer follows from where one looks.
 _STEEP = 0.995

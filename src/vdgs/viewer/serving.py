@@ -18,6 +18,7 @@ from typing import Any
 from rich.console import Console
 
 from vdgs.captures.heights import camera_height
+from vdgs.captures.overview import FOV_DEG
 from vdgs.errors import Interrupted, VdgsError
 from vdgs.memory.process import share_arenas
 from vdgs.runs.folder import RunFolder
@@ -110,8 +111,8 @@ def serve(run: TrainedRun, host: str, port: int, console: Console) -> Iterator[V
         if visitor is not None:
             visitor.leave()
 
-    # What is there by now stays. Left out of all later searches for garbage, these are quick and come often: visitors who
-    # left are held by circles of viser's until one finds them.
+    # What is there by now stays. Left out of all later searches for garbage, it lets them be quick and frequent:
+    # visitors who left are held by circles of viser's until one finds them.
     gc.collect()
     gc.freeze()
     worker = threading.Thread(target=studio.run, name="studio", daemon=True)
@@ -133,7 +134,7 @@ def _place_newcomers(server: Any, run: TrainedRun) -> None:
     """Where a browser stands when it first opens the page; one that connects again stays where it is."""
     stand, height = navigation.whole_scene(run.capture), camera_height(run.capture)
     start = server.initial_camera
-    start.up, start.fov = (0.0, 0.0, 1.0), math.radians(navigation.FOV_DEG)
+    start.up, start.fov = (0.0, 0.0, 1.0), math.radians(FOV_DEG)
     start.position, start.look_at = tuple(stand.position), tuple(stand.look_at)
     start.near, start.far = 1e-3 * height, 1000 * height
 
@@ -221,7 +222,7 @@ def _start(door: Door) -> Any:
 
 
 def _keep_short(connection: Any) -> None:
-    """Let nothing pile up in the system's buffers (Linux, macOS): over a slow network, pictures there would be seconds old."""
+    """Let nothing pile up in the system's buffers (Linux, macOS): over a slow network, pictures there grow old."""
     if hasattr(socket, "TCP_NOTSENT_LOWAT"):
         with contextlib.suppress(OSError, AttributeError):
             wire = connection.transport.get_extra_info("socket")

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt32
 
+from vdgs.captures.overview import FOV_DEG
 from vdgs.errors import VdgsError
 from vdgs.export.formats.levels import axes_of, thinned
 from vdgs.export.formats.scene import Page, Scene, bytes_of, colours, logits_of, opacities
@@ -34,9 +35,7 @@ WORDS = 8
 USUAL_SIZE = 0.1
 #: No standard deviation above this, in lengths of the page: its square ends below the largest float16.
 LARGEST_SIZE = 250.0
-#: Vertical angle of the first view, degrees.
-FOV_DEG = 50.0
-#: What a page looks up of a Gaussian is tried on so many to tell how large all will be; it is right within this share.
+#: Bytes a Gaussian takes are found on so many; they are right within this share.
 SAMPLE, SLACK = 1 << 15, 1.05
 #: Fewer than this are no scene.
 FEWEST = 1000
@@ -46,11 +45,11 @@ _EMBEDDED = re.compile(r'window\.__VISER_EMBED_DATA__="([A-Za-z0-9+/=]*)"')
 _FACTS = re.compile(r'<meta name="vdgs" content="([^"]*)"')
 #: The page may load nothing: all that it needs is in it.
 _POLICY = (
-    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' data: blob:; worker-src data: blob:; "
-    "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; connect-src data: blob:"
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' data: blob:; "
+    "worker-src data: blob:; style-src 'unsafe-inline'; img-src data: blob:; font-src data:; connect-src data: blob:"
 )
-#: Chromium refuses module workers from blobs in pages that were opened as files, and without its worker the client never
-#: sorts the Gaussians by depth. The same script as a data URL it takes.
+#: Chromium refuses module workers from blobs in pages that were opened as files, and without its worker the client
+#: never sorts the Gaussians by depth. The same script as a data URL it takes.
 _WORKERS = (
     "<script>{const Usual=Worker;window.Worker=class extends Usual{constructor(url,options){"
     "if(location.protocol==='file:'&&String(url).startsWith('blob:')){const script=new XMLHttpRequest();"
@@ -172,7 +171,9 @@ def _document(gaussians: Gaussians, factor: float, page: Page, scene: Scene) -> 
         f'<meta name="vdgs" content="{html.escape(json.dumps(facts))}">{_WORKERS}'
     )
     recording = _recorded(_packed(gaussians, factor), factor, page)
-    script = f'<script>window.__VISER_EMBED_DATA__="{recording}";window.__VISER_EMBED_CONFIG__={{darkMode:false}};</script>'
+    script = (
+        f'<script>window.__VISER_EMBED_DATA__="{recording}";window.__VISER_EMBED_CONFIG__={{darkMode:false}};</script>'
+    )
     caption = (
         f'<p style="{_CAPTION}">{title} · {len(gaussians):,} Gaussians, colours as seen from no particular side · '
         "left button turns, right moves, wheel goes nearer</p>"
