@@ -15,6 +15,7 @@ from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
+import cv2
 import numpy as np
 import pytest
 from rich.console import Console
@@ -368,6 +369,9 @@ def test_a_run_that_trains_is_shown_as_it_was_saved_last(run, viewer, guest, tmp
     viewer.show(last)
     guest.sees(expected(viewer, camera))
     viewer.show(shown)
+    for _ in guest.messages():  # words and pictures take turns
+        if "**coarse** done" in guest.text():
+            break
     assert "**coarse** done" in guest.text()
 
 
@@ -434,16 +438,22 @@ def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
         wait_until(lambda: visitor.camera is not None and visitor.camera.width == 1000)
 
         def painted() -> np.ndarray:
-            """What the visitor should see now."""
-            camera = visitor.camera
-            return visitor.errand(lambda: visitor.painter.paint(visitor.shown, camera, camera))[part].astype(int)
+            """What the visitor should see now, beside the panel."""
+            camera = visitor.camera.resized(1000, 700)  # on a slow machine, the browser asks for fewer pixels
+            return quarter(visitor.errand(lambda: visitor.painter.paint(visitor.shown, camera, camera)))
+
+        def quarter(picture: np.ndarray) -> np.ndarray:
+            return cv2.resize(picture[part], None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(int)
+
+        def seen() -> np.ndarray:
+            return quarter(page.screenshot())
 
         shown = {}
         for name in NAMES:
             visitor._layer.value = name
             wait_until(lambda name=name: visitor.shown.layer == NAMES[name])
-            wait_until(lambda: np.abs(page.screenshot()[part] - painted()).mean() < 8)
-            shown[name] = page.screenshot()[part].astype(int)
+            wait_until(lambda: np.abs(seen() - painted()).mean() < 6)
+            shown[name] = seen()
         for one, other in combinations(shown, 2):
             assert np.abs(shown[one] - shown[other]).mean() > 3, (one, other)
         visitor._layer.value = "Colour"
@@ -453,4 +463,4 @@ def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
             up = -visitor.camera.camera_from_world[1, :3]
             assert up[1] > 0.7  # north is up
             assert abs(up[0]) < 0.01
-            wait_until(lambda: np.abs(page.screenshot()[part] - painted()).mean() < 8)
+            wait_until(lambda: np.abs(seen() - painted()).mean() < 6)

@@ -100,9 +100,12 @@ def serve(run: TrainedRun, host: str, port: int, console: Console) -> Iterator[V
     _place_newcomers(server, run)
 
     def comes(client: Any) -> None:
+        generation = scene.generation
         visitor = Visitor(client, scene, studio, console)
         viewer.visitors[client.client_id] = visitor
         visitor.tell(viewer.progress)
+        if scene.generation != generation:  # a newer model came while the panel was made
+            visitor.model_changed()
         if client.client_id not in server.get_clients():  # gone while the panel was made
             goes(client)
 
