@@ -1,21 +1,27 @@
 """How quick `vdgs view` is: to the first picture, while a camera moves, at rest, and with several visitors.
 
-    python benchmarks/viewer.py RUN [--visitors 8] [--seconds 20] [--size 1280 800]
+    python benchmarks/viewer.py RUN [--visitors 8] [--seconds 20] [--size 1280 800] [--load 300]
 
-Visitors speak the browser's protocol on the loopback address; the server is another process. Prints one line each.
+Visitors speak the browser's protocol on the loopback address; the server is another process. Prints one line
+each. `--load` adds a long test in which half of the visitors vanish and come again.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import os
 import re
 import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -23,9 +29,10 @@ import psutil
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from vdgs.cameras import Camera
+from vdgs.captures.overview import FOV_DEG
 from vdgs.films.paths import look_at
 from vdgs.runs.opening import open_run
-from vdgs.viewer.navigation import FOV_DEG, whole_scene
+from vdgs.viewer.navigation import whole_scene
 from viewer_support import Guest
 
 SERVER = "import sys\nfrom vdgs.cli import main\nmain(sys.argv[1:])"
@@ -46,8 +53,19 @@ def around(run: Path, width: int, height: int):
     return camera
 
 
-def first_picture(run: Path, camera) -> tuple[subprocess.Popen, str, float]:
-    """Start the server; its process, its address, and seconds until a visitor has a picture."""
+@dataclass
+class Started:
+    """A server that has shown a visitor a picture."""
+
+    process: subprocess.Popen[str]
+    address: str
+    #: From the command to the first picture, and how much of that the server computed.
+    seconds: float
+    cpu_seconds: float
+
+
+def start(run: Path, camera) -> Started:
+    """Start the server and wait for a picture."""
     began = time.perf_counter()
     process = subprocess.Popen([sys.executable, "-c", SERVER, "view", str(run)], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -55,20 +73,26 @@ def first_picture(run: Path, camera) -> tuple[subprocess.Popen, str, float]:
     guest = Guest(address)
     guest.stand(camera(0.0))
     next(guest.pictures())
-    taken = time.perf_counter() - began
+    taken, used = time.perf_counter() - began, psutil.Process(process.pid).cpu_times()
     guest.close()
-    return process, address, taken
+    return Started(process, address, taken, used.user + used.system)
 
 
 def moving(address: str, camera, seconds: float, start: float = 0.0) -> dict[str, float]:
-    """A visitor whose camera turns for so long and then rests: pictures a second, their size, gaps, time to full."""
-    guest, arrivals, sizes, stopped = Guest(address), [], [], threading.Event()
+    """A visitor whose camera turns for so long and then rests: pictures a second, their size, gaps, age, time to full.
+
+    The age of what a visitor sees is greatest just before the next picture comes: the time since the camera stood where
+    the last picture was asked for is at most the gap and the time that one picture takes.
+    """
+    guest, arrivals, sizes, stopped = Guest(address), list[float](), list[int](), threading.Event()
+    ended = [math.inf]
 
     def move() -> None:
         began = time.perf_counter()
         while (now := time.perf_counter() - began) < seconds:
             guest.stand(camera(start + 0.3 * now))
             time.sleep(1 / MOVES)
+        ended[0] = time.perf_counter()
         stopped.set()
 
     mover = threading.Thread(target=move)
@@ -77,20 +101,63 @@ def moving(address: str, camera, seconds: float, start: float = 0.0) -> dict[str
     rest = math.nan
     for picture in guest.pictures():
         now = time.perf_counter()
-        if stopped.is_set():
-            ended = arrivals[-1] if arrivals else now
-            if picture.shape[:2] == (full.height, full.width):
-                rest = now - ended
-                break
-        arrivals.append(now)
-        sizes.append(picture.shape[1])
+        if stopped.is_set() and picture.shape[:2] == (full.height, full.width):
+            rest = now - ended[0]
+            break
+        if not stopped.is_set():
+            arrivals.append(now)
+            sizes.append(picture.shape[1])
     mover.join()
     guest.close()
-    gaps = np.diff(arrivals)
+    gaps = np.diff(arrivals) if len(arrivals) > 1 else np.array([math.inf])
     return {
         "rate": len(arrivals) / seconds, "width": float(np.median(sizes)), "gap": float(np.quantile(gaps, 0.95)),
-        "rest": rest,
+        "longest": float(gaps.max()), "rest": rest,
     }  # fmt: skip
+
+
+def coming_and_going(address: str, camera, seconds: float, number: int) -> int:
+    """One after another visits for a while, each looks about for some seconds and vanishes or leaves; how many."""
+    until, visits = time.perf_counter() + seconds, 0
+    while time.perf_counter() < until:
+        guest = Guest(address)
+        for step in range(int(MOVES * (1 + (number + visits) % 3))):
+            guest.stand(camera(number + 0.01 * step))
+            time.sleep(1 / MOVES)
+        (guest.vanish if visits % 2 else guest.close)()
+        visits += 1
+    return visits
+
+
+def together(jobs: list[Callable[[], Any]]) -> list[Any]:
+    """Do jobs at the same time."""
+    with ThreadPoolExecutor(len(jobs)) as pool:
+        return [each.result() for each in [pool.submit(job) for job in jobs]]
+
+
+def load(address: str, camera, visitors: int, seconds: float, server: psutil.Process) -> None:
+    """Visitors for a long time, half of whom vanish in the middle and come again; memory every tenth of it."""
+    weights: list[int] = []
+    ended = threading.Event()
+
+    def weigh() -> None:
+        while not ended.wait(seconds / 10):
+            weights.append(round(server.memory_info().rss / 1e6))
+
+    scales = threading.Thread(target=weigh)
+    scales.start()
+    stay = [lambda n=n: moving(address, camera, seconds, 0.7 * n) for n in range(visitors // 2)]
+    change = [lambda n=n: coming_and_going(address, camera, seconds, n) for n in range(visitors - visitors // 2)]
+    found = together([*stay, *change])
+    ended.set()
+    scales.join()
+    rates = [each["rate"] for each in found[: len(stay)]]
+    print(
+        f"load: {visitors} visitors for {seconds:g} s, of whom {len(change)} came {sum(found[len(stay) :])} times and "
+        f"vanished half of them: those who stayed got {min(rates):.1f} to {max(rates):.1f} pictures a second; "
+        "memory, MB: " + " ".join(str(weight) for weight in weights)
+    )
+    assert server.is_running()
 
 
 def main() -> None:
@@ -98,35 +165,36 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--visitors", type=int, default=8)
     parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--load", type=float, default=0.0, help="Seconds of the load test; 300 is a good while")
     parser.add_argument("--size", type=int, nargs=2, default=(1280, 800))
     asked = parser.parse_args()
     camera = around(asked.run, *asked.size)
-    process, address, taken = first_picture(asked.run, camera)
+    print(f"load of the machine before: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    started = start(asked.run, camera)
+    address = started.address
     try:
-        print(f"first picture after {taken:.2f} s")
-        server = psutil.Process(process.pid)
+        print(f"first picture after {started.seconds:.2f} s, of which the server computed {started.cpu_seconds:.2f} s")
+        server = psutil.Process(started.process.pid)
+        print(f"memory with the first picture: {server.memory_info().rss / 1e6:.0f} MB")
         one = moving(address, camera, min(asked.seconds, 10.0))
         print(
             f"one visitor: {one['rate']:.1f} pictures a second while moving, {one['width']:.0f} px wide, 95 % of gaps "
-            f"below {1e3 * one['gap']:.0f} ms, full picture {1e3 * one['rest']:.0f} ms after the last of them"
+            f"below {1e3 * one['gap']:.0f} ms, the longest {1e3 * one['longest']:.0f} ms, full picture "
+            f"{1e3 * one['rest']:.0f} ms after the camera came to rest"
         )
-        before, found = server.memory_info().rss, list[dict[str, float]]()
-        threads = [
-            threading.Thread(target=lambda n=n: found.append(moving(address, camera, asked.seconds, 0.7 * n)))
-            for n in range(asked.visitors)
-        ]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        rates = [each["rate"] for each in found]
+        before = server.memory_info().rss
+        found = together([lambda n=n: moving(address, camera, asked.seconds, 0.7 * n) for n in range(asked.visitors)])
+        rates, gaps = [each["rate"] for each in found], [each["gap"] for each in found]
         print(
             f"{len(found)} visitors for {asked.seconds:g} s: {min(rates):.1f} to {max(rates):.1f} pictures a second "
-            f"each; memory {before / 1e6:.0f} -> {server.memory_info().rss / 1e6:.0f} MB"
+            f"each, {np.median([each['width'] for each in found]):.0f} px wide, 95 % of gaps below "
+            f"{1e3 * max(gaps):.0f} ms; memory {before / 1e6:.0f} -> {server.memory_info().rss / 1e6:.0f} MB"
         )
+        if asked.load:
+            load(address, camera, asked.visitors, asked.load, server)
     finally:
-        process.send_signal(signal.SIGINT)
-        process.wait()
+        started.process.send_signal(signal.SIGINT)
+        started.process.wait()
 
 
 if __name__ == "__main__":

@@ -212,6 +212,24 @@ def test_the_report_of_a_whole_run_holds_its_figures(whole):
     assert page.tags.count("img") == 5 + 3 + 1 + 11
 
 
+def test_the_report_leads_to_a_page_of_the_scene_that_it_shows(tmp_path):
+    run = whole_run(tmp_path / "run")
+    page = tmp_path / "my place&co.html"
+    page.write_text("<html></html>")
+    run.merged.key_file.write_text("a key")
+    record = {"model": "merged", "key": "a key", "files": [{"file": str(page), "bytes": 7_100_000}]}
+    write(run.path / "export.json", record)
+    text = write_report(run).read_text()
+    assert '<a href="../my%20place%26co.html">Move through the scene</a>' in text
+    assert "my place&amp;co.html, 7.1 MB" in text
+    for other in ({**record, "key": "another"}, {**record, "files": []}, {"files": 3}):
+        write(run.path / "export.json", other)
+        assert "Move through" not in write_report(run).read_text()
+    write(run.path / "export.json", record)
+    page.unlink()
+    assert "Move through" not in write_report(run).read_text()
+
+
 def test_the_least_solid_view_is_shown_and_solidity_compared(tmp_path):
     run = whole_run(tmp_path)
     known = metrics(28.375, "merged") | {

@@ -33,7 +33,7 @@ from vdgs.viewer.measuring import Ruler
 from vdgs.viewer.photographs import laid_over, nearest_view
 from vdgs.viewer.places import place_at, position_at, thumbnail
 from vdgs.viewer.scene import Scene
-from vdgs.viewer.studio import FEWEST_PX, REST, Frame, Studio, shrunk
+from vdgs.viewer.studio import FEWEST_PX, REST, ROUND, TURN_ANCHORS, Frame, Studio, shrunk
 from vdgs.viewer.thinning import Levels
 
 PLACE = (46.95, 7.44, 560.0)
@@ -151,10 +151,11 @@ def test_quick_pictures_of_much_are_drawn_with_fewer_larger_gaussians(parts):
         counts = (300, len(model.anchors) - 300)
         model = replace(model, parts=tuple(Part(count, model.decoder) for count in counts))
     camera = camera_at(0.0, 0.0, 6.0)
-    levels = Levels(model, most=400)
-    assert levels.of(camera, quick=False).model is model
-    assert Levels(model).of(camera, quick=True).model is model
-    few = levels.of(camera, quick=True)
+    levels = Levels(model)
+    assert levels.of(camera)[0].model is model
+    assert levels.of(camera, 10_000)[0].model is model
+    few, count = levels.of(camera, 400)
+    assert 0 < count <= 400
     assert few.kept is not None
     assert len(few.model.anchors) == int(few.kept.sum()) < len(model.anchors) / 3
     assert sum(part.count for part in few.model.parts) == (len(few.model.anchors) if parts else 0)
@@ -336,12 +337,18 @@ class Slow:
     """A painter that takes so long for each pixel."""
 
     def __init__(self, clock: Clock, per_px: float = 0.0) -> None:
-        self.clock, self.per_px, self.settled = clock, per_px, 0
+        self.clock, self.per_px, self.settled, self.drawn = clock, per_px, 0, 0
+
+    def key(self, shown: Shown) -> object:
+        return id(self)
+
+    def in_view(self, shown: Shown, camera: Camera) -> int:
+        return 0
 
     def settle(self, shown: Shown, whole: Camera) -> None:
         self.settled += 1
 
-    def paint(self, shown: Shown, camera: Camera, whole: Camera, quick: bool = False) -> np.ndarray:
+    def paint(self, shown: Shown, camera: Camera, whole: Camera, most: int | None = None) -> np.ndarray:
         self.clock.now += self.per_px * camera.width * camera.height
         return np.zeros((camera.height, camera.width, 3), np.uint8)
 
@@ -380,8 +387,8 @@ def test_small_while_moving_and_full_at_rest(studio):
 def test_a_camera_that_moves_on_leaves_nothing_to_be_finished(studio):
     studio, clock = studio
     seat, frames, _ = sit(studio, Slow(clock, 1e-6))
-    for _ in range(2):  # the second picture is drawn in turns: the first one told how long they take
-        studio.ask(seat, camera_at(0, 0, width=1280), Shown())
+    for x in range(2):  # the second picture is drawn in turns: the first one told how long they take
+        studio.ask(seat, camera_at(x, 0, width=1280), Shown())
         studio.step()
         clock.now += REST
         studio.step()
@@ -408,6 +415,82 @@ def test_quick_pictures_are_as_large_as_time_allows(studio):
         height, width = frames[-1].picture.shape[:2]
         assert least <= width * height <= most
         studio.leave(seat)
+
+
+class Decoding(Slow):
+    """A painter of 100 000 anchors in view that takes so long for each one that it draws."""
+
+    def __init__(self, clock: Clock, per_anchor: float) -> None:
+        super().__init__(clock)
+        self.per_anchor, self.times = per_anchor, [1, 5, 15, 45]
+
+    def paint(self, shown: Shown, camera: Camera, whole: Camera, most: int | None = None) -> np.ndarray:
+        counts = [100_000 // times for times in self.times]
+        self.drawn = counts[0] if most is None else next((c for c in counts if c <= most), counts[-1])
+        self.clock.now += self.per_anchor * self.drawn
+        return super().paint(shown, camera, whole, most)
+
+
+@pytest.mark.parametrize(("moving", "drawn"), [(1, 20_000), (2, 20_000), (8, 6_666)])
+def test_a_round_of_all_who_move_stays_short(studio, moving, drawn):
+    studio, clock = studio
+    painters = [Decoding(clock, 2e-6) for _ in range(moving)]
+    seats = [sit(studio, painter)[0] for painter in painters]
+    for x in range(8):
+        began = clock.now
+        for seat in seats:
+            studio.ask(seat, camera_at(x, 0, width=1280), Shown())
+        for _ in seats:
+            assert studio.step() == 0
+        taken = clock.now - began
+    assert [painter.drawn for painter in painters] == [drawn] * moving
+    assert taken <= ROUND * 1.05
+
+
+def test_who_is_alone_on_a_fast_machine_sees_the_model_itself_while_moving(studio):
+    studio, clock = studio
+    painter = Decoding(clock, 1e-7)
+    seat, _, _ = sit(studio, painter)
+    for x in range(3):
+        studio.ask(seat, camera_at(x, 0, width=1280), Shown())
+        studio.step()
+    assert painter.drawn == 100_000
+
+
+def test_two_who_rest_at_the_same_place_share_a_picture(studio):
+    studio, clock = studio
+
+    class Alike(Slow):
+        def key(self, shown: Shown) -> object:
+            return "one scene"
+
+    one, other, elsewhere = (sit(studio, Alike(clock, 1e-7)) for _ in range(3))
+    for (seat, _, _), x in ((one, 0), (other, 0), (elsewhere, 1)):
+        studio.ask(seat, camera_at(x, 0, width=640), Shown())
+    for _ in range(3):
+        studio.step()
+    clock.now += REST
+    while studio.step() == 0:
+        pass
+    full = [frames[-1] for _, frames, _ in (one, other, elsewhere)]
+    assert all(frame.full for frame in full)
+    assert full[0].picture is full[1].picture
+    assert full[0].picture is not full[2].picture
+
+
+def test_a_full_picture_of_much_is_drawn_in_parts(studio):
+    studio, clock = studio
+    painter = Slow(clock)
+    painter.in_view = lambda shown, camera: 5 * TURN_ANCHORS  # type: ignore[method-assign]
+    seat, frames, _ = sit(studio, painter)
+    studio.ask(seat, camera_at(0, 0, width=1280), Shown())
+    studio.step()
+    clock.now += REST
+    steps = 0
+    while studio.step() == 0:
+        steps += 1
+    assert steps == 5
+    assert frames[-1].picture.shape == (960, 1280, 3)
 
 
 def test_visitors_take_turns_and_moving_ones_go_first(studio):
@@ -443,7 +526,7 @@ def test_one_visitors_trouble_is_theirs_alone(studio):
     studio, clock = studio
 
     class Broken(Slow):
-        def paint(self, shown, camera, whole, quick=False):
+        def paint(self, shown, camera, whole, most=None):
             raise RuntimeError("no picture")
 
     broken, _, errors = sit(studio, Broken(clock))

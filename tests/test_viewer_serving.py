@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import shutil
@@ -9,15 +10,19 @@ import signal
 import socket
 import subprocess
 import sys
+from itertools import combinations
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
+import cv2
 import numpy as np
 import pytest
 from rich.console import Console
 
 pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[viewer]')")
+
+import viser
 
 from captures_support import tiny_scene, write_colmap
 from cli_support import vdgs, wait_until
@@ -31,7 +36,12 @@ from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
 from vdgs.viewer.door import Door
 from vdgs.viewer.following import newest, open_or_last_saved, standing_lines
+from vdgs.viewer.layers import Painter
+from vdgs.viewer.path_panel import PathPanel
+from vdgs.viewer.place_panel import PlacePanel
 from vdgs.viewer.serving import Viewer, free_port, serve
+from vdgs.viewer.studio import KEPT, Seat
+from vdgs.viewer.visitor import NAMES, Visitor
 from viewer_support import Guest, browser, open_page
 
 pytestmark = pytest.mark.xdist_group("viewer")
@@ -115,6 +125,26 @@ def test_a_click_tells_the_place(viewer, guest):
 
 
 @quiet
+def test_a_double_click_turns_about_the_place(viewer, guest):
+    camera = above(width=640, height=480)
+    guest.stand(camera)
+    guest.full_picture(camera)
+    (visitor,) = viewer.visitors.values()
+    visitor.place.clock = lambda: 0.0  # all at the same time
+    x, y = camera.project(np.array([[0.8, -0.6, 0.0]]))[0][0]
+    guest.click(x / 640, y / 480)
+    guest.click(x / 640 + 0.1, y / 480)  # elsewhere
+    wait_until(lambda: visitor.place._place is not None)
+    assert visitor.camera.position == pytest.approx(camera.position)
+    guest.click(x / 640, y / 480)
+    guest.click(x / 640, y / 480)
+    wait_until(lambda: np.linalg.norm(visitor.stand.look_at[:2] - [0.8, -0.6]) < 0.15)
+    assert visitor.camera.position == pytest.approx(camera.position, abs=1e-6)
+    seen, _ = visitor.camera.project(visitor.stand.look_at[None])
+    assert seen[0] == pytest.approx((320.0, 240.0), abs=0.5)
+
+
+@quiet
 def test_a_path_is_set_and_saved(viewer, guest, tmp_path):
     frames = [above(), above(1.0, 0.0)]
     for count, camera in enumerate(frames, start=1):
@@ -152,6 +182,27 @@ def test_visitors_that_vanish_are_forgotten(viewer):
     guests[3].close()
     wait_until(lambda: not viewer.visitors)
     assert not viewer.studio._seats
+
+
+@quiet
+def test_many_visits_leave_nothing_behind(viewer):
+    """Counted in objects: what a process weighs depends on its allocator, and on what else was at work."""
+    kinds = (Visitor, Painter, Seat, PlacePanel, PathPanel, viser.ClientHandle)
+
+    def there() -> dict[type, int]:
+        gc.collect()
+        return {kind: sum(isinstance(each, kind) for each in gc.get_objects()) for kind in kinds}
+
+    wait_until(lambda: not viewer.visitors)
+    for number in range(6):
+        guest = Guest(viewer.door.address())
+        guest.stand(above(0.1 * number))
+        guest.full_picture(above(0.1 * number))
+        guest.choose("Layer", "Depth")
+        (guest.vanish if number % 2 else guest.close)()
+    wait_until(lambda: not viewer.visitors)
+    wait_until(lambda: not any(there().values()))
+    assert len(viewer.studio._full_pictures) <= KEPT
 
 
 @quiet
@@ -318,6 +369,9 @@ def test_a_run_that_trains_is_shown_as_it_was_saved_last(run, viewer, guest, tmp
     viewer.show(last)
     guest.sees(expected(viewer, camera))
     viewer.show(shown)
+    for _ in guest.messages():  # words and pictures take turns
+        if "**coarse** done" in guest.text():
+            break
     assert "**coarse** done" in guest.text()
 
 
@@ -371,3 +425,42 @@ def test_a_browser_shows_the_scene(viewer):
         page.drag((340.0, 440.0), (430.0, 400.0))
         wait_until(lambda: not np.allclose(visitor.camera.position, camera.position))
         wait_until(lambda: differs() < 8)  # the mark of the place is in it now
+
+
+@quiet
+@pytest.mark.skipif(browser() is None, reason="no Chromium on this machine (apt-get install chromium)")
+def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
+    wait_until(lambda: not viewer.visitors)
+    part = slice(250, 650), slice(40, 600)  # beside the panel
+    with open_page(viewer.door.address(), 1000, 700) as page:
+        wait_until(lambda: viewer.visitors)
+        (visitor,) = viewer.visitors.values()
+        wait_until(lambda: visitor.camera is not None and visitor.camera.width == 1000)
+
+        def painted() -> np.ndarray:
+            """What the visitor should see now, beside the panel."""
+            camera = visitor.camera.resized(1000, 700)  # on a slow machine, the browser asks for fewer pixels
+            return quarter(visitor.errand(lambda: visitor.painter.paint(visitor.shown, camera, camera)))
+
+        def quarter(picture: np.ndarray) -> np.ndarray:
+            return cv2.resize(picture[part], None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(int)
+
+        def seen() -> np.ndarray:
+            return quarter(page.screenshot())
+
+        shown = {}
+        for name in NAMES:
+            visitor._layer.value = name
+            wait_until(lambda name=name: visitor.shown.layer == NAMES[name])
+            wait_until(lambda: np.abs(seen() - painted()).mean() < 6)
+            shown[name] = seen()
+        for one, other in combinations(shown, 2):
+            assert np.abs(shown[one] - shown[other]).mean() > 3, (one, other)
+        visitor._layer.value = "Colour"
+        for name, looks in (("From above", (0, 0, -1)), ("All", (0, 0.71, -0.71))):
+            wait_until(lambda name=name: page.press(name))
+            wait_until(lambda looks=looks: visitor.camera.forward == pytest.approx(looks, abs=0.02))
+            up = -visitor.camera.camera_from_world[1, :3]
+            assert up[1] > 0.7  # north is up
+            assert abs(up[0]) < 0.01
+            wait_until(lambda: np.abs(seen() - painted()).mean() < 6)

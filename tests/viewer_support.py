@@ -151,6 +151,17 @@ class Page:
     def evaluate(self, expression: str) -> Any:
         return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
 
+    def wait_until_loaded(self, address: str) -> None:
+        """Between one page and the next there is none that could be drawn."""
+        until = time.monotonic() + PATIENCE
+        while time.monotonic() < until:
+            with contextlib.suppress(AssertionError, TypeError):
+                there, state = self.evaluate("[location.href, document.readyState]")
+                if state == "complete" and there.split("?")[0] == address.split("?")[0]:
+                    return
+            time.sleep(0.05)
+        raise AssertionError(f"the browser does not open {address}")
+
     def screenshot(self) -> np.ndarray:
         """What the page shows, RGB."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
@@ -159,6 +170,11 @@ class Page:
     def click(self, x: float, y: float) -> None:
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+
+    def press(self, words: str) -> bool:
+        """Press the button with these words; False while there is none."""
+        found = f"[...document.querySelectorAll('button')].find(each => each.textContent === {json.dumps(words)})"
+        return bool(self.evaluate(f"(() => {{const it = {found}; it?.click(); return it !== undefined;}})()"))
 
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8) -> None:
         mouse = {"button": "left", "buttons": 1, "clickCount": 1}
@@ -169,8 +185,8 @@ class Page:
 
 
 @contextlib.contextmanager
-def open_page(address: str, width: int = 1000, height: int = 700) -> Iterator[Page]:
-    """A page of the machine's browser, without a window, drawn in software."""
+def open_page(address: str, width: int = 1000, height: int = 700, offline: bool = False) -> Iterator[Page]:
+    """A page of the machine's browser, without a window, drawn in software; `offline`: without any network."""
     command = browser()
     assert command is not None
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
@@ -191,7 +207,12 @@ def open_page(address: str, width: int = 1000, height: int = 700) -> Iterator[Pa
                 page.call(
                     "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
                 )
+                if offline:
+                    page.call("Network.enable")
+                    speed = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+                    page.call("Network.emulateNetworkConditions", offline=True, **speed)
                 page.call("Page.navigate", url=address)
+                page.wait_until_loaded(address)
                 yield page
         finally:
             process.terminate()

@@ -7,10 +7,10 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-import pycolmap
 
 from vdgs.captures.formats.source import Intrinsics
 from vdgs.captures.photographs import decode_mask, decode_photograph
@@ -56,6 +56,8 @@ def undistort(folder: Path, photographs: list[ImageFile]) -> list[ImageFile]:
 
 def pinhole_for(intrinsics: Intrinsics) -> Intrinsics:
     """The pinhole camera whose picture holds no blank pixels (COLMAP's own choice of size and centre)."""
+    import pycolmap  # 60 MB of memory: only for lenses that need it
+
     try:
         camera = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), _colmap(intrinsics))
     except Exception as error:  # pycolmap raises plain ValueError and RuntimeError kinds
@@ -133,7 +135,9 @@ def _write(file: Path, data: bytes) -> None:
     os.replace(part, file)
 
 
-def _colmap(intrinsics: Intrinsics) -> pycolmap.Camera:
+def _colmap(intrinsics: Intrinsics) -> Any:
+    import pycolmap
+
     return pycolmap.Camera(
         model=intrinsics.model,
         width=intrinsics.width,

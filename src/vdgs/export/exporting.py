@@ -6,7 +6,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,11 @@ from rich.console import Console
 from rich.progress import Progress
 
 from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
+from vdgs.captures.overview import overview
 from vdgs.errors import VdgsError
 from vdgs.export.baking import Survey, bake, survey
 from vdgs.export.formats import registry
-from vdgs.export.formats.scene import ROWS, Scene
+from vdgs.export.formats.scene import ROWS, Page, Scene
 from vdgs.export.formats.spool import Spooled, spooled
 from vdgs.export.frame import Frame, frame_of, usual_crs
 from vdgs.export.loss import loss_of
@@ -41,13 +42,17 @@ class _Baked:
 
     spool: Spooled
     degree: int
+    #: How pages show it first, in the ground frame.
+    page: Page
 
     def scene(self, frame: Frame) -> Scene:
         """What a writer is given."""
         count = len(self.spool.means)
         corners = frame.scale * self.spool.means.astype(np.float64) @ frame.rotation.T + frame.translation
         low, high = tuple(corners.min(axis=0).tolist()), tuple(corners.max(axis=0).tolist())
-        return Scene(self._chunks(frame, count), count, self.degree, frame.facts, (low, high))
+        return Scene(
+            self._chunks(frame, count), count, self.degree, frame.facts, (low, high), _placed(self.page, frame)
+        )
 
     def _chunks(self, frame: Frame, count: int) -> Iterator[Gaussians]:
         for first in range(0, count, ROWS):
@@ -59,6 +64,26 @@ class _Baked:
         return self.spool.rows(np.arange(len(self.spool.means)))
 
 
+def page_of(run: TrainedRun, most_bytes: int) -> Page:
+    """All of the flight, before the colour that the model has behind it; ground frame."""
+    position, target = overview(run.capture)
+    red, green, blue = (float(each) for each in run.model.background)
+    title = run.capture.root.resolve().name or "scene"
+    return Page(_point(position), _point(target), (red, green, blue), title, most_bytes)
+
+
+def _placed(page: Page, frame: Frame) -> Page:
+    """A page in local coordinates."""
+    ground = np.array([page.position, page.target])
+    position, target = frame.scale * ground @ frame.rotation.T + frame.translation
+    return replace(page, position=_point(position), target=_point(target))
+
+
+def _point(place: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(each) for each in place)
+    return x, y, z
+
+
 def export_run(asked: ExportRequest, console: Console) -> dict[str, Any]:
     """Write what was asked for, on a device that is chosen already; returns what RUN/export.json holds.
 
@@ -66,6 +91,8 @@ def export_run(asked: ExportRequest, console: Console) -> dict[str, Any]:
     empty choice, and coordinates that a format or the capture does not have.
     """
     _check_names(asked.to)
+    if all(registry.format_of(path).fixed for path in asked.to):
+        asked = replace(asked, sh_degree=0)
     run = open_run(asked.run, asked.model, asked.device)
     if run.caution:
         console.print(f"[yellow]warning[/] {run.caution}", highlight=False)
@@ -84,7 +111,8 @@ def export_run(asked: ExportRequest, console: Console) -> dict[str, Any]:
             + (" and asked for" if len(kept) < np.count_nonzero(seen.pixels) else ""),
             highlight=False,
         )
-        with _baked(seen, kept, asked.sh_degree, asked.to[0].parent, bar) as baked:
+        page = page_of(run, int(asked.html_mb * 1e6))
+        with _baked(seen, kept, asked.sh_degree, page, asked.to[0].parent, bar) as baked:
             seconds = time.monotonic() - began
             files = [_write(path, frames[path], baked, console) for path in asked.to]
             losses = _losses(run, frames, baked, asked, bar, console)
@@ -168,7 +196,7 @@ def _check_scenes(frames: dict[Path, Frame], seen: Survey, kept: np.ndarray, deg
 
 
 @contextmanager
-def _baked(seen: Survey, kept: np.ndarray, degree: int, folder: Path, bar: Progress) -> Iterator[_Baked]:
+def _baked(seen: Survey, kept: np.ndarray, degree: int, page: Page, folder: Path, bar: Progress) -> Iterator[_Baked]:
     """The Gaussians in a temporary file beside the first output."""
     task = bar.add_task("fitting Gaussians", total=len(kept))
 
@@ -184,7 +212,7 @@ def _baked(seen: Survey, kept: np.ndarray, degree: int, folder: Path, bar: Progr
             raise VdgsError(
                 f"{folder}: cannot hold the scene ({error.strerror or error}). Nothing was written."
             ) from error
-        yield _Baked(spool, degree)
+        yield _Baked(spool, degree, page)
 
 
 def _write(path: Path, frame: Frame, baked: _Baked, console: Console) -> dict[str, Any]:

@@ -10,9 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import CubicHermiteSpline
-from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation, Slerp
 
 from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
@@ -51,6 +48,9 @@ def interpolate(keyframes: Sequence[Camera], n_frames: int, closed: bool = False
     so that turning on the spot takes time too (choice). The ends are met exactly; a closed path leaves
     out the frame that would repeat the first. Intrinsics are interpolated linearly, the size is the first's.
     """
+    from scipy.interpolate import CubicHermiteSpline  # slow to load, and most who look at a scene make no path
+    from scipy.spatial.transform import Rotation, Slerp
+
     if not keyframes:
         raise ValueError("a path needs at least one key frame")
     frames = [*keyframes, keyframes[0]] if closed and len(keyframes) > 1 else list(keyframes)
@@ -115,6 +115,8 @@ def flyover(
     """
     if not cameras:
         raise ValueError("a flyover needs training cameras")
+    from scipy.ndimage import gaussian_filter1d
+
     if tilt_deg is None:
         downwards = np.clip([-camera.forward[2] for camera in cameras], -1.0, 1.0)
         tilt_deg = max(FLYOVER_TILT_DEG, float(np.degrees(np.arccos(np.median(downwards)))))
@@ -190,6 +192,8 @@ def _smooth_track(positions: Float[np.ndarray, "n 3"], n_frames: int) -> Float[n
         positions = chained
     if len(positions) == 1 or _length(positions) == 0.0:
         return np.repeat(positions[:1], n_frames, axis=0)
+    from scipy.ndimage import gaussian_filter1d
+
     dense = _evenly(positions, max(16 * len(positions), n_frames))
     # Smoothing over about two cameras rounds the turns and takes out the jitter of single positions.
     smooth = gaussian_filter1d(dense, 2.0 * len(dense) / len(positions), axis=0, mode="nearest")

@@ -59,6 +59,16 @@ def forget_peak() -> None:
         Path("/proc/self/clear_refs").write_text("5")
 
 
+#: glibc's number for the most arenas that `mallopt` allows.
+_M_ARENA_MAX = -8
+
+
+def share_arenas(most: int = 2) -> None:
+    """Let all threads allocate from so few arenas (glibc): each of many threads else keeps what it has freed."""
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, most)
+
+
 def return_unused() -> None:
     """Give back to the system what this process keeps but does not use.
 

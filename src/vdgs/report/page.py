@@ -81,6 +81,11 @@ def paragraph(text: str, kind: str = "") -> Html:
     return Html(f"<p{_class(kind)}>{escaped(text)}</p>") if text else Html("")
 
 
+def link(address: str, text: str, more: str = "") -> Html:
+    """A paragraph that leads to a file, and what follows the link."""
+    return Html(f'<p><a href="{escaped(address)}">{escaped(text)}</a>{escaped(more)}</p>')
+
+
 def heading(text: str) -> Html:
     return Html(f"<h3>{escaped(text)}</h3>")
 

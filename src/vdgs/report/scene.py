@@ -2,9 +2,31 @@
 
 from __future__ import annotations
 
-from vdgs.report.page import Html, figure, heading, paragraph, section, table
-from vdgs.report.reading import Record, Shown
+import os
+from pathlib import Path
+from urllib.parse import quote
+
+from vdgs.report.page import Html, figure, heading, link, paragraph, section, table
+from vdgs.report.reading import Record, Shown, Source
 from vdgs.report.words import ABSENT, count, figure_of, share
+
+
+def page_link(shown: Shown) -> Html:
+    """The page to move through the scene with, where `vdgs export` wrote one of the model that the run has now."""
+    run = shown.run
+    record = Source(run.path).record("export.json")  # its own section tells of other files that cannot be read
+    stage = run.merged if record.text("model") == "merged" else run.coarse
+    if record.text("key") is None or record.text("key") != stage.key():
+        return Html("")
+    for file in record.rows("files"):
+        path = file.text("file") or ""
+        if path.lower().endswith(".html") and os.path.isfile(path):
+            address = quote(Path(os.path.relpath(path, run.path.resolve())).as_posix())
+            size = (file.number("bytes") or 0) / 1e6
+            return link(
+                address, "Move through the scene", f" ({os.path.basename(path)}, {size:,.1f} MB; opens offline)"
+            )
+    return Html("")
 
 
 def visibility_section(shown: Shown) -> Html:

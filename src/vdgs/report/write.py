@@ -14,7 +14,7 @@ from vdgs.report.page import Html, contents, document, escaped, joined, paragrap
 from vdgs.report.photographs import photographs_section
 from vdgs.report.reading import Record, Shown, Source
 from vdgs.report.results import by_visibility_section, metrics_of, result_table, seams_section, verdict, views_section
-from vdgs.report.scene import assignment_section, blocks_section, maps_section, visibility_section
+from vdgs.report.scene import assignment_section, blocks_section, maps_section, page_link, visibility_section
 from vdgs.report.training import training_section
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.standing import RunStanding, Standing, standing_of
@@ -95,6 +95,7 @@ def _header(shown: Shown) -> tuple[Html, str]:
         *(paragraph(note, "note") for note in [*source.notes, *shown.cautions()]),
         paragraph(verdict(coarse, merged), "verdict"),
         result_table(coarse, merged),
+        page_link(shown),
         *(paragraph(warning, "note") for warning in made_of.texts("warnings")),
     ]
     return Html(f"<header>\n{joined(parts)}\n</header>"), title

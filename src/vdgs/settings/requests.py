@@ -152,7 +152,8 @@ class ExportRequest:
     """Run folder."""
     to: tuple[Path, ...] = ()
     """A file to write, by its ending: .ply (3DGS), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles),
-    .points.ply, .laz, .las (point clouds). Give --to again for more: the scene is baked once (docs/export.md)."""
+    .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline). Give --to again for more: the
+    scene is baked once (docs/export.md)."""
     model: ModelName = "best"
     """Which model; `best` is the merged one where there is one."""
     block: Annotated[int | None, Range(0, 10_000)] = None
@@ -164,6 +165,8 @@ class ExportRequest:
     sh_degree: Literal[0, 1, 2, 3] = 3
     """How colours change with the direction: spherical harmonics up to this degree. 0: not at all, and a fifth of the
     size."""
+    html_mb: Annotated[float, Range(1, 2000)] = 30.0
+    """A .html file has at most so many MB: the scene is thinned by halves until it fits."""
     crs: str | None = None
     """Coordinates of the files: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source`
     (those of the capture) or `local` (the ground frame). By default `enu` where the capture is georeferenced, and UTM

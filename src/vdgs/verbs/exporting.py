@@ -20,7 +20,8 @@ class ExportArguments(ExportRequest):
     """Run folder."""
     to: Annotated[tuple[Path, ...], UseAppendAction] = ()
     """A file to write, by its ending: .ply (3DGS), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles),
-    .points.ply, .laz, .las (point clouds). Give --to again for more: the scene is baked once (docs/export.md)."""
+    .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline). Give --to again for more: the
+    scene is baked once (docs/export.md)."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
 
@@ -32,3 +33,8 @@ def export(arguments: list[str]) -> None:
     device = use_device(asked.device)
     use_threads(asked.threads)
     export_run(replace(asked, device=device), open_console(asked.quiet))
+    from vdgs.report.write import FILE, write_report
+    from vdgs.runs.folder import RunFolder
+
+    if any(path.suffix.lower() == ".html" for path in asked.to) and (asked.run / FILE).exists():
+        write_report(RunFolder(asked.run))  # it leads to the page

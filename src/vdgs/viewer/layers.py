@@ -3,7 +3,7 @@ the legends of `vdgs render`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -56,6 +56,13 @@ class Painter:
         self._scene = scene
         self._comparison = Comparison(scene)
         self._depth: Scale | None = None
+        #: Anchors that the last picture was drawn from: what its time is learned from.
+        self.drawn = 0
+
+    def key(self, shown: Shown) -> Hashable:
+        """What a picture depends on beside the camera and what is shown: pictures of equal keys are equal."""
+        depth = self._depth if shown.layer == "depth" else None
+        return self._scene.generation, None if depth is None else (depth.low, depth.high)
 
     def settle(self, shown: Shown, whole: Camera) -> None:
         """The camera has come to rest: the range of depths becomes that of what it sees."""
@@ -78,12 +85,19 @@ class Painter:
             return maps.alpha_scale()
         return error_scale() if shown.layer == "error" else None
 
-    def paint(self, shown: Shown, camera: Camera, whole: Camera, quick: bool = False) -> UInt8[np.ndarray, "h w 3"]:
-        """A picture, or rows of it: `camera` is `whole` or cropped from it, all columns. `quick`: coarser."""
+    def in_view(self, shown: Shown, camera: Camera) -> int:
+        """How many anchors a full picture is drawn from."""
+        both = shown.model == "both" and len(self._scene.names) > 1
+        return sum(self._scene.level(name, camera)[1] for name in (self._scene.names if both else [self._model(shown)]))
+
+    def paint(self, shown: Shown, camera: Camera, whole: Camera, most: int | None = None) -> UInt8[np.ndarray, "h w 3"]:
+        """A picture, or rows of it: `camera` is `whole` or cropped from it, all columns. `most`: drawn from at most so
+        many anchors."""
+        self.drawn = 0
         if shown.model == "both" and len(self._scene.names) > 1:
-            picture = self._side_by_side(shown, camera, whole, quick)
+            picture = self._side_by_side(shown, camera, whole, most)
         else:
-            picture = self._of(self._model(shown), shown, camera, whole, quick)
+            picture = self._of(self._model(shown), shown, camera, whole, most)
         if shown.photograph is not None:
             picture = self._with_photograph(shown, camera, picture)
         return picture
@@ -91,8 +105,11 @@ class Painter:
     def _model(self, shown: Shown) -> str:
         return shown.model if shown.model in self._scene.names else self._scene.names[0]
 
-    def _of(self, name: str, shown: Shown, camera: Camera, whole: Camera, quick: bool) -> UInt8[np.ndarray, "h w 3"]:
-        level = self._scene.level(name, camera, quick)
+    def _of(
+        self, name: str, shown: Shown, camera: Camera, whole: Camera, most: int | None
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        level, count = self._scene.level(name, camera, most)
+        self.drawn += count
         if shown.layer == "colour":
             return to_8bit(render(level.model, camera).image.cpu().numpy())
         if shown.layer == "blocks":
@@ -112,12 +129,14 @@ class Painter:
             return render(level.model, camera).alpha.cpu().numpy()
         return self._comparison.error_in(name, camera, whole)
 
-    def _side_by_side(self, shown: Shown, camera: Camera, whole: Camera, quick: bool) -> UInt8[np.ndarray, "h w 3"]:
+    def _side_by_side(
+        self, shown: Shown, camera: Camera, whole: Camera, most: int | None
+    ) -> UInt8[np.ndarray, "h w 3"]:
         edge = column(shown.split, camera.width)
         parts = []
         for name, left, right in (("coarse", 0, edge), ("merged", edge, camera.width)):
             if left < right:
-                parts.append(self._of(name, shown, camera.cropped(left, 0, right, camera.height), whole, quick))
+                parts.append(self._of(name, shown, camera.cropped(left, 0, right, camera.height), whole, most))
         return _lined(np.concatenate(parts, axis=1), edge)
 
     def _with_photograph(self, shown: Shown, camera: Camera, picture: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:

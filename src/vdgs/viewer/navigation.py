@@ -7,14 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
-from vdgs.captures.heights import camera_height
+from vdgs.captures.overview import overview
 
-#: Angle of view of a new visitor, vertical (choice).
-FOV_DEG = 50.0
 #: Nearer to straight down than this, the direction on the map no longer follows from where one looks.
 _STEEP = 0.995
 #: How far a view from straight above is tilted, so that it knows which way is north.
@@ -43,26 +40,23 @@ def camera_of(wxyz: np.ndarray, position: np.ndarray, fov: float, width: int, he
     usable = np.isfinite(turn).all() and np.isfinite(place).all() and np.linalg.norm(turn) > 1e-6
     if not (usable and width > 0 and height > 0 and 1e-3 < fov < math.pi - 1e-3):
         raise ValueError("this is no camera")
-    rotation = Rotation.from_quat(np.roll(turn, -1)).as_matrix().T
+    rotation = _matrix_of(turn / np.linalg.norm(turn)).T
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ place
     focal = 0.5 * height / math.tan(0.5 * fov)
     return Camera(pose, focal, focal, width / 2, height / 2, width, height)
 
 
+def _matrix_of(wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation of a unit quaternion: v -> v + 2w (u × v) + 2u × (u × v)."""
+    w, (x, y, z) = wxyz[0], wxyz[1:]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + 2.0 * (w * cross + cross @ cross)
+
+
 def whole_scene(capture: Capture) -> Stand:
-    """All of the flight from the south, half from above."""
-    middle, half = _extent(capture)
-    distance = max(1.5 * camera_height(capture), 1.3 * half / math.tan(math.radians(FOV_DEG / 2)))
-    return Stand(middle + distance * np.array([0.0, -math.sqrt(0.5), math.sqrt(0.5)]), middle)
-
-
-def _extent(capture: Capture) -> tuple[Float[np.ndarray, "3"], float]:
-    """The middle of what was flown over, on the ground, and half its longer side."""
-    flown = np.stack([view.camera.position for view in capture.train_views])[:, :2]
-    low, high = np.quantile(flown, (0.05, 0.95), axis=0)
-    ground = float(np.median(capture.points[:, 2])) if len(capture.points) else 0.0
-    return np.append((low + high) / 2, ground), max(float((high - low).max()) / 2, camera_height(capture) / 2)
+    """All of the flight."""
+    return Stand(*overview(capture))
 
 
 def from_above(stand: Stand) -> Stand:

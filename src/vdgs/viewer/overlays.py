@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from jaxtyping import Float, UInt8
-from scipy.spatial import cKDTree
 
 from vdgs.cameras import Camera
 from vdgs.captures.heights import camera_height
@@ -41,6 +40,8 @@ def _ground_below(scene: Scene, places: Float[np.ndarray, "n 2"]) -> Float[np.nd
     points = scene.capture.points
     if not len(points):
         return np.zeros(len(places))
+    from scipy.spatial import cKDTree  # not before the first picture
+
     _, nearest = cKDTree(points[:, :2]).query(places, k=min(8, len(points)))
     return np.asarray(np.median(points[:, 2][np.reshape(nearest, (len(places), -1))], axis=1))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from functools import partial
 from typing import Any
 
@@ -13,7 +15,9 @@ from vdgs.viewer.host import Host
 from vdgs.viewer.measuring import Ruler
 from vdgs.viewer.places import Place, place_at, position_at, thumbnail
 
-_HINT = "Click a place to see what is known of it."
+_HINT = "Click a place to see what is known of it; double click to turn about it."
+#: Two clicks within so many seconds, so near to each other (share of the canvas), are a double click.
+_DOUBLE_SECONDS, _DOUBLE_APART = 0.45, 0.01
 #: Photographs shown of a place.
 _THUMBNAILS = 4
 
@@ -30,18 +34,25 @@ class PlacePanel:
         with self._folder:
             self._words = visitor.client.gui.add_markdown(_HINT)
         self._measuring = False
+        self.clock = time.monotonic
+        self._lock = threading.Lock()
+        self._last: tuple[float, float, float] | None = None
         self._build_measuring()
 
     def clicked(self, screen: tuple[float, float]) -> None:
-        """A click at a share of the canvas' width and height."""
+        """A click at a share of the canvas' width and height. A double click turns about the place from then on."""
         visitor, camera = self._visitor, self._visitor.camera
         if camera is None:
             return
+        double = self._is_double(screen)
         name = visitor.shown.model if visitor.shown.model in visitor.scene.names else visitor.scene.names[0]
         x, y = screen[0] * camera.width, screen[1] * camera.height
         position = visitor.errand(lambda: position_at(visitor.scene.model(name), camera, x, y))
         if position is None:
             self._words.content = "Nothing is drawn there."
+            return
+        if double and not self._measuring:
+            visitor.go(navigation.Stand(visitor.stand.position, position))
             return
         if self._measuring:
             self._measure(position)
@@ -49,6 +60,16 @@ class PlacePanel:
         place = visitor.errand(lambda: place_at(visitor.scene, name, position))
         if place is not None:
             self._show(place)
+
+    def _is_double(self, screen: tuple[float, float]) -> bool:
+        """Whether this click is the second of two; a third one begins anew."""
+        now, (x, y) = self.clock(), screen
+        with self._lock:
+            last, self._last = self._last, (now, x, y)
+            if last is None or now - last[0] > _DOUBLE_SECONDS or np.hypot(x - last[1], y - last[2]) > _DOUBLE_APART:
+                return False
+            self._last = None
+            return True
 
     def _show(self, place: Place) -> None:
         visitor = self._visitor

@@ -39,6 +39,8 @@ class Scene:
         self._seen: dict[str, Tensor] = {}
         self._tints: dict[str, Tensor] = {}
         self._levels: dict[str, Levels] = {}
+        #: Grows with every newer model.
+        self.generation = 0
 
     @property
     def names(self) -> Sequence[str]:
@@ -57,17 +59,18 @@ class Scene:
     def model(self, name: str) -> AnchorModel:
         return self.opened(name).model
 
-    def level(self, name: str, camera: Camera, quick: bool) -> Level:
-        """What to draw of a model: itself, or for a quick picture of much a thinner one."""
+    def level(self, name: str, camera: Camera, most: int | None = None) -> tuple[Level, int]:
+        """What to draw of a model: itself, or one with at most so many anchors in view; and how many those are."""
         if name not in self._levels:
             self._levels[name] = Levels(self.model(name))
-        return self._levels[name].of(camera, quick)
+        return self._levels[name].of(camera, most)
 
     def show(self, run: TrainedRun) -> None:
         """Put a newer model in place of the one of its name."""
         self.run = run
         self._runs = {run.name: run}
         self._seen, self._tints, self._levels = {}, {}, {}
+        self.generation += 1
         self.__dict__.pop("blocks", None)
 
     def seen(self, name: str) -> Float[Tensor, " n"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import http
 import io
 import math
@@ -17,7 +18,9 @@ from typing import Any
 from rich.console import Console
 
 from vdgs.captures.heights import camera_height
+from vdgs.captures.overview import FOV_DEG
 from vdgs.errors import Interrupted, VdgsError
+from vdgs.memory.process import share_arenas
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import TrainedRun
 from vdgs.settings.requests import ViewRequest
@@ -31,6 +34,8 @@ from vdgs.watching.interrupts import stop_if_asked, stop_requests
 
 #: Where the search for a free port begins, and how many are tried.
 FIRST_PORT, TRIED_PORTS = 8080, 50
+#: So many bytes may wait in the system for a visitor's network before newer pictures take the place of older ones here.
+WAITING_BYTES = 64 << 10
 #: How often a run that trains is looked at, seconds.
 LOOK_AGAIN = 2.0
 
@@ -41,6 +46,7 @@ def view_run(asked: ViewRequest, console: Console, opened: Callable[[str], None]
     Raises VdgsError for a run without a model, an address that cannot be used, and where viser is not installed.
     """
     _require_viser()
+    share_arenas()
     port = free_port(asked.host, asked.port)
     run = open_or_last_saved(asked.run, asked.model, asked.device)
     if run.caution:
@@ -94,9 +100,12 @@ def serve(run: TrainedRun, host: str, port: int, console: Console) -> Iterator[V
     _place_newcomers(server, run)
 
     def comes(client: Any) -> None:
+        generation = scene.generation
         visitor = Visitor(client, scene, studio, console)
         viewer.visitors[client.client_id] = visitor
         visitor.tell(viewer.progress)
+        if scene.generation != generation:  # a newer model came while the panel was made
+            visitor.model_changed()
         if client.client_id not in server.get_clients():  # gone while the panel was made
             goes(client)
 
@@ -105,6 +114,10 @@ def serve(run: TrainedRun, host: str, port: int, console: Console) -> Iterator[V
         if visitor is not None:
             visitor.leave()
 
+    # What is there by now stays. Left out of all later searches for garbage, it lets them be quick and frequent:
+    # visitors who left are held by circles of viser's until one finds them.
+    gc.collect()
+    gc.freeze()
     worker = threading.Thread(target=studio.run, name="studio", daemon=True)
     worker.start()
     server.on_client_connect(comes)
@@ -117,13 +130,14 @@ def serve(run: TrainedRun, host: str, port: int, console: Console) -> Iterator[V
             server.stop()
         worker.join(timeout=5.0)
         scene.close()
+        gc.unfreeze()
 
 
 def _place_newcomers(server: Any, run: TrainedRun) -> None:
     """Where a browser stands when it first opens the page; one that connects again stays where it is."""
     stand, height = navigation.whole_scene(run.capture), camera_height(run.capture)
     start = server.initial_camera
-    start.up, start.fov = (0.0, 0.0, 1.0), math.radians(navigation.FOV_DEG)
+    start.up, start.fov = (0.0, 0.0, 1.0), math.radians(FOV_DEG)
     start.position, start.look_at = tuple(stand.position), tuple(stand.look_at)
     start.near, start.far = 1e-3 * height, 1000 * height
 
@@ -210,6 +224,14 @@ def _start(door: Door) -> Any:
     return server
 
 
+def _keep_short(connection: Any) -> None:
+    """Let nothing pile up in the system's buffers (Linux, macOS): over a slow network, pictures there grow old."""
+    if hasattr(socket, "TCP_NOTSENT_LOWAT"):
+        with contextlib.suppress(OSError, AttributeError):
+            wire = connection.transport.get_extra_info("socket")
+            wire.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, WAITING_BYTES)
+
+
 def _at_the_door(door: Door, inner: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """What answers a request: a refusal, or what viser answers."""
     from websockets.datastructures import Headers
@@ -221,6 +243,7 @@ def _at_the_door(door: Door, inner: Callable[[Any, Any], Any]) -> Callable[[Any,
             body = (refusal + "\n").encode()
             headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
             return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, body)
+        _keep_short(connection)
         response = inner(connection, request)
         if response is not None:
             response.headers["Referrer-Policy"] = "no-referrer"

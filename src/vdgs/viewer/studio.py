@@ -3,16 +3,21 @@
 All kernels run in this one thread; they take the cores themselves. Visitors take turns, a quick picture of anyone
 before the next rows of a full one of anyone. A camera that moves on leaves nothing to be finished: what it last asked
 for counts, and what was begun for it before is dropped.
+
+The more visitors move, the less each picture may take, so that a round of all of them stays short (`ROUND`). What a
+picture takes follows from the anchors that it is drawn from, and from pixels only where those are few: each seat learns
+its seconds an anchor, and asks for as many as fit. Two visitors who rest at the same place get the same full picture.
 """
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections import OrderedDict, deque
+from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -20,14 +25,26 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vdgs.cameras import Camera
+from vdgs.memory.process import return_unused
 from vdgs.viewer.layers import Shown
 
 #: A camera that has not moved for so long rests, seconds.
 REST = 0.12
 #: A quick picture takes so long, and never has fewer pixels nor more than these.
 QUICK, FEWEST_PX, MOST_PX = 0.045, 240 * 160, 640 * 480
-#: Rows of a full picture are drawn for so long before others have their turn.
-TURN = 0.1
+#: A quick picture of each visitor who moves takes so long together, and no picture is given less than this.
+ROUND, BRIEFEST = 0.12, 0.008
+#: A quick picture is drawn from at most about so many anchors before it is known what they take, never from fewer.
+FIRST_ANCHORS, FEWEST_ANCHORS = 20_000, 2_000
+#: Of a new measure of seconds an anchor, this share counts; the rest is what was known.
+LEARNING = 0.4
+#: Rows of a full picture are drawn for so long before others have their turn, and from about so many anchors at once:
+#: what they decode to is memory.
+TURN, TURN_ANCHORS, MOST_TURNS = 0.1, 60_000, 24
+#: Full pictures that are kept for others who stand at the same place.
+KEPT = 3
+#: With nothing to do for so long, memory is given back, seconds.
+IDLE = 1.0
 
 _Result = TypeVar("_Result")
 
@@ -36,8 +53,13 @@ _Result = TypeVar("_Result")
 class Paints(Protocol):
     """Draws what one visitor asks for (`layers.Painter`)."""
 
+    #: Anchors that the last picture was drawn from; 0 where that is not known.
+    drawn: int
+
     def settle(self, shown: Shown, whole: Camera) -> None: ...
-    def paint(self, shown: Shown, camera: Camera, whole: Camera, quick: bool = False) -> np.ndarray: ...
+    def key(self, shown: Shown) -> Hashable: ...
+    def in_view(self, shown: Shown, camera: Camera) -> int: ...
+    def paint(self, shown: Shown, camera: Camera, whole: Camera, most: int | None = None) -> np.ndarray: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +92,10 @@ class Seat:
     work: Iterator[None] | None = None
     #: Pixels that a quick picture may have, learned from what they take.
     quick_px: float = 320 * 240
+    #: Seconds that a quick picture takes for each of its anchors; 0 before there was any.
+    per_anchor: float = 0.0
     #: Seconds that a pixel of a full picture took; 0 before there was any.
-    per_px: float = field(default=0.0)
+    per_px: float = 0.0
 
 
 class Studio:
@@ -81,6 +105,7 @@ class Studio:
         self._clock = clock
         self._seats: list[Seat] = []
         self._errands: deque[Callable[[], None]] = deque()
+        self._full_pictures: OrderedDict[Hashable, np.ndarray] = OrderedDict()
         self._changed = threading.Condition()
         self._closed = False
 
@@ -134,9 +159,18 @@ class Studio:
             with self._changed:
                 if self._closed:
                     return
-                busy = self._errands or any(seat.quick_due for seat in self._seats)
-                if wait != 0 and not busy:
-                    self._changed.wait(wait)
+                if wait == 0 or self._busy():
+                    continue
+                told = self._changed.wait(IDLE if wait is None else wait)
+                if told or wait is not None or self._busy() or self._closed:
+                    continue
+            gc.collect()  # who left is held by circles of theirs
+            return_unused()
+            with self._changed:
+                self._changed.wait_for(lambda: self._busy() or self._closed)
+
+    def _busy(self) -> bool:
+        return bool(self._errands) or any(seat.quick_due for seat in self._seats)
 
     def step(self) -> float | None:
         """Do one piece of work. Returns 0 if there may be more, else seconds until there will be; None: not known."""
@@ -179,12 +213,21 @@ class Studio:
         if small is whole and not seat.full_due:
             return
         began = self._clock()
-        seat.deliver(Frame(seat.painter.paint(shown, small, small, True), False, whole, shown))
+        allowed = self._allowed(began)
+        anchors = max(int(allowed / seat.per_anchor), FEWEST_ANCHORS) if seat.per_anchor else FIRST_ANCHORS
+        seat.deliver(Frame(seat.painter.paint(shown, small, small, anchors), False, whole, shown))
         taken = max(self._clock() - began, 1e-4)
-        most = min(MOST_PX, whole.width * whole.height)
-        seat.quick_px = float(
-            np.clip(seat.quick_px * np.clip(QUICK / taken, 0.5, 1.5), FEWEST_PX, max(most, FEWEST_PX))
-        )
+        if seat.painter.drawn:
+            measured = taken / seat.painter.drawn
+            seat.per_anchor += (LEARNING if seat.per_anchor else 1.0) * (measured - seat.per_anchor)
+        most = max(min(MOST_PX, whole.width * whole.height), FEWEST_PX)
+        seat.quick_px = float(np.clip(seat.quick_px * np.clip(allowed / taken, 0.5, 1.5), FEWEST_PX, most))
+
+    def _allowed(self, now: float) -> float:
+        """Seconds that a quick picture may take: a fair share of a round of all who move."""
+        with self._changed:
+            moving = sum(now - seat.moved < 2 * REST for seat in self._seats)
+        return min(QUICK, max(ROUND / max(moving, 1), BRIEFEST))
 
     def _draw_on(self, seat: Seat) -> None:
         """The next rows of a full picture."""
@@ -203,7 +246,14 @@ class Studio:
     def _full(self, seat: Seat, whole: Camera, shown: Shown) -> Iterator[None]:
         """Draw a full picture, turn by turn, and deliver it unless something else was asked for meanwhile."""
         seat.painter.settle(shown, whole)
-        turns = max(1, min(8, round(seat.per_px * whole.width * whole.height / TURN)))
+        key = (view_of(whole), shown, seat.painter.key(shown))
+        if key in self._full_pictures:
+            self._full_pictures.move_to_end(key)
+            seat.deliver(Frame(self._full_pictures[key], True, whole, shown))
+            return
+        turns = round(seat.per_px * whole.width * whole.height / TURN)
+        turns = max(turns, -(-seat.painter.in_view(shown, whole) // TURN_ANCHORS), 1)
+        turns = min(turns, MOST_TURNS, whole.height)
         edges = np.linspace(0, whole.height, turns + 1).round().astype(int).tolist()
         parts, taken = [], 0.0
         for top, bottom in pairwise(edges):
@@ -214,8 +264,19 @@ class Studio:
             if bottom != whole.height:
                 yield
         seat.per_px = taken / (whole.width * whole.height)
+        picture = np.concatenate(parts)
+        self._full_pictures[key] = picture
+        while len(self._full_pictures) > KEPT:
+            self._full_pictures.popitem(last=False)
         if seat.asked == (whole, shown):
-            seat.deliver(Frame(np.concatenate(parts), True, whole, shown))
+            seat.deliver(Frame(picture, True, whole, shown))
+
+
+def view_of(camera: Camera) -> Hashable:
+    """What tells a view from others: equal for two cameras that see the same, to the last bit."""
+    return (
+        camera.camera_from_world.tobytes(), camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
+    )  # fmt: skip
 
 
 def shrunk(camera: Camera, pixels: float) -> Camera:

@@ -18,10 +18,9 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.render import visible_rows
 
-#: Each level has so many times fewer anchors than the one before: all together take a quarter of the model's memory.
-THINNING = 5
-#: A quick picture draws at most about so many anchors (choice: 25 ms on two cores).
-MOST_ANCHORS = 60_000
+#: The first level has so many times fewer anchors than the model, each further one so many times fewer than the one
+#: before it: all together take 0.3 of the model's memory.
+FIRST, FURTHER = 5, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,20 +38,26 @@ class Level:
 class Levels:
     """A model and its thinner ones, each made when it is first needed."""
 
-    def __init__(self, model: AnchorModel, most: int = MOST_ANCHORS) -> None:
-        self._levels, self._most = [Level(model)], most
+    def __init__(self, model: AnchorModel) -> None:
+        self._levels = [Level(model)]
 
-    def of(self, camera: Camera, quick: bool) -> Level:
-        """The model itself, or for a quick picture the finest one of which the camera sees few enough anchors."""
+    def of(self, camera: Camera, most: int | None = None) -> tuple[Level, int]:
+        """The model itself, or the finest level of which the camera sees at most so many anchors; and how many it
+        sees of it, about."""
         whole = self._levels[0]
-        if not quick:
-            return whole
-        shown, number = float(len(visible_rows(whole.model.anchors, camera))), 0
-        while shown > self._most:
-            shown, number = shown / THINNING, number + 1
+        shown, number = len(visible_rows(whole.model.anchors, camera)), 0
+        if most is None:
+            return whole, shown
+        while shown // times_of(number) > max(most, 1):
+            number += 1
         while len(self._levels) <= number:
-            self._levels.append(thinned(whole.model, THINNING ** len(self._levels)))
-        return self._levels[number]
+            self._levels.append(thinned(whole.model, times_of(len(self._levels))))
+        return self._levels[number], shown // times_of(number)
+
+
+def times_of(level: int) -> int:
+    """How many times fewer anchors a level has than the model, which is level 0."""
+    return FIRST * FURTHER ** (level - 1) if level else 1
 
 
 def thinned(model: AnchorModel, times: int) -> Level:

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from vdgs.cameras import Camera
 from vdgs.captures.heights import camera_height
+from vdgs.captures.overview import FOV_DEG
 from vdgs.errors import VdgsError
 from vdgs.viewer import navigation, overlays
 from vdgs.viewer.layers import LAYERS, Layer, Painter, Shown
@@ -228,7 +229,7 @@ class Visitor:
                 "From above": lambda: navigation.from_above(self.stand),
                 "North up": lambda: navigation.north_up(self.stand),
             }
-            self.go(change[buttons.value](), np.radians(navigation.FOV_DEG))
+            self.go(change[buttons.value](), np.radians(FOV_DEG))
 
     def _build_overlays(self) -> None:
         gui = self.client.gui

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
-import pycolmap
 
 from vdgs.captures.capture import Split
 from vdgs.captures.sightings import Sightings
@@ -169,6 +168,8 @@ def rays_of(intrinsics: Intrinsics, pixels: np.ndarray) -> np.ndarray:
     """x/z and y/z [n, 2] of the rays through pixels [n, 2] of a camera, its lens undone; NaN where it has no ray."""
     if not intrinsics.distorted:
         return (pixels - intrinsics.principal_point) / intrinsics.focal
+    import pycolmap  # 60 MB of memory: only for lenses that need it
+
     width, height, params = intrinsics.width, intrinsics.height, list(intrinsics.params)
     camera = pycolmap.Camera(model=intrinsics.model, width=width, height=height, params=params)
     return np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)

@@ -71,7 +71,7 @@ def merged(gaussians: Gaussians, cells: Int64[Tensor, " n"]) -> Gaussians:
     means = pooled(gaussians.means)
     apart = gaussians.means.double() - means[cells]
     spread = pooled(covariances(gaussians).double() + WIDER * apart[:, :, None] * apart[:, None, :])
-    log_scales, quaternions = _axes(spread)
+    log_scales, quaternions = axes_of(spread)
     cover_of_cell = torch.zeros(count, dtype=torch.float64).index_add_(0, cells, cover)
     opacity = -torch.expm1(-cover_of_cell / _areas(log_scales))
     together = Gaussians(
@@ -95,7 +95,7 @@ def _areas(log_scales: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
     return log_scales.double().topk(2, dim=-1).values.sum(-1).exp()
 
 
-def _axes(spread: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
+def axes_of(spread: Float[Tensor, "n 3 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 4"]]:
     """Logarithms of the standard deviations and rotations (wxyz) of covariances."""
     variances, axes = torch.linalg.eigh(spread)
     axes = axes * torch.linalg.det(axes).sign()[:, None, None]

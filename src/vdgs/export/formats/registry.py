@@ -8,6 +8,7 @@ from pathlib import Path
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.gltf import refuse_too_large, write_glb
+from vdgs.export.formats.html import read_html, refuse_without_viser, write_html
 from vdgs.export.formats.ply import read_ply, write_ply
 from vdgs.export.formats.points import refuse_without_laspy, write_laz, write_points
 from vdgs.export.formats.scene import Scene, beside
@@ -33,6 +34,8 @@ class Format:
     check: Callable[[Path, Scene], None] = lambda path, scene: None
     #: Whether facts are written to FILE.json, for the format has no room for them.
     facts_beside: bool = False
+    #: Whether its colours do not change with the direction: best baked so, where all files are of that kind.
+    fixed: bool = False
 
 
 #: The longer endings first: `.points.ply` is a `.ply` too.
@@ -44,6 +47,7 @@ FORMATS: tuple[Format, ...] = (
     Format(".sog", "PlayCanvas' SOG, a twelfth of the PLY or less", write_sog, facts_beside=True),
     Format(".glb", "glTF with KHR_gaussian_splatting, nothing lost", write_glb, check=refuse_too_large),
     Format(NAME, "3D Tiles for CesiumJS, in levels", write_tiles, check=refuse_other_names),
+    Format(".html", "page that shows the scene offline", write_html, read_html, refuse_without_viser, fixed=True),
     Format(".laz", "point cloud, map coordinates, compressed", write_laz, check=refuse_without_laspy),
     Format(".las", "point cloud, map coordinates", write_laz, check=refuse_without_laspy),
 )

@@ -55,6 +55,20 @@ class Facts:
 
 
 @dataclass(frozen=True)
+class Page:
+    """How a page first shows a scene, in local coordinates."""
+
+    #: Where one stands and what one looks at.
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
+    #: Colour behind the scene, RGB in 0 .. 1.
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    title: str = "scene"
+    #: The file may have so many bytes.
+    most_bytes: int = 30_000_000
+
+
+@dataclass(frozen=True)
 class Scene:
     """Gaussians on their way into a file. They are gone through once."""
 
@@ -65,6 +79,8 @@ class Scene:
     facts: Facts = Facts()
     #: Lowest and highest coordinates of the means, where known beforehand: what cannot be held is refused before work.
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    #: For those formats that show the scene themselves; they find a view of their own where it is not given.
+    page: Page | None = None
 
     @staticmethod
     def of(gaussians: Gaussians, facts: Facts | None = None) -> Scene:

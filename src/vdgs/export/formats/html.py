@@ -1,0 +1,248 @@
+"""`.html`: a page that shows the scene offline, in any browser with WebGL 2: viser's client with the scene inside.
+
+The client comes from the installed package viser, with a recording of one message that carries the Gaussians: 32 bytes
+each (mean in float32, covariance in float16, colour and opacity in bytes), compressed, as base64. Colours do not change
+with the direction. A scene that would be too large for the file is thinned by halves until it fits (`levels`).
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt32
+
+from vdgs.captures.overview import FOV_DEG
+from vdgs.errors import VdgsError
+from vdgs.export.formats.levels import axes_of, thinned
+from vdgs.export.formats.scene import Page, Scene, bytes_of, colours, logits_of, opacities
+from vdgs.model.gaussians import Gaussians
+from vdgs.model.similarity import covariances
+from vdgs.model.spherical_harmonics import dc_of_colours
+from vdgs.storage.files import write_bytes
+
+#: Numbers of 32 bits a Gaussian.
+WORDS = 8
+#: Lengths in the page are those of the scene times a power of two, with which the median Gaussian is about so large:
+#: covariances in float16 then hold all from 1/13 of it to 2000 times it.
+USUAL_SIZE = 0.1
+#: No standard deviation above this, in lengths of the page: its square ends below the largest float16.
+LARGEST_SIZE = 250.0
+#: Bytes a Gaussian takes are found on so many; they are right within this share.
+SAMPLE, SLACK = 1 << 15, 1.05
+#: Fewer than this are no scene.
+FEWEST = 1000
+#: z up to the y up of the client: a quarter turn about x, wxyz.
+_UPRIGHT = (0.7071067811865476, -0.7071067811865476, 0.0, 0.0)
+_EMBEDDED = re.compile(r'window\.__VISER_EMBED_DATA__="([A-Za-z0-9+/=]*)"')
+_FACTS = re.compile(r'<meta name="vdgs" content="([^"]*)"')
+#: The page may load nothing: all that it needs is in it.
+_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' data: blob:; "
+    "worker-src data: blob:; style-src 'unsafe-inline'; img-src data: blob:; font-src data:; connect-src data: blob:"
+)
+#: Chromium refuses module workers from blobs in pages that were opened as files, and without its worker the client
+#: never sorts the Gaussians by depth. The same script as a data URL it takes.
+_WORKERS = (
+    "<script>{const Usual=Worker;window.Worker=class extends Usual{constructor(url,options){"
+    "if(location.protocol==='file:'&&String(url).startsWith('blob:')){const script=new XMLHttpRequest();"
+    "script.open('GET',url,false);script.send();"
+    "url='data:text/javascript;charset=utf-8,'+encodeURIComponent(script.responseText);}super(url,options);}}}</script>"
+)
+_CAPTION = (
+    "position:fixed;left:0;bottom:0;z-index:2;margin:0;padding:.35em .7em;font:13px/1.4 system-ui,sans-serif;"
+    "color:#222;background:rgba(255,255,255,.75);pointer-events:none"
+)
+
+
+def refuse_without_viser(path: Path, scene: Scene) -> None:
+    """Raise VdgsError where the package that holds the client is missing."""
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise VdgsError(f"{path}: pages need viser. Install it: pip install 'vdgs[viewer]'") from error
+
+
+def write_html(path: Path, scene: Scene) -> tuple[str, ...]:
+    """Write the page, atomically. Returns what was lost. Raises VdgsError."""
+    whole = _of_fixed_colour(scene)
+    page = scene.page or _facing(whole)
+    factor = _factor(whole)
+    kept = whole
+    while len(content := _document(kept, factor, page, scene)) > page.most_bytes:
+        kept = _fitting(whole, len(kept), factor, page)
+    write_bytes(path, content)
+    lost = ["colours do not change with the viewing direction"]
+    if len(kept) < len(whole):
+        lost.append(
+            f"thinned from {len(whole):,} Gaussians to {len(kept):,}, for the page may have "
+            f"{page.most_bytes / 1e6:g} MB (--html-mb)"
+        )
+    return tuple(lost)
+
+
+def read_html(path: Path) -> Gaussians:
+    """The Gaussians of a page of ours, in the ground frame. Raises VdgsError if it is missing or none."""
+    import msgspec
+    import zstandard
+
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise VdgsError(f"{path}: cannot be read ({error}).") from error
+    facts, data = _FACTS.search(text), _EMBEDDED.search(text)
+    if facts is None or data is None:
+        raise VdgsError(f"{path}: is no page of `vdgs export`.")
+    packed = base64.b64decode(data[1])
+    inner = zstandard.ZstdDecompressor().decompress(packed[8:], int.from_bytes(packed[:8], "little"))
+    known = json.loads(html.unescape(facts[1]))
+    length = int.from_bytes(inner[:8], "little")
+    (size,) = msgspec.msgpack.decode(inner[8 : 8 + length])["binaryBufferLengths"]
+    return _unpacked(np.frombuffer(inner[-size:], np.uint32).reshape(-1, WORDS), known["factor"])
+
+
+def _of_fixed_colour(scene: Scene) -> Gaussians:
+    """All of a scene in memory, without the coefficients that are not shown: 56 bytes each."""
+    parts = [[*piece.tensors().values()][:-1] for piece in scene.pieces()]
+    joined = [torch.cat(tensors) for tensors in zip(*parts, strict=True)]
+    return Gaussians(*joined, torch.zeros(len(joined[0]), 0, 3))
+
+
+def _fitting(whole: Gaussians, tried: int, factor: float, page: Page) -> Gaussians:
+    """The scene halved as often as it takes to fit, at least once more than what was tried. Raises VdgsError."""
+    some = whole.select(torch.linspace(0, len(whole) - 1, min(SAMPLE, len(whole))).long())
+    frame = len(_client()) + 4096
+    each = SLACK * len(_recorded(_packed(some, factor), factor, page)) / len(some)
+    count = len(whole)
+    while count >= tried or frame + each * count > page.most_bytes:
+        count //= 2
+        if count < FEWEST:
+            raise VdgsError(
+                f"A page of {page.most_bytes / 1e6:g} MB has no room for the scene: the client alone takes "
+                f"{frame / 1e6:.1f} MB. Allow more: --html-mb."
+            )
+    return thinned(whole, count)[0]
+
+
+def _factor(gaussians: Gaussians) -> float:
+    """The power of two that lengths are multiplied with."""
+    usual = float(gaussians.log_scales.amax(1).median().exp())
+    return float(2.0 ** np.round(np.log2(USUAL_SIZE / max(usual, 1e-30))))
+
+
+def _packed(gaussians: Gaussians, factor: float) -> UInt32[np.ndarray, "n 8"]:
+    """As the client's textures hold them."""
+    rows = np.zeros((len(gaussians), WORDS), np.uint32)
+    rows[:, :3] = (factor * gaussians.means.numpy()).astype(np.float32).view(np.uint32)
+    largest = float(np.log(LARGEST_SIZE / factor))
+    clamped = Gaussians(**{**gaussians.tensors(), "log_scales": gaussians.log_scales.clamp_max(largest)})
+    spread = factor**2 * covariances(clamped).numpy().reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    rows[:, 4:7] = np.ascontiguousarray(spread.astype(np.float16)).view(np.uint32)
+    shown = np.concatenate([colours(gaussians), opacities(gaussians)[:, None]], 1)
+    rows[:, 7:] = bytes_of(shown).view(np.uint32)
+    return rows
+
+
+def _unpacked(rows: UInt32[np.ndarray, "n 8"], factor: float) -> Gaussians:
+    """The inverse of `_packed`, but for what is rounded."""
+    upper = torch.from_numpy(np.ascontiguousarray(rows[:, 4:7]).view(np.float16).astype(np.float64)) / factor**2
+    log_scales, quaternions = axes_of(upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
+    rgba = np.ascontiguousarray(rows[:, 7:]).view(np.uint8).astype(np.float32) / 255
+    return Gaussians(
+        means=torch.from_numpy(np.ascontiguousarray(rows[:, :3]).view(np.float32) / np.float32(factor)),
+        log_scales=log_scales.float(), quaternions=quaternions.float(), logits=logits_of(rgba[:, 3]),
+        dc=dc_of_colours(torch.from_numpy(rgba[:, :3])), rest=torch.zeros(len(rows), 0, 3),
+    )  # fmt: skip
+
+
+def _document(gaussians: Gaussians, factor: float, page: Page, scene: Scene) -> bytes:
+    """The whole file."""
+    title = html.escape(page.title)
+    facts = {**scene.facts.known(), "axes": "z up", "gaussians": len(gaussians), "factor": factor}
+    head = (
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        f'<meta name="vdgs" content="{html.escape(json.dumps(facts))}">{_WORKERS}'
+    )
+    recording = _recorded(_packed(gaussians, factor), factor, page)
+    script = (
+        f'<script>window.__VISER_EMBED_DATA__="{recording}";window.__VISER_EMBED_CONFIG__={{darkMode:false}};</script>'
+    )
+    caption = (
+        f'<p style="{_CAPTION}">{title} · {len(gaussians):,} Gaussians, colours as seen from no particular side · '
+        "left button turns, right moves, wheel goes nearer</p>"
+    )
+    client = _client().replace("<title>Viser</title>", f"<title>{title}</title>", 1)
+    client = client.replace('<meta charset="utf-8" />', f'<meta charset="utf-8" />{head}', 1)
+    client = client.replace("</head>", f"{script}</head>", 1)
+    before, after = client.rsplit("</body>", 1)
+    return f"{before}{caption}</body>{after}".encode()
+
+
+def _client() -> str:
+    """The page of viser's client, as the installed package has it."""
+    import viser
+
+    file = Path(viser.__file__).parent / "client" / "build" / "index.html"
+    try:
+        text = file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise VdgsError(f"{file}: cannot be read ({error.strerror or error}). Install viser again.") from error
+    if not all(part in text for part in ('<meta charset="utf-8" />', "</head>", "</body>")):
+        raise VdgsError(f"{file}: is a client that vdgs does not know. Install viser 1.1.")
+    return text
+
+
+def _recorded(rows: UInt32[np.ndarray, "n 8"], factor: float, page: Page) -> str:
+    """What the client plays: where one stands, the colour behind, and the Gaussians. Base64."""
+    from viser import _messages as messages
+    from viser.infra import StateSerializer, WebsockMessageHandler
+
+    position, target = factor * np.array(page.position), factor * np.array(page.target)
+    away = float(np.linalg.norm(position - target))
+    handler = WebsockMessageHandler()  # of no server: it only holds the list of recordings
+    recording: StateSerializer = handler.get_message_serializer(lambda message: True)
+    said: list[Any] = [
+        messages.SetOrientationMessage("", _UPRIGHT),
+        messages.SetCameraUpDirectionMessage((0.0, 0.0, 1.0), initial=True),
+        messages.SetCameraPositionMessage(tuple(position.tolist()), initial=True),
+        messages.SetCameraLookAtMessage(tuple(target.tolist()), initial=True),
+        messages.SetCameraFovMessage(float(np.radians(FOV_DEG)), initial=True),
+        messages.SetCameraNearMessage(1e-3 * away, initial=True),
+        messages.SetCameraFarMessage(1e3 * away, initial=True),
+        messages.SetCameraMinOrbitDistanceMessage(1e-3 * away),
+        messages.SetCameraMaxOrbitDistanceMessage(100 * away),
+        messages.BackgroundImageMessage("png", _png(page.background), None),
+        messages.GaussianSplatsMessage("/scene", messages.GaussianSplatsProps(rows, 1.0)),
+    ]
+    for message in said:
+        recording._insert_message(message)
+    return base64.b64encode(recording.serialize()).decode("ascii")
+
+
+def _png(colour: tuple[float, float, float]) -> bytes:
+    """A picture of one colour."""
+    pixels = np.broadcast_to(bytes_of(np.array(colour))[::-1], (2, 2, 3))
+    done, encoded = cv2.imencode(".png", np.ascontiguousarray(pixels))
+    assert done
+    return encoded.tobytes()
+
+
+def _facing(gaussians: Gaussians) -> Page:
+    """A view of all from the south, half from above."""
+    low, high = (np.quantile(gaussians.means.numpy(), q, axis=0) for q in (0.02, 0.98))
+    middle: Float[np.ndarray, "3"] = (low + high) / 2
+    away = max(float((high - low).max()), 1e-6)
+    position = middle + away * np.array([0.0, -0.9, 0.9])
+    return Page(_three(position), _three(middle))
+
+
+def _three(place: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    x, y, z = (float(each) for each in place)
+    return x, y, z
