@@ -1,12 +1,12 @@
-"""How long the export of a large scene takes, and how much memory: a made-up model of many anchors, two files.
+"""How long the export of a large scene takes, and how much memory: a made-up model of many anchors.
 
-    OMP_WAIT_POLICY=PASSIVE python benchmarks/exporting.py --anchors 20000 60000 200000 [--to a.ply b.spz] [--no-measure]
-    OMP_WAIT_POLICY=PASSIVE python benchmarks/exporting.py --anchors 1000000 --folder /large/disk
+    OMP_WAIT_POLICY=PASSIVE python benchmarks/exporting.py --anchors 20000 60000 200000 [--to a.ply b.spz]
+    OMP_WAIT_POLICY=PASSIVE python benchmarks/exporting.py --anchors 1000000 --folder /large/disk --no-measure
 
 Each anchor has 10 Gaussians; there are as many photographs to an anchor as in a real flight (one for 1600), 400 x 300
-pixels, each holding 2.4 % of the first size's ground, so that a place is seen by about ten. Every size runs in a process
-of its own. Seconds are wall clock and processor time of the whole; the exponents are those between the first and the last
-size (1: in proportion). Peak memory counts pages of the temporary file as far as they lie in memory.
+pixels, and a place is seen by about ten. Every size runs in a process of its own. Seconds are wall clock and processor
+time of the whole; the exponents are those between the first and the last size (1: in proportion). Peak memory counts
+pages of the temporary file as far as they lie in memory.
 """
 
 from __future__ import annotations
@@ -119,15 +119,17 @@ def main() -> None:
             row = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout.splitlines()[-1])
         rows.append(row)
         print(
-            f"{row['anchors']:9,} anchors, {row['gaussians']:10,} Gaussians, {row['views']:4} views: {row['seconds']:.1f} s "
-            f"(baking {row['baking']:.1f}), processor {row['processor']:.1f} s, {row['memory'] / 1e9:.2f} GB, "
-            f"files {row['bytes'] / 1e9:.2f} GB",
+            f"{row['anchors']:9,} anchors, {row['gaussians']:10,} Gaussians, {row['views']:4} views: "
+            f"{row['seconds']:.1f} s (baking {row['baking']:.1f}), processor {row['processor']:.1f} s, "
+            f"{row['memory'] / 1e9:.2f} GB, files {row['bytes'] / 1e9:.2f} GB",
             flush=True,
         )
     if len(rows) > 1:
         first, last = rows[0], rows[-1]
         times = last["gaussians"] / first["gaussians"]
-        exponents = (f"{what} {math.log(last[what] / first[what]) / math.log(times):.2f}" for what in ("processor", "memory"))
+        exponents = (
+            f"{what} {math.log(last[what] / first[what]) / math.log(times):.2f}" for what in ("processor", "memory")
+        )
         print("exponents: " + ", ".join(exponents))
 
 

@@ -55,8 +55,8 @@ def frame_of(ground: GroundFrame, crs: str | None, centre: Float[np.ndarray, "3"
     """The local coordinates of a system (`Placement.of`) about a scene whose middle is `centre` (ground frame).
 
     Gaussians take the similarity that is right about the centre: over a kilometre a projection departs from it by
-    centimetres, mostly in height (the Earth is round). A middle that is more than `far` from the origin of the system gets
-    an origin of its own. Raises VdgsError for a system that cannot be had.
+    centimetres, mostly in height (the Earth is round). A middle that is more than `far` from the origin of the system
+    gets an origin of its own. Raises VdgsError for a system that cannot be had.
     """
     placement = Placement.of(ground, crs)
     similarity = placement.similarity_at(centre)

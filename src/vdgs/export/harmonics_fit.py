@@ -54,9 +54,7 @@ def fit_harmonics(
     return found
 
 
-def _alike(
-    starts: Int[np.ndarray, " m"], pairs: int
-) -> Iterator[tuple[Int[Tensor, " b"], Int[Tensor, "b v"], Tensor]]:
+def _alike(starts: Int[np.ndarray, " m"], pairs: int) -> Iterator[tuple[Int[Tensor, " b"], Int[Tensor, "b v"], Tensor]]:
     """Gaussians with about as many pairs each: their rows, the places of their pairs, and which of those are theirs."""
     counts = np.diff(starts, append=pairs)
     order = np.argsort(-counts, kind="stable")

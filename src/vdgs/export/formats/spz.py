@@ -161,8 +161,8 @@ def _three_smallest(quaternions: np.ndarray) -> np.ndarray:
 
 
 def spz_pieces(path: Path) -> Iterator[Gaussians]:
-    """The Gaussians of a file of version 2 or 3, in the ground frame, at most `ROWS` at a time (but all of its bytes are
-    in memory, 64 for each). Raises VdgsError if it is damaged or another."""
+    """The Gaussians of a file of version 2 or 3, in the ground frame, at most `ROWS` at a time, but all of its
+    bytes in memory, 64 for each. Raises VdgsError if it is damaged or another."""
     try:
         data = zlib.decompress(path.read_bytes(), 31)
     except OSError as error:
