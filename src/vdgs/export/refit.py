@@ -2,9 +2,9 @@
 
 A model shows some of what changes with the direction by opacity and shape, which a file cannot. Colours can stand in
 for them. The baked Gaussians are drawn where the model is, its picture minus theirs is what is missing, and each
-Gaussian takes of it the mean over the pixels that it makes, by its part of each: for the colours one step of the simultaneous
-iterative reconstruction technique (Gilbert, 1972). Spherical harmonics are fitted to these steps as they were to the
-colours.
+Gaussian takes of it the mean over the pixels that it makes, by its part of each: for the colours one step of the
+simultaneous iterative reconstruction technique (Gilbert, 1972). Spherical harmonics are fitted to these steps as they
+were to the colours.
 
 Cameras between those of the photographs take part: the model knows what is to be seen from there, and without them what
 few photographs ask for would be learnt by heart. Memory: 12 bytes for each Gaussian that a view shows.
