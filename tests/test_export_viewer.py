@@ -95,13 +95,13 @@ def test_a_published_viewer_shows_what_we_draw(tmp_path):
 
         def alike() -> bool:
             shown[0] = page.screenshot()
-            return psnr(shown[0] / 255, expected) > 30
+            return psnr(shown[0] / 255, expected) > 33
 
         try:
             wait_until(alike)
         finally:
             cv2.imwrite(str(tmp_path / "shown.png"), shown[0][..., ::-1])
             cv2.imwrite(str(tmp_path / "expected.png"), np.rint(255 * expected).astype(np.uint8)[..., ::-1])
-    assert psnr(shown[0] / 255, expected) > 30
+    assert psnr(shown[0] / 255, expected) > 33
     # So the comparison can fail: it sees that one picture is turned over.
     assert psnr(shown[0][::-1] / 255, expected) < 25
