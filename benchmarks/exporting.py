@@ -77,7 +77,7 @@ def one(anchors: int, folder: Path, names: list[str], measure: bool) -> None:
     model, cameras = made_up(anchors)
     photograph = folder / "grey.png"
     Image.new("RGB", (WIDTH, HEIGHT), (128, 128, 128)).save(photograph)
-    every = max(1, len(cameras) // TESTED)
+    every = max(4, len(cameras) // TESTED)
     views = tuple(
         View(f"{i:05d}.png", camera, photograph, None, "test" if i % every == 0 else "train")
         for i, camera in enumerate(cameras)

@@ -73,16 +73,17 @@ def loss_of(run: TrainedRun, pieces: Iterable[Gaussians], after_view: Callable[[
             rows.append([*psnrs, *(masked_mean(each, mask) for each in likeness)])
             after_view()
     tested = run.capture.test_views
-    means = np.mean(rows, axis=0).tolist()
-    bins = [dict(each) for each in histogram.bins(BINS)]
+    there_are, of = (len(tested), "test") if tested else (len(run.capture.train_views), "training")
+    psnr, psnr_baked, psnr_cc, psnr_cc_baked, ssim, ssim_baked = np.mean(rows, axis=0).tolist()
     return Loss(
-        len(views), len(tested or run.capture.train_views), "test" if tested else "training", *means, by_visibility=bins
-    )
+        len(views), there_are, of, psnr, psnr_baked, psnr_cc, psnr_cc_baked, ssim, ssim_baked,
+        [dict(each) for each in histogram.bins(BINS)],
+    )  # fmt: skip
 
 
 def _seen(pieces: Iterable[Gaussians], cameras: Sequence[Camera]) -> Gaussians:
     """What the cameras may show of the pieces, and at least one Gaussian."""
-    kept = []
+    kept: list[Gaussians] = []
     for piece in pieces:
         seen = torch.zeros(len(piece), dtype=torch.bool)
         seen[:1] = not kept

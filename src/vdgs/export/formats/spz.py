@@ -32,8 +32,6 @@ FRACTION_BITS = 12
 #: Positions lie below this many units from the origin.
 REACH = 2**23 / 2**FRACTION_BITS
 COLOUR_SCALE = 0.15
-#: Steps of the coefficients of the first band and of the others, in units of 1 / 128: what Niantic's writer takes.
-FIRST_STEP, REST_STEP = 8, 16
 #: Columns in the order of the file.
 COLUMNS = ("positions", "alphas", "colours", "scales", "rotations", "harmonics")
 READ_IN = 1 << 22
@@ -134,9 +132,10 @@ def _beyond(piece: Gaussians) -> dict[str, int]:
 
 def _harmonics(rest: np.ndarray) -> np.ndarray:
     n, r, _ = rest.shape
-    step = np.where(np.arange(r) < 3, FIRST_STEP, REST_STEP)[:, None].astype(np.float32)
-    # The middle of the bytes, 128, is a step of its own: what is zero stays zero.
-    coded = np.rint(rest * np.float32(128) / step) * step + 128
+    # All eight bits: Niantic's writer keeps five of the first band and four of the others, for smaller files, and takes
+    # nearly all change with the direction away from scenes whose coefficients are small (docs/export.md). The middle of
+    # the bytes, 128, is a value of its own: what is zero stays zero.
+    coded = np.rint(rest * np.float32(128)) + 128
     return np.clip(coded, 0, 255).astype(np.uint8).reshape(n, 3 * r)
 
 
