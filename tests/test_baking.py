@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from merging_support import camera_above, model_at
+from vdgs.cameras import Camera
 from vdgs.export import baking
 from vdgs.export.baking import Survey, bake, survey
-from vdgs.export.harmonics_fit import fit_harmonics
+from vdgs.export.between import between
+from vdgs.export.formats.scene import Scene
+from vdgs.export.formats.spool import spooled
+from vdgs.export.harmonics_fit import RIDGE, fit_harmonics
+from vdgs.export.refining import refine
+from vdgs.export.refit import Baked, refit
+from vdgs.export.shapes import ellipsoids, logarithms
 from vdgs.kernels.types import DecoderWeights, HeadWeights
 from vdgs.model.anchor_model import AnchorModel, Part
 from vdgs.model.decoder import Decoder
 from vdgs.model.gaussians import Gaussians, draw_gaussians
 from vdgs.model.render import decode_view, render
-from vdgs.model.spherical_harmonics import function_count, view_colours
+from vdgs.model.spherical_harmonics import basis, function_count, view_colours
 from vdgs.model.world import places, spawned
 
 VIEWS = [camera_above(0.3, -0.2), camera_above(-2.0, 1.0, tilt_deg=30.0), camera_above(1.5, 2.0, tilt_deg=-25.0)]
@@ -127,6 +137,118 @@ def test_places_and_numbers_of_what_is_kept():
     assert torch.equal(gaussians.means, places(model.anchors).reshape(-1, 3)[torch.from_numpy(kept)])
     assert torch.allclose(gaussians.quaternions.norm(dim=1), torch.ones(len(kept)), atol=1e-5)
     assert all(bool(torch.isfinite(tensor).all()) for tensor in gaussians.tensors().values())
+
+
+def steep(model: AnchorModel) -> AnchorModel:
+    """The model with colours, opacities and shapes that change much with where it is seen from."""
+
+    def steeper(head: HeadWeights) -> HeadWeights:
+        return replace(head, w1=torch.cat([head.w1[:, :32], 6 * head.w1[:, 32:]], 1))
+
+    weights = model.decoder.weights
+    heads = DecoderWeights(steeper(weights.opacity), steeper(weights.covariance), steeper(weights.colour))
+    return replace(model, decoder=replace(model.decoder, weights=heads))
+
+
+def on_disk(seen: Survey, kept: np.ndarray, folder: Path, degree: int = 3) -> Baked:
+    return Baked(seen.model, kept, spooled(Scene(bake(seen, kept, degree), len(kept), degree), folder / "spool"))
+
+
+def error(shown: Baked, views: Sequence[Camera]) -> float:
+    """Mean squared, of what is baked against what the model shows by it."""
+    gaussians = shown.spool.rows(np.arange(len(shown.spool.means)))
+    pairs = [(drawn(gaussians, shown.model, view), shown.drawn(view)[0].numpy()) for view in views]
+    return float(np.mean([(mine - wanted) ** 2 for mine, wanted in pairs]))
+
+
+GRID = [camera_above(x, y, tilt_deg=tilt) for x in (-2, 0, 2) for y in (-2, 0, 2) for tilt in (-30, 0, 30)]
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_colours_stand_in_for_opacities_and_shapes_that_change(tmp_path, degree):
+    seen = survey(steep(model_at(scattered())), GRID)
+    shown = on_disk(seen, np.flatnonzero(seen.pixels > 0), tmp_path, degree)
+    errors, others = [error(shown, GRID)], [error(shown, between(GRID))]
+    opacities = shown.spool.rows(np.arange(9)).logits
+    for _ in range(2):
+        refit(shown, [*GRID, *between(GRID)])
+        errors.append(error(shown, GRID))
+        others.append(error(shown, between(GRID)))
+    assert errors == sorted(errors, reverse=True)
+    assert others == sorted(others, reverse=True)
+    if degree:
+        assert errors[-1] < 0.5 * errors[0]
+    assert torch.equal(shown.spool.rows(np.arange(9)).logits, opacities)
+
+
+def test_a_part_of_a_scene_is_compared_with_that_part(tmp_path):
+    model = model_at(scattered())
+    model = replace(model, decoder=blind(model.decoder))
+    seen = survey(model, VIEWS)
+    part = np.flatnonzero((seen.pixels > 0) & (np.arange(len(seen.pixels)) < len(seen.pixels) // 3))
+    shown = on_disk(seen, part, tmp_path)
+    before = shown.spool.rows(np.arange(len(part)))
+    refit(shown, VIEWS)
+    after = shown.spool.rows(np.arange(len(part)))
+    # Nothing changes with the direction, so nothing is missing: what was left out is not painted onto what stays.
+    assert (after.dc - before.dc).abs().max() < 0.02
+    assert np.array_equal(shown.of_anchors(np.arange(len(model.anchors))), np.arange(len(part)))
+
+
+def test_refining_comes_nearer_and_ends_when_its_time_is_over(tmp_path):
+    seen = survey(steep(model_at(scattered())), GRID)
+    shown = on_disk(seen, np.flatnonzero(seen.pixels > 0), tmp_path, degree=1)
+    refit(shown, GRID)
+    before, means = error(shown, GRID), np.array(shown.spool.means)
+    ticks = iter(range(1000))
+    passed: list[float] = []
+    assert refine(shown, GRID, 80.0, passed.append, clock=lambda: next(ticks)) == 79
+    assert passed == list(range(1, 80))
+    assert error(shown, GRID) < 0.9 * before
+    assert np.array_equal(shown.spool.rows(np.arange(len(means))).means.numpy(), means)
+
+
+def test_cameras_between_are_midway_and_look_alike():
+    turned = camera_above(0.0, 0.0, tilt_deg=80.0)
+    found = between([*VIEWS, turned])
+    assert 2 <= len(found) <= 2 * len(VIEWS)
+    midway = [(a.position + b.position) / 2 for a, b in combinations(VIEWS, 2)]
+    for camera in found:
+        assert min(np.abs(camera.position - each).max() for each in midway) < 1e-9
+        assert max(float(camera.forward @ each.forward) for each in VIEWS) == pytest.approx(1.0)
+    assert between(VIEWS[:1]) == []
+
+
+def test_the_mean_of_ellipsoids_minds_neither_the_order_nor_the_signs_of_axes():
+    generator = torch.Generator().manual_seed(0)
+    scales, turns = torch.randn(400, 3, generator=generator), torch.randn(400, 4, generator=generator)
+    logarithm = logarithms(scales, turns)
+    named = ellipsoids(logarithm)
+    torch.testing.assert_close(logarithms(*named), logarithm, atol=1e-5, rtol=0)
+    torch.testing.assert_close(named[0].sort(1).values, scales.sort(1).values, atol=1e-5, rtol=0)
+    torch.testing.assert_close(named[1].norm(dim=1), torch.ones(400))
+    # The same ellipsoids with axes named anew are the same logarithms, so they have the same mean.
+    quarter = torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])  # about x: y becomes z
+    w, x, y, z = turns.unbind(1)
+    anew = torch.stack([w - x, w + x, y + z, z - y], 1) * quarter[0]
+    torch.testing.assert_close(logarithms(scales[:, [0, 2, 1]], -anew), logarithm, atol=1e-4, rtol=0)
+
+
+def test_each_regression_is_solved_as_if_it_were_alone():
+    generator = torch.Generator().manual_seed(1)
+    counts = [1, 30, 2, 17, 2, 90]
+    starts = np.cumsum([0, *counts[:-1]])
+    directions = torch.nn.functional.normalize(torch.randn(sum(counts), 3, generator=generator), dim=1)
+    colours, weights = torch.rand(sum(counts), 3, generator=generator), torch.rand(sum(counts), generator=generator)
+    together = fit_harmonics(directions, colours, weights, starts, 3)
+    for number, (start, count) in enumerate(zip(starts, counts, strict=True)):
+        part = slice(start, start + count)
+        functions = basis(directions[part].double(), 3)
+        share = (weights[part] / weights[part].sum()).double()[:, None]
+        ridge = torch.diag(torch.tensor([0.0] + 15 * [RIDGE], dtype=torch.float64))
+        matrix = functions.T @ (share * functions) + ridge
+        alone = torch.linalg.solve(matrix, functions.T @ (share * (colours[part].double() - 0.5)))
+        torch.testing.assert_close(together[number].double(), alone, atol=2e-3, rtol=1e-3)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

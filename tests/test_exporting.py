@@ -12,6 +12,7 @@ import torch
 from rich.console import Console
 
 from captures_support import look_down
+from formats_support import random_gaussians
 from merging_support import camera_above, model_at
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
@@ -159,16 +160,55 @@ def test_what_cannot_be_written_is_said_before_anything_is_baked(
     assert not list(tmp_path.glob("*.ply"))
 
 
+def looking_down_at(monkeypatch: pytest.MonkeyPatch, *x: float) -> None:
+    """Let captures have training cameras above these places."""
+    capture = capture_at(None)
+    cameras = [Camera(look_down(np.array([at, 0, 8.0]), 0.0, 90.0), 60.0, 60.0, 32.0, 24.0, 64, 48) for at in x]
+    views = tuple(replace(capture.views[0], camera=camera) for camera in cameras)
+    monkeypatch.setattr(f"{__name__}.capture_at", lambda _: replace(capture, views=views))
+
+
+def moved(model: AnchorModel, x: torch.Tensor) -> AnchorModel:
+    positions = model.anchors.positions + torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], 1)
+    return replace(model, anchors=replace(model.anchors, positions=positions))
+
+
 def test_a_scene_too_wide_for_a_format_is_refused_before_it_is_baked(export, monkeypatch):
     monkeypatch.setattr(exporting, "bake", lambda *_: pytest.fail("baked"))
-    model = scattered()
-    far = model.anchors.positions + torch.tensor([3000.0, 0.0, 0.0])
-    cameras = [Camera(look_down(np.array([3000.0, 0, 8.0]), 0.0, 90.0), 60.0, 60.0, 32.0, 24.0, 64, 48)]
-    capture = capture_at(None)
-    views = tuple(replace(view, camera=cameras[0]) for view in capture.views[:1])
-    monkeypatch.setattr(f"{__name__}.capture_at", lambda _: replace(capture, views=views))
+    looking_down_at(monkeypatch, -3000.0, 3000.0)
+    sides = torch.where(torch.arange(200) % 2 == 0, 3000.0, -3000.0)
     with pytest.raises(VdgsError, match="2048"):
-        export("a.spz", model=replace(model, anchors=replace(model.anchors, positions=far)))
+        export("a.spz", model=moved(scattered(), sides))
+
+
+def test_a_scene_far_from_its_origin_is_placed_near_one(export, tmp_path, monkeypatch):
+    looking_down_at(monkeypatch, 3000.0)
+    export("a.spz", "a.ply", model=moved(scattered(), torch.full((200,), 3000.0)))
+    near, whole = registry.read(tmp_path / "a.spz"), registry.read(tmp_path / "a.ply")
+    origin = torch.tensor(read_json(tmp_path / "a.spz.json")["origin"])
+    assert origin.tolist() == [3000.0, 0.0, 0.0]
+    assert torch.allclose(near.means + origin, whole.means, atol=1e-3)
+
+
+def test_a_file_goes_without_the_few_that_lie_beyond_its_reach(export, tmp_path, monkeypatch):
+    model = scattered()
+    positions = model.anchors.positions.clone()
+    positions[7] = torch.tensor([0.0, 0.0, -5000.0])
+    model = replace(model, anchors=replace(model.anchors, positions=positions))
+    real = survey(model, [view.camera for view in capture_at(None).train_views])
+    pixels = real.pixels.copy()
+    k = model.anchors.offsets.shape[1]
+    there = slice(7 * k, 8 * k)
+    pixels[there] = 0.01
+    monkeypatch.setattr(exporting, "survey", lambda *_: replace(real, pixels=pixels))
+    monkeypatch.setattr(exporting, "bake", lambda seen, kept, degree, _: iter([random_gaussians(len(kept), degree)]))
+    monkeypatch.setattr(exporting, "_improved", lambda *_: None)
+    record = export("all.ply", "near.spz", model=model)
+    assert [file["gaussians"] for file in record["files"]] == [record["gaussians"], record["gaussians"] - k]
+    assert len(registry.read(tmp_path / "near.spz")) == record["gaussians"] - k
+    pixels[there] = pixels.sum()
+    with pytest.raises(VdgsError, match="2048"):
+        export("near.spz", model=model)
 
 
 def test_a_disk_that_fills_leaves_nothing(export, tmp_path: Path, monkeypatch):

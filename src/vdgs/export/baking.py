@@ -22,6 +22,8 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.export.harmonics_fit import fit_harmonics, segment_sums
+from vdgs.export.shapes import ellipsoids, logarithms
+from vdgs.export.working import in_order
 from vdgs.kernels import choose
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.gaussians import Gaussians
@@ -30,8 +32,8 @@ from vdgs.model.world import places, spawned
 
 #: A splat that makes less of a view than so many pixels did not show there.
 LEAST_PIXELS = 1e-3
-#: Anchors that are fitted at once.
-ANCHORS_AT_ONCE = 16_384
+#: Anchors that a thread fits at once.
+ANCHORS_AT_ONCE = 8192
 #: Opacities are kept away from 0 and 1, where their logits have no end.
 OPACITY_MARGIN = 1e-4
 
@@ -92,14 +94,13 @@ def bake(
     k = seen.model.anchors.offsets.shape[1]
     anchors = len(seen.model.anchors)
     kept = np.ascontiguousarray(kept)
+    firsts = range(0, anchors, ANCHORS_AT_ONCE)
+    bounds = [np.searchsorted(kept, [first * k, min(first + ANCHORS_AT_ONCE, anchors) * k]) for first in firsts]
+    parts = [kept[low:high] for low, high in bounds if low < high]
     done = 0
-    for first in range(0, anchors, ANCHORS_AT_ONCE):
-        bounds = np.searchsorted(kept, [first * k, min(first + ANCHORS_AT_ONCE, anchors) * k])
-        wanted = kept[slice(*bounds)]
-        if not len(wanted):
-            continue
-        yield _fitted(_gathered(seen, wanted), wanted, seen, degree)
-        done += len(wanted)
+    for gaussians in in_order(lambda wanted: _fitted(_gathered(seen, wanted), wanted, seen, degree), parts):
+        yield gaussians
+        done += len(gaussians)
         after_part(done)
 
 
@@ -159,22 +160,15 @@ def _fitted(pairs: _Pairs, wanted: Int[np.ndarray, " m"], seen: Survey, degree: 
     opacities = _means(pairs.opacities[:, None], pairs)[:, 0].clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     rows = torch.from_numpy(wanted // k)
     means = places(anchors.select(rows.to(anchors.positions.device))).cpu()
+    log_scales, quaternions = ellipsoids(_means(logarithms(pairs.log_scales, pairs.quaternions), pairs))
     return Gaussians(
         means=means[torch.arange(len(wanted)), torch.from_numpy(wanted % k)],
-        log_scales=_means(pairs.log_scales, pairs),
-        quaternions=torch.nn.functional.normalize(_means(_aligned(pairs), pairs), dim=1),
+        log_scales=log_scales,
+        quaternions=quaternions,
         logits=opacities.logit(),
         dc=coefficients[:, 0].contiguous(),
         rest=coefficients[:, 1:].contiguous(),
     )
-
-
-def _aligned(pairs: _Pairs) -> Float[Tensor, "p 4"]:
-    """Unit rotations, each with the sign that brings it nearer to the first of its Gaussian: q and -q are the same."""
-    unit = torch.nn.functional.normalize(pairs.quaternions, dim=1)
-    counts = np.diff(pairs.starts, append=len(unit))
-    first = unit[torch.from_numpy(np.repeat(pairs.starts, counts))]
-    return torch.where((unit * first).sum(1, keepdim=True) < 0, -unit, unit)
 
 
 def _means(values: Float[Tensor, "p d"], pairs: _Pairs) -> Float[Tensor, "m d"]:

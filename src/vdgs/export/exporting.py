@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from rich.console import Console
 from rich.progress import Progress
 
+from vdgs.cameras import Camera
 from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
 from vdgs.captures.overview import overview
 from vdgs.errors import VdgsError
 from vdgs.export.baking import Survey, bake, survey
+from vdgs.export.between import between
 from vdgs.export.formats import registry
 from vdgs.export.formats.scene import ROWS, Page, Scene
 from vdgs.export.formats.spool import Spooled, spooled
-from vdgs.export.frame import Frame, frame_of, usual_crs
-from vdgs.export.loss import loss_of
+from vdgs.export.frame import FAR, Frame, frame_of, usual_crs
+from vdgs.export.loss import loss_of, measured_views
+from vdgs.export.refining import refine
+from vdgs.export.refit import Baked, refit
 from vdgs.model.gaussians import Gaussians
 from vdgs.model.world import places
 from vdgs.placing.placement import Placement
@@ -34,6 +38,10 @@ from vdgs.watching.interrupts import stop_if_asked
 
 #: What was written and lost, beside the run's other results.
 RECORD = "export.json"
+#: How often colours are fitted again to what pictures lack (chosen on validation views, docs/export.md).
+REFITS = 2
+#: A file goes without Gaussians beyond its reach where they make at most this part of what the training cameras see.
+MOST_BEYOND = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,23 +53,17 @@ class _Baked:
     #: How pages show it first, in the ground frame.
     page: Page
 
-    def scene(self, frame: Frame) -> Scene:
-        """What a writer is given."""
-        count = len(self.spool.means)
-        corners = frame.scale * self.spool.means.astype(np.float64) @ frame.rotation.T + frame.translation
-        low, high = tuple(corners.min(axis=0).tolist()), tuple(corners.max(axis=0).tolist())
-        return Scene(
-            self._chunks(frame, count), count, self.degree, frame.facts, (low, high), _placed(self.page, frame)
-        )
+    def scene(self, frame: Frame, rows: Int[np.ndarray, " r"]) -> Scene:
+        """What a writer is given: the Gaussians of these rows."""
+        chunks = (frame.place(piece) for piece in self.pieces(rows))
+        bounds, page = _bounds(frame, self.spool.means[rows]), _placed(self.page, frame)
+        return Scene(chunks, len(rows), self.degree, frame.facts, bounds, page)
 
-    def _chunks(self, frame: Frame, count: int) -> Iterator[Gaussians]:
-        for first in range(0, count, ROWS):
+    def pieces(self, rows: Int[np.ndarray, " r"]) -> Iterator[Gaussians]:
+        """These Gaussians, some thousand at a time."""
+        for first in range(0, len(rows), ROWS):
             stop_if_asked()
-            yield frame.place(self.spool.rows(np.arange(first, min(first + ROWS, count))))
-
-    def whole(self) -> Gaussians:
-        """All of them in memory."""
-        return self.spool.rows(np.arange(len(self.spool.means)))
+            yield self.spool.rows(rows[first : first + ROWS])
 
 
 def page_of(run: TrainedRun, most_bytes: int) -> Page:
@@ -99,26 +101,25 @@ def export_run(asked: ExportRequest, console: Console) -> dict[str, Any]:
     for path in asked.to:
         refuse_among_inputs(path, run.capture)
     centre = np.median(run.model.anchors.positions.cpu().double().numpy(), axis=0)
-    frames = {path: frame_of(run.capture.ground, asked.crs or usual_crs(run.capture.ground, path), centre)
-              for path in asked.to}  # fmt: skip
+    frames = {path: _frame(path, run, asked, centre) for path in asked.to}
     began = time.monotonic()
     with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
         seen = _surveyed(run, bar)
         kept = chosen(seen, run, asked)
-        _check_scenes(frames, seen, kept, asked.sh_degree)
+        rows = _check_scenes(frames, seen, kept, asked.sh_degree, console)
         console.print(
             f"{run.line}: {len(kept):,} Gaussians of {len(seen.pixels):,} are drawn by the training cameras"
             + (" and asked for" if len(kept) < np.count_nonzero(seen.pixels) else ""),
             highlight=False,
         )
-        page = page_of(run, int(asked.html_mb * 1e6))
-        with _baked(seen, kept, asked.sh_degree, page, asked.to[0].parent, bar) as baked:
+        with _baked(seen, kept, asked, page_of(run, int(asked.html_mb * 1e6)), bar) as baked:
             seconds = time.monotonic() - began
-            files = [_write(path, frames[path], baked, console) for path in asked.to]
+            console.print(f"baked in {seconds:.1f} s", highlight=False)
+            files = [_write(path, baked.scene(frames[path], rows[path]), console) for path in asked.to]
             losses = _losses(run, frames, baked, asked, bar, console)
     record = jsonable({
         "model": run.name, "key": run.key, "gaussians": len(kept), "sh_degree": asked.sh_degree,
-        "seconds_to_bake": seconds, "files": files, "losses": losses,
+        "seconds_to_bake": seconds, "seconds_to_refine": asked.refine, "files": files, "losses": losses,
     })  # fmt: skip
     write_json(run.folder.path / RECORD, record)
     return record
@@ -186,18 +187,59 @@ def _of_block(run: TrainedRun, block: int) -> np.ndarray:
     return np.repeat(np.arange(len(counts)) == block, counts)
 
 
-def _check_scenes(frames: dict[Path, Frame], seen: Survey, kept: np.ndarray, degree: int) -> None:
-    """What a format cannot hold is said before the work."""
-    means = places(seen.model.anchors).cpu().double().reshape(-1, 3).numpy()[kept]
+def _frame(path: Path, run: TrainedRun, asked: ExportRequest, centre: np.ndarray) -> Frame:
+    """The coordinates of a file: those that do not reach far have their origin nearby."""
+    far = min(FAR, registry.format_of(path).reach / 2)
+    return frame_of(run.capture.ground, asked.crs or usual_crs(run.capture.ground, path), centre, far)
+
+
+def _check_scenes(
+    frames: dict[Path, Frame], seen: Survey, kept: np.ndarray, degree: int, console: Console
+) -> dict[Path, Int[np.ndarray, " r"]]:
+    """Which of the Gaussians each file is given. What a format cannot hold is said before the work.
+
+    A format that does not reach far goes without the few Gaussians that lie beyond and of which the photographs show
+    next to nothing; more of them are refused.
+    """
+    means = places(seen.model.anchors).cpu().reshape(-1, 3).numpy()[kept]
+    pixels = seen.pixels[kept]
+    rows = {}
     for path, frame in frames.items():
-        local = frame.scale * means @ frame.rotation.T + frame.translation
-        low, high = tuple(local.min(axis=0).tolist()), tuple(local.max(axis=0).tolist())
-        registry.check(path, Scene((), len(kept), degree, frame.facts, (low, high)))
+        reach = registry.format_of(path).reach
+        beyond = (np.abs(_local(frame, means)) >= 0.999 * reach).any(1)
+        share = float(pixels[beyond].sum() / pixels.sum())
+        if share > MOST_BEYOND:
+            beyond[:] = False  # it is refused below
+        elif beyond.any():
+            console.print(
+                f"[yellow]note[/] {path.name}: {np.count_nonzero(beyond):,} of {len(kept):,} Gaussians lie more than "
+                f"{reach:.0f} units away, where the format does not reach; they are left out. They make "
+                f"{share:.2g} of what the training cameras see.",
+                highlight=False,
+            )
+        rows[path] = np.flatnonzero(~beyond)
+        registry.check(path, Scene((), len(rows[path]), degree, frame.facts, _bounds(frame, means[rows[path]])))
+    return rows
+
+
+def _local(frame: Frame, means: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+    local: np.ndarray = frame.scale * means.astype(np.float64) @ frame.rotation.T + frame.translation
+    return local
+
+
+def _bounds(
+    frame: Frame, means: Float[np.ndarray, "m 3"]
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Lowest and highest local coordinates."""
+    local = _local(frame, means)
+    (x0, y0, z0), (x1, y1, z1) = local.min(axis=0).tolist(), local.max(axis=0).tolist()
+    return (x0, y0, z0), (x1, y1, z1)
 
 
 @contextmanager
-def _baked(seen: Survey, kept: np.ndarray, degree: int, page: Page, folder: Path, bar: Progress) -> Iterator[_Baked]:
+def _baked(seen: Survey, kept: np.ndarray, asked: ExportRequest, page: Page, bar: Progress) -> Iterator[_Baked]:
     """The Gaussians in a temporary file beside the first output."""
+    folder, degree = asked.to[0].parent, asked.sh_degree
     task = bar.add_task("fitting Gaussians", total=len(kept))
 
     def after_part(done: int) -> None:
@@ -212,17 +254,40 @@ def _baked(seen: Survey, kept: np.ndarray, degree: int, page: Page, folder: Path
             raise VdgsError(
                 f"{folder}: cannot hold the scene ({error.strerror or error}). Nothing was written."
             ) from error
+        _improved(Baked(seen.model, kept, spool), seen.cameras, asked.refine, bar)
         yield _Baked(spool, degree, page)
 
 
-def _write(path: Path, frame: Frame, baked: _Baked, console: Console) -> dict[str, Any]:
+def _improved(baked: Baked, cameras: Sequence[Camera], seconds: float, bar: Progress) -> None:
+    """Fit the colours again to what pictures lack, and move all else for so many seconds."""
+    all_cameras = [*cameras, *between(cameras)]
+    task = bar.add_task("comparing pictures", total=REFITS * len(all_cameras))
+
+    def after_view() -> None:
+        stop_if_asked()
+        bar.advance(task)
+
+    for _ in range(REFITS):
+        refit(baked, all_cameras, after_view)
+    if seconds > 0:
+        task = bar.add_task("refining", total=seconds)
+
+        def after_step(passed: float) -> None:
+            stop_if_asked()
+            bar.update(task, completed=passed)
+
+        refine(baked, all_cameras, seconds, after_step)
+
+
+def _write(path: Path, scene: Scene, console: Console) -> dict[str, Any]:
     began = time.monotonic()
-    lost = registry.write(path, baked.scene(frame))
+    lost = registry.write(path, scene)
     seconds, size = time.monotonic() - began, _size(path)
     console.print(f"{path}: {size / 1e6:,.1f} MB in {seconds:.1f} s", highlight=False)
     for each in lost:
         console.print(f"[yellow]note[/] {path.name}: {each}", highlight=False)
-    return {"file": str(path.resolve()), "bytes": size, "seconds": seconds, "notes": list(lost)}
+    return {"file": str(path.resolve()), "gaussians": scene.count, "bytes": size, "seconds": seconds,
+            "notes": list(lost)}  # fmt: skip
 
 
 def _size(path: Path) -> int:
@@ -239,7 +304,7 @@ def _losses(
     if not asked.measure:
         return []
     readable: list[Path | None] = [path for path in asked.to if registry.format_of(path).read]
-    task = bar.add_task("comparing with the model", total=max(1, len(readable)) * len(run.capture.test_views))
+    task = bar.add_task("comparing with the model", total=len(readable or [None]) * len(measured_views(run)))
 
     def after_view() -> None:
         stop_if_asked()
@@ -247,12 +312,15 @@ def _losses(
 
     losses = []
     for path in readable or [None]:
-        gaussians = baked.whole() if path is None else frames[path].to_ground(registry.read(path))
-        loss = loss_of(run, gaussians, after_view)
+        every = np.arange(len(baked.spool.means))
+        pieces = baked.pieces(every) if path is None else map(frames[path].to_ground, registry.pieces(path))
+        loss = loss_of(run, pieces, after_view)
         what = "as baked" if path is None else f"{path.name}, read back"
         console.print(
             f"{what}, on {loss.views} {loss.of} views: PSNR {loss.psnr:.2f} → {loss.psnr_baked:.2f} dB "
-            f"({loss.psnr_baked - loss.psnr:+.2f}), SSIM {loss.ssim:.3f} → {loss.ssim_baked:.3f}",
+            f"({loss.psnr_baked - loss.psnr:+.2f}; with the exposure of each photograph corrected {loss.psnr_cc:.2f} → "
+            f"{loss.psnr_cc_baked:.2f}, {loss.psnr_cc_baked - loss.psnr_cc:+.2f}), "
+            f"SSIM {loss.ssim:.3f} → {loss.ssim_baked:.3f}",
             highlight=False,
         )
         losses.append({"file": None if path is None else str(path.resolve()), **asdict(loss)})

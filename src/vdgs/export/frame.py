@@ -51,16 +51,17 @@ class Frame:
         )
 
 
-def frame_of(ground: GroundFrame, crs: str | None, centre: Float[np.ndarray, "3"]) -> Frame:
+def frame_of(ground: GroundFrame, crs: str | None, centre: Float[np.ndarray, "3"], far: float = FAR) -> Frame:
     """The local coordinates of a system (`Placement.of`) about a scene whose middle is `centre` (ground frame).
 
     Gaussians take the similarity that is right about the centre: over a kilometre a projection departs from it by
-    centimetres, mostly in height (the Earth is round). Raises VdgsError for a system that cannot be had.
+    centimetres, mostly in height (the Earth is round). A middle that is more than `far` from the origin of the system
+    gets an origin of its own. Raises VdgsError for a system that cannot be had.
     """
     placement = Placement.of(ground, crs)
     similarity = placement.similarity_at(centre)
     middle = similarity.apply(centre[None])[0]
-    origin = np.round(middle / ROUND) * ROUND if np.abs(middle).max() > FAR else np.zeros(3)
+    origin = np.round(middle / ROUND) * ROUND if np.abs(middle).max() > far else np.zeros(3)
     facts = Facts(
         origin=(float(origin[0]), float(origin[1]), float(origin[2])),
         crs=placement.wkt,

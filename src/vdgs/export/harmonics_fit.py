@@ -7,6 +7,8 @@ m Gaussians; f = (degree + 1)² functions.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -15,8 +17,12 @@ from torch import Tensor
 from vdgs.model.spherical_harmonics import basis
 
 #: Pull of the coefficients towards one colour for all directions (choice): where cameras look from few directions, the
-#: others must not swing. Of 1e-3, 1e-2 and 1e-1 on validation views the middle one (docs/export.md).
-RIDGE = 1e-2
+#: others must not swing. Chosen on validation views (docs/export.md).
+RIDGE = 1e-3
+#: So many regressions are solved together, of about as many pairs each: their matrices stay in the cache.
+TOGETHER = 2048
+#: Pairs of those at most, unless one alone has more.
+PAIRS_TOGETHER = 1 << 16
 
 
 def segment_sums(values: Float[np.ndarray, " p"], starts: Int[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
@@ -32,34 +38,32 @@ def fit_harmonics(
     degree: int,
 ) -> Float[Tensor, "m f 3"]:
     """Coefficients of each Gaussian, whose pairs begin at `starts`. Directions are unit, from the camera."""
-    functions = basis(directions, degree).numpy().T
-    share = weights.numpy()
-    total = segment_sums(share, starts)
-    wanted = colours.numpy().T - 0.5
-    f, m = len(functions), len(starts)
-    matrix, right = np.empty((f, f, m), np.float32), np.empty((f, 3, m), np.float32)
-    for i in range(f):
-        weighted = share * functions[i]
-        for j in range(i + 1):
-            matrix[i, j] = segment_sums(weighted * functions[j], starts) / total
-        for channel in range(3):
-            right[i, channel] = segment_sums(weighted * wanted[channel], starts) / total
-        matrix[i, i] += RIDGE if i else 0.0
-    return torch.from_numpy(_solved(matrix, right)).permute(2, 0, 1)
+    functions = basis(directions, degree)
+    f = functions.shape[1]
+    known = torch.cat([functions, colours - 0.5], 1)
+    ridge = torch.full((f,), RIDGE, dtype=torch.float64)
+    ridge[0] = 0.0
+    found = torch.empty(len(starts), f, 3)
+    for rows, places, there in _alike(starts, len(weights)):
+        share = torch.where(there, weights[places], 0.0).double()
+        share /= share.sum(1, keepdim=True)
+        padded = known[places].double()
+        products = torch.bmm((padded[..., :f] * share[..., None]).transpose(1, 2), padded)
+        matrix, right = products[..., :f] + torch.diag(ridge), products[..., f:]
+        found[rows] = torch.cholesky_solve(right, torch.linalg.cholesky(matrix)).float()
+    return found
 
 
-def _solved(matrix: Float[np.ndarray, "f f m"], right: Float[np.ndarray, "f 3 m"]) -> Float[np.ndarray, "f 3 m"]:
-    """Solve m positive definite systems, given by their lower triangles, by Cholesky's decomposition, all systems at
-    once in each operation. Overwrites both."""
-    f = len(matrix)
-    for j in range(f):
-        for k in range(j):
-            matrix[j:, j] -= matrix[j:, k] * matrix[j, k]
-        matrix[j:, j] /= np.sqrt(np.maximum(matrix[j, j], np.float32(1e-12)))
-    for j in range(f):  # L y = b
-        right[j] /= matrix[j, j]
-        right[j + 1 :] -= matrix[j + 1 :, j, None] * right[j]
-    for j in reversed(range(f)):  # Lᵀ x = y
-        right[j] /= matrix[j, j]
-        right[:j] -= matrix[j, :j, None] * right[j]
-    return right
+def _alike(starts: Int[np.ndarray, " m"], pairs: int) -> Iterator[tuple[Int[Tensor, " b"], Int[Tensor, "b v"], Tensor]]:
+    """Gaussians with about as many pairs each: their rows, the places of their pairs, and which of those are theirs."""
+    counts = np.diff(starts, append=pairs)
+    order = np.argsort(-counts, kind="stable")
+    first = 0
+    while first < len(order):
+        most = int(counts[order[first]])
+        rows = order[first : first + max(1, min(TOGETHER, PAIRS_TOGETHER // most))]
+        inside = np.arange(most)
+        places = starts[rows, None] + inside
+        there = inside < counts[rows, None]
+        yield torch.from_numpy(rows), torch.from_numpy(np.minimum(places, pairs - 1)), torch.from_numpy(there)
+        first += len(rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,35 +12,52 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vdgs.cameras import Camera
+from vdgs.captures.capture import View
 from vdgs.evaluation.by_visibility import VisibilityHistogram
+from vdgs.evaluation.colour import correct_colours
 from vdgs.evaluation.metrics import masked_mean, psnr_of, squared_error, ssim_map, to_8bit
 from vdgs.evaluation.of_run import cached_photographs, coarse_of, visibility_map
+from vdgs.export.formats.scene import joined
 from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows
 from vdgs.model.render import render
 from vdgs.runs.opening import TrainedRun
 
 #: Groups of pixels by visibility.
 BINS = 4
+#: Views that are drawn at most, evenly taken: more would say the same.
+MOST_VIEWS = 40
 
 
 @dataclass(frozen=True)
 class Loss:
     """Means over the views, of the model and of the file; `by_visibility` as in metrics.json, with both."""
 
+    #: How many were drawn, and of how many.
     views: int
+    views_there_are: int
     #: Which views: "test", or "training" where none is held out.
     of: str
     psnr: float
     psnr_baked: float
+    #: After the usual correction of colours, fitted to each photograph: what is lost but for its exposure.
+    psnr_cc: float
+    psnr_cc_baked: float
     ssim: float
     ssim_baked: float
     by_visibility: list[dict[str, Any]]
 
 
-def loss_of(run: TrainedRun, gaussians: Gaussians, after_view: Callable[[], None] = lambda: None) -> Loss:
-    """Draw every test view (at most every tenth training view where there is none) with the model and with the
-    Gaussians, which are in the ground frame, and compare both with the photograph, in 8 bits as all metrics."""
+def measured_views(run: TrainedRun) -> list[View]:
+    """The test views, or every tenth training view where there is none; at most `MOST_VIEWS`."""
     views = list(run.capture.test_views) or list(run.capture.train_views)[::10]
+    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).astype(int))]
+
+
+def loss_of(run: TrainedRun, pieces: Iterable[Gaussians], after_view: Callable[[], None] = lambda: None) -> Loss:
+    """Draw `measured_views` with the model and with Gaussians, which are in the ground frame, and compare both with the
+    photographs, in 8 bits as all metrics. Of the pieces only what those views show is kept in memory."""
+    views = measured_views(run)
+    gaussians = _seen(pieces, [view.camera for view in views])
     visibility = visibility_map(coarse_of(run))
     names = [f"{figure}{whose}" for figure in ("squared_error", "ssim") for whose in ("", "_baked")]
     histogram, rows = VisibilityHistogram(names), list[list[float]]()
@@ -48,15 +65,32 @@ def loss_of(run: TrainedRun, gaussians: Gaussians, after_view: Callable[[], None
         for view in views:
             reference, mask = photographs.load_image(view), photographs.load_mask(view)
             drawn = to_8bit(render(run.model, view.camera).image.cpu().numpy()), _picture(gaussians, run, view.camera)
-            errors = [squared_error(picture, reference) for picture in drawn]
+            corrected = [to_8bit(correct_colours(picture, reference, mask).image) for picture in drawn]
+            errors = [squared_error(picture, reference) for picture in (*drawn, *corrected)]
             likeness = [ssim_map(picture, reference, mask) for picture in drawn]
-            histogram.add(visibility(view.camera), dict(zip(names, errors + likeness, strict=True)), mask)
+            histogram.add(visibility(view.camera), dict(zip(names, errors[:2] + likeness, strict=True)), mask)
             psnrs = [psnr_of(masked_mean(error, mask)) for error in errors]
             rows.append([*psnrs, *(masked_mean(each, mask) for each in likeness)])
             after_view()
-    psnr, psnr_baked, ssim, ssim_baked = np.mean(rows, axis=0).tolist()
-    of = "test" if run.capture.test_views else "training"
-    return Loss(len(views), of, psnr, psnr_baked, ssim, ssim_baked, [dict(each) for each in histogram.bins(BINS)])
+    tested = run.capture.test_views
+    there_are, of = (len(tested), "test") if tested else (len(run.capture.train_views), "training")
+    psnr, psnr_baked, psnr_cc, psnr_cc_baked, ssim, ssim_baked = np.mean(rows, axis=0).tolist()
+    return Loss(
+        len(views), there_are, of, psnr, psnr_baked, psnr_cc, psnr_cc_baked, ssim, ssim_baked,
+        [dict(each) for each in histogram.bins(BINS)],
+    )  # fmt: skip
+
+
+def _seen(pieces: Iterable[Gaussians], cameras: Sequence[Camera]) -> Gaussians:
+    """What the cameras may show of the pieces, and at least one Gaussian."""
+    kept: list[Gaussians] = []
+    for piece in pieces:
+        seen = torch.zeros(len(piece), dtype=torch.bool)
+        seen[:1] = not kept
+        for camera in cameras:
+            seen[visible_rows(piece, camera)] = True
+        kept.append(piece.select(seen))
+    return joined(kept)
 
 
 @torch.no_grad()

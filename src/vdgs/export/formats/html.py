@@ -11,6 +11,7 @@ import base64
 import html
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +89,8 @@ def write_html(path: Path, scene: Scene) -> tuple[str, ...]:
     return tuple(lost)
 
 
-def read_html(path: Path) -> Gaussians:
-    """The Gaussians of a page of ours, in the ground frame. Raises VdgsError if it is missing or none."""
+def html_pieces(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians of a page of ours, in the ground frame, all at once. Raises VdgsError if it is missing or none."""
     import msgspec
     import zstandard
 
@@ -105,7 +106,7 @@ def read_html(path: Path) -> Gaussians:
     known = json.loads(html.unescape(facts[1]))
     length = int.from_bytes(inner[:8], "little")
     (size,) = msgspec.msgpack.decode(inner[8 : 8 + length])["binaryBufferLengths"]
-    return _unpacked(np.frombuffer(inner[-size:], np.uint32).reshape(-1, WORDS), known["factor"])
+    yield _unpacked(np.frombuffer(inner[-size:], np.uint32).reshape(-1, WORDS), known["factor"])
 
 
 def _of_fixed_colour(scene: Scene) -> Gaussians:

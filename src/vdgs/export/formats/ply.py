@@ -6,13 +6,14 @@ Coordinates are those of the ground frame, z up. Header comments say where they 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from vdgs.errors import VdgsError
-from vdgs.export.formats.scene import Facts, Scene, one_line
+from vdgs.export.formats.scene import ROWS, Facts, Scene, joined, one_line
 from vdgs.model.gaussians import Gaussians
 from vdgs.model.spherical_harmonics import MAX_DEGREE, function_count
 from vdgs.storage.files import write_atomically
@@ -69,33 +70,43 @@ def _rows(piece: Gaussians, width: int) -> np.ndarray:
 
 
 def read_ply(path: Path) -> Gaussians:
-    """The Gaussians of a binary PLY file of 3DGS, properties in any order.
+    """All Gaussians of a file: see `ply_pieces`."""
+    return joined(ply_pieces(path))
+
+
+def ply_pieces(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians of a binary PLY file of 3DGS, properties in any order, at most `ROWS` at a time.
 
     Raises VdgsError for a file that is missing, of another kind, or shorter than it announces.
     """
     layout, count, start = _header(path)
-    try:
-        table = np.fromfile(path, layout, count, offset=start)
-    except OSError as error:
-        raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
-    if len(table) < count:
-        raise VdgsError(f"{path}: announces {count} Gaussians but holds {len(table)}. It is truncated; write it again.")
     names = layout.names or ()
     rest = sum(name.startswith("f_rest_") for name in names)
-    degrees = {3 * (function_count(degree) - 1): degree for degree in range(MAX_DEGREE + 1)}
     missing = [name for name in properties(0) if name not in names and not name.startswith("n")]
-    if missing or rest not in degrees:
+    if missing or rest not in {3 * (function_count(degree) - 1) for degree in range(MAX_DEGREE + 1)}:
         what = f"has no {missing[0]}" if missing else f"has {rest} f_rest properties"
         raise VdgsError(f"{path}: {what}; this is no PLY of 3DGS. Point clouds have other layouts.")
+    held = (path.stat().st_size - start) // layout.itemsize
+    if held < count:
+        raise VdgsError(f"{path}: announces {count} Gaussians but holds {held}. It is truncated; write it again.")
+    for first in range(0, max(count, 1), ROWS):
+        try:
+            table = np.fromfile(path, layout, min(ROWS, count - first), offset=start + first * layout.itemsize)
+        except OSError as error:
+            raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
+        yield _gaussians(table, rest)
 
+
+def _gaussians(table: np.ndarray, rest: int) -> Gaussians:
     def columns(*wanted: str) -> torch.Tensor:
         return torch.from_numpy(np.stack([table[name].astype(np.float32) for name in wanted], -1))
 
-    coefficients = columns(*(f"f_rest_{i}" for i in range(rest))) if rest else torch.zeros(count, 0)
+    n = len(table)
+    coefficients = columns(*(f"f_rest_{i}" for i in range(rest))) if rest else torch.zeros(n, 0)
     return Gaussians(
         means=columns("x", "y", "z"), log_scales=columns(*SCALES), quaternions=columns(*ROTATION),
         logits=columns("opacity")[:, 0], dc=columns(*DC_NAMES),
-        rest=coefficients.reshape(count, 3, rest // 3).transpose(1, 2).contiguous(),
+        rest=coefficients.reshape(n, 3, rest // 3).transpose(1, 2).contiguous(),
     )  # fmt: skip
 
 

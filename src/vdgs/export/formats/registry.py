@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.gltf import refuse_too_large, write_glb
-from vdgs.export.formats.html import read_html, refuse_without_viser, write_html
-from vdgs.export.formats.ply import read_ply, write_ply
+from vdgs.export.formats.html import html_pieces, refuse_without_viser, write_html
+from vdgs.export.formats.ply import ply_pieces, write_ply
 from vdgs.export.formats.points import refuse_without_laspy, write_laz, write_points
-from vdgs.export.formats.scene import Scene, beside
+from vdgs.export.formats.scene import Scene, beside, joined
 from vdgs.export.formats.sog import write_sog
-from vdgs.export.formats.splat import read_splat, write_splat
-from vdgs.export.formats.spz import read_spz, refuse_too_far, write_spz
+from vdgs.export.formats.splat import splat_pieces, write_splat
+from vdgs.export.formats.spz import REACH, refuse_too_far, spz_pieces, write_spz
 from vdgs.export.formats.tiles import NAME, refuse_other_names, write_tiles
 from vdgs.model.gaussians import Gaussians
 
@@ -28,12 +29,14 @@ class Format:
     #: What it is, in a few words.
     what: str
     write: Callable[[Path, Scene], tuple[str, ...]]
-    #: Reads a file back into the ground frame, where that makes sense.
-    read: Callable[[Path], Gaussians] | None = None
+    #: Reads a file back into the ground frame, piece by piece, where that makes sense.
+    read: Callable[[Path], Iterator[Gaussians]] | None = None
     #: Raises VdgsError for what can be known to fail before the first chunk is asked for.
     check: Callable[[Path, Scene], None] = lambda path, scene: None
     #: Whether facts are written to FILE.json, for the format has no room for them.
     facts_beside: bool = False
+    #: Coordinates lie below this, from the origin.
+    reach: float = math.inf
     #: Whether its colours do not change with the direction: best baked so, where all files are of that kind.
     fixed: bool = False
 
@@ -41,13 +44,13 @@ class Format:
 #: The longer endings first: `.points.ply` is a `.ply` too.
 FORMATS: tuple[Format, ...] = (
     Format(".points.ply", "point cloud, local coordinates", write_points),
-    Format(".ply", "3DGS PLY, nothing lost", write_ply, read_ply),
-    Format(".spz", "SPZ, a sixth of the PLY or less", write_spz, read_spz, refuse_too_far, True),
-    Format(".splat", "32 bytes a Gaussian, fixed colours", write_splat, read_splat, facts_beside=True),
+    Format(".ply", "3DGS PLY, nothing lost", write_ply, ply_pieces),
+    Format(".spz", "SPZ, a sixth of the PLY or less", write_spz, spz_pieces, refuse_too_far, True, REACH),
+    Format(".splat", "32 bytes a Gaussian, fixed colours", write_splat, splat_pieces, facts_beside=True),
     Format(".sog", "PlayCanvas' SOG, a twelfth of the PLY or less", write_sog, facts_beside=True),
     Format(".glb", "glTF with KHR_gaussian_splatting, nothing lost", write_glb, check=refuse_too_large),
     Format(NAME, "3D Tiles for CesiumJS, in levels", write_tiles, check=refuse_other_names),
-    Format(".html", "page that shows the scene offline", write_html, read_html, refuse_without_viser, fixed=True),
+    Format(".html", "page that shows the scene offline", write_html, html_pieces, refuse_without_viser, fixed=True),
     Format(".laz", "point cloud, map coordinates, compressed", write_laz, check=refuse_without_laspy),
     Format(".las", "point cloud, map coordinates", write_laz, check=refuse_without_laspy),
 )
@@ -83,6 +86,11 @@ def write(path: Path, scene: Scene) -> tuple[str, ...]:
 
 def read(path: Path) -> Gaussians:
     """Read Gaussians back, in the ground frame of the scene that was written. Raises VdgsError."""
+    return joined(pieces(path))
+
+
+def pieces(path: Path) -> Iterator[Gaussians]:
+    """The same, some thousand at a time."""
     chosen = format_of(path)
     if chosen.read is None:
         able = ", ".join(each.ending for each in FORMATS if each.read)

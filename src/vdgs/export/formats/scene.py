@@ -118,6 +118,12 @@ def _clean(piece: Gaussians, first: int) -> Gaussians:
     return Gaussians(**tensors)
 
 
+def joined(pieces: Iterable[Gaussians]) -> Gaussians:
+    """Pieces of a scene, at least one, as one."""
+    tensors = [piece.tensors() for piece in pieces]
+    return Gaussians(**{name: torch.cat([each[name] for each in tensors]) for name in tensors[0]})
+
+
 def unturned(gaussians: Gaussians, turn: Float[np.ndarray, "3 3"]) -> Gaussians:
     """Gaussians of a file back in the ground frame."""
     return transformed(gaussians, 1.0, turn.T, np.zeros(3))

@@ -5,6 +5,7 @@ Position and standard deviations as float32, colour and opacity as RGBA, rotatio
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.scene import (
+    ROWS,
     Y_DOWN,
     Scene,
     bytes_of,
@@ -53,19 +55,24 @@ def write_splat(path: Path, scene: Scene) -> tuple[str, ...]:
     return tuple(lost)
 
 
-def read_splat(path: Path) -> Gaussians:
-    """The Gaussians of a file, in the ground frame. Raises VdgsError if it is missing or damaged."""
+def splat_pieces(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians of a file, in the ground frame, at most `ROWS` at a time. Raises VdgsError if it is missing or
+    damaged."""
     try:
         rows = np.fromfile(path, np.uint8)
     except OSError as error:
         raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
     if not len(rows) or len(rows) % LAYOUT.itemsize:
         raise VdgsError(f"{path}: holds {len(rows)} bytes, which are no whole Gaussians of 32. Write it again.")
-    table = rows.view(LAYOUT)
+    whole = rows.view(LAYOUT)
+    for first in range(0, len(whole), ROWS):
+        yield unturned(_gaussians(whole[first : first + ROWS]), Y_DOWN)
+
+
+def _gaussians(table: np.ndarray) -> Gaussians:
     rgba = table["rgba"].astype(np.float32) / 255
-    read = Gaussians(
+    return Gaussians(
         means=torch.from_numpy(table["mean"].copy()), log_scales=torch.from_numpy(table["scale"].copy()).log(),
         quaternions=torch.from_numpy((table["rotation"].astype(np.float32) - 128) / 128), logits=logits_of(rgba[:, 3]),
         dc=dc_of_colours(torch.from_numpy(rgba[:, :3])), rest=torch.zeros(len(table), 0, 3),
     )  # fmt: skip
-    return unturned(read, Y_DOWN)

@@ -11,7 +11,7 @@ import math
 import struct
 import tempfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -20,7 +20,7 @@ import torch
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.gzipping import gzipped
-from vdgs.export.formats.scene import Y_UP, Scene, bytes_of, logits_of, opacities, unturned, write_beside
+from vdgs.export.formats.scene import ROWS, Y_UP, Scene, bytes_of, joined, logits_of, opacities, unturned, write_beside
 from vdgs.export.formats.small_turns import with_small_turns
 from vdgs.model.gaussians import Gaussians
 from vdgs.model.spherical_harmonics import MAX_DEGREE, function_count
@@ -32,8 +32,6 @@ FRACTION_BITS = 12
 #: Positions lie below this many units from the origin.
 REACH = 2**23 / 2**FRACTION_BITS
 COLOUR_SCALE = 0.15
-#: Steps of the coefficients of the first band and of the others, in units of 1 / 128: what Niantic's writer takes.
-FIRST_STEP, REST_STEP = 8, 16
 #: Columns in the order of the file.
 COLUMNS = ("positions", "alphas", "colours", "scales", "rotations", "harmonics")
 READ_IN = 1 << 22
@@ -134,9 +132,10 @@ def _beyond(piece: Gaussians) -> dict[str, int]:
 
 def _harmonics(rest: np.ndarray) -> np.ndarray:
     n, r, _ = rest.shape
-    step = np.where(np.arange(r) < 3, FIRST_STEP, REST_STEP)[:, None].astype(np.float32)
-    # The middle of the bytes, 128, is a step of its own: what is zero stays zero.
-    coded = np.rint(rest * np.float32(128) / step) * step + 128
+    # All eight bits: Niantic's writer keeps five of the first band and four of the others, for smaller files, and takes
+    # nearly all change with the direction away from scenes whose coefficients are small (docs/export.md). The middle of
+    # the bytes, 128, is a value of its own: what is zero stays zero.
+    coded = np.rint(rest * np.float32(128)) + 128
     return np.clip(coded, 0, 255).astype(np.uint8).reshape(n, 3 * r)
 
 
@@ -160,19 +159,25 @@ def _three_smallest(quaternions: np.ndarray) -> np.ndarray:
     return packed.astype("<u4").view(np.uint8).reshape(-1, 4)
 
 
-def read_spz(path: Path) -> Gaussians:
-    """The Gaussians of a file of version 2 or 3, in the ground frame. Raises VdgsError if it is damaged or another."""
+def spz_pieces(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians of a file of version 2 or 3, in the ground frame, at most `ROWS` at a time, but all of its
+    bytes in memory, 64 for each. Raises VdgsError if it is damaged or another."""
     try:
         data = zlib.decompress(path.read_bytes(), 31)
     except OSError as error:
         raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
     except zlib.error as error:
         raise VdgsError(f"{path}: is no SPZ of versions 2 and 3, or damaged ({error}). Write it again.") from None
-    return unturned(decoded(data, path), Y_UP)
+    for piece in _decoded(data, path):
+        yield unturned(piece, Y_UP)
 
 
 def decoded(data: bytes, path: Path) -> Gaussians:
     """Gaussians, y up, of an inflated file; `path` is for what is said of a damaged one (VdgsError)."""
+    return joined(_decoded(data, path))
+
+
+def _decoded(data: bytes, path: Path) -> Iterator[Gaussians]:
     if len(data) < HEADER.size or (fields := HEADER.unpack_from(data))[0] != MAGIC or fields[1] not in (2, 3):
         raise VdgsError(f"{path}: is no SPZ of versions 2 and 3.")
     _, version, n, degree, fraction, _, _ = fields
@@ -184,7 +189,13 @@ def decoded(data: bytes, path: Path) -> Gaussians:
     for width in widths:
         parts.append(np.frombuffer(data, np.uint8, n * width, start).reshape(n, width))
         start += n * width
+    for first in range(0, max(n, 1), ROWS):
+        yield _gaussians([part[first : first + ROWS] for part in parts], version, fraction)
+
+
+def _gaussians(parts: Sequence[np.ndarray], version: int, fraction: int) -> Gaussians:
     positions, alphas, colours, scales, rotations, harmonics = parts
+    n = len(positions)
     whole = np.zeros((n, 3, 4), np.uint8)
     whole[:, :, 1:] = positions.reshape(n, 3, 3)  # in the upper three bytes, so that the shift back carries the sign
     means = (whole.view("<i4")[:, :, 0] >> 8) / 2.0**fraction
@@ -195,7 +206,7 @@ def decoded(data: bytes, path: Path) -> Gaussians:
         quaternions=torch.from_numpy(quaternions.astype(np.float32)),
         logits=logits_of(alphas[:, 0] / np.float32(255)),
         dc=torch.from_numpy((colours / np.float32(255) - np.float32(0.5)) / np.float32(COLOUR_SCALE)),
-        rest=torch.from_numpy((harmonics.reshape(n, rest, 3).astype(np.float32) - 128) / 128),
+        rest=torch.from_numpy((harmonics.reshape(n, harmonics.shape[1] // 3, 3).astype(np.float32) - 128) / 128),
     )
 
 

@@ -33,8 +33,9 @@ def decode_backward_adam(
     Gradients of anchors are never held: a warp takes an anchor from its splats to its new place. Those of the decoder
     are matrix products (by torch) of what each anchor adds, for which some 1.4 kB a visible anchor are taken; where
     nobody wants them, nothing. Nothing waits for the device, and whether all was finite stays there: an anchor for
-    which it is not does not move. Of gradients by depth the kernel knows nothing: with them torch does it all. All of `moved` anneal alike (`AdamState.early`). Raises ValueError or TypeError for
-    unsuitable tensors, CudaUnavailable where the kernel cannot be run.
+    which it is not does not move. Of gradients by depth the kernel knows nothing: with them, torch does it all. All of
+    `moved` anneal alike (`AdamState.early`). Raises ValueError or TypeError for unsuitable tensors, CudaUnavailable
+    where the kernel cannot be run.
     """
     if gradients.depths is not None:
         return by_torch(positions, moved, weights, camera, rows, gradients, updates)

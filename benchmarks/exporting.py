@@ -1,0 +1,137 @@
+"""How long the export of a large scene takes, and how much memory: a made-up model of many anchors.
+
+    OMP_WAIT_POLICY=PASSIVE python benchmarks/exporting.py --anchors 20000 60000 200000 [--to a.ply b.spz]
+    OMP_WAIT_POLICY=PASSIVE python benchmarks/exporting.py --anchors 1000000 --folder /large/disk --no-measure
+
+Each anchor has 10 Gaussians; there are as many photographs to an anchor as in a real flight (one for 1600), 400 x 300
+pixels, and a place is seen by about ten. Every size runs in a process of its own. Seconds are wall clock and processor
+time of the whole; the exponents are those between the first and the last size (1: in proportion). Peak memory counts
+pages of the temporary file as far as they lie in memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from rich.console import Console
+
+from vdgs.cameras import Camera
+from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.export import exporting
+from vdgs.kernels import set_threads, threads
+from vdgs.kernels.types import FEATURE_SIZE
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchors import Anchors
+from vdgs.model.decoder import Decoder
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import TrainedRun
+from vdgs.runs.status import Status
+from vdgs.settings.requests import ExportRequest
+
+OFFSETS, ANCHORS_PER_VIEW, SEEN_BY, SPACING = 10, 1600, 10, 1.0
+WIDTH, HEIGHT = 400, 300
+#: Test views, whose photographs are grey: what they show does not matter here.
+TESTED = 40
+
+
+def made_up(anchors: int) -> tuple[AnchorModel, list[Camera]]:
+    """Anchors in rows on a square of ground, an anchor in each unit, and a flight above it looking straight down."""
+    side = math.ceil(math.sqrt(anchors))
+    generator = torch.Generator().manual_seed(0)
+    row, column = torch.arange(anchors) // side, torch.arange(anchors) % side
+    positions = torch.stack([column, row, torch.rand(anchors, generator=generator)], 1).float() * SPACING
+    log_scales = torch.randn(anchors, 6, generator=generator) * 0.2 + math.log(0.7 * SPACING)
+    model = AnchorModel(
+        Anchors(positions, torch.randn(anchors, FEATURE_SIZE, generator=generator),
+                0.4 * torch.randn(anchors, OFFSETS, 3, generator=generator), log_scales),
+        Decoder.initial(OFFSETS, True, 0, 0, generator), SPACING, (0.5, 0.5, 0.5), {},
+    )  # fmt: skip
+    count = max(4, anchors // ANCHORS_PER_VIEW)
+    # A picture holds SEEN_BY / count of the ground: its width at 4 to 3, from one focal length of 400 pixels.
+    width = math.sqrt(4 / 3 * SEEN_BY * ANCHORS_PER_VIEW) * SPACING
+    along = max(1, round(math.sqrt(count)))
+    places = (np.stack(np.meshgrid(np.arange(along), np.arange(math.ceil(count / along))), -1).reshape(-1, 2)[:count]
+              + 0.5) * side * SPACING / [along, math.ceil(count / along)]  # fmt: skip
+    cameras = []
+    for x, y in places:
+        rotation = np.diag([1.0, -1.0, -1.0])
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ np.array([x, y, width])
+        cameras.append(Camera(matrix, WIDTH, WIDTH, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT))
+    return model, cameras
+
+
+def one(anchors: int, folder: Path, names: list[str], measure: bool) -> None:
+    """Export one size and print what it took, as JSON."""
+    model, cameras = made_up(anchors)
+    photograph = folder / "grey.png"
+    Image.new("RGB", (WIDTH, HEIGHT), (128, 128, 128)).save(photograph)
+    every = max(4, len(cameras) // TESTED)
+    views = tuple(
+        View(f"{i:05d}.png", camera, photograph, None, "test" if i % every == 0 else "train")
+        for i, camera in enumerate(cameras)
+    )
+    ground = GroundFrame(1.0, np.eye(3), np.zeros(3), True, "made up", None)
+    capture = Capture(folder, "made up", ".", views, np.zeros((1, 3)), np.zeros((1, 3), np.uint8), ground)
+    file = folder / "run" / "coarse" / "model.safetensors"
+    model.save(file)
+    run = TrainedRun(RunFolder(folder / "run"), model, file, "coarse", Status(), "key", "", capture)
+    exporting.open_run = lambda *_: run
+    set_threads(threads())
+    began, before = time.monotonic(), time.process_time()
+    asked = ExportRequest(folder / "run", tuple(folder / name for name in names), measure=measure, device="cpu")
+    record = exporting.export_run(asked, Console(quiet=True))
+    print(json.dumps({
+        "anchors": anchors, "gaussians": record["gaussians"], "views": len(cameras),
+        "seconds": time.monotonic() - began, "processor": time.process_time() - before,
+        "baking": record["seconds_to_bake"], "bytes": sum(each["bytes"] for each in record["files"]),
+        "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+    }))  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--anchors", type=int, nargs="+", default=[20_000, 60_000])
+    parser.add_argument("--to", nargs="+", default=["scene.ply"])
+    parser.add_argument("--folder", type=Path, default=None, help="where files are written for a while")
+    parser.add_argument("--measure", action=argparse.BooleanOptionalAction, default=True)
+    parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.one:
+        one(asked.anchors[0], asked.folder, asked.to, asked.measure)
+        return
+    rows = []
+    for anchors in asked.anchors:
+        with tempfile.TemporaryDirectory(dir=asked.folder) as folder:
+            command = [sys.executable, __file__, "--one", "--anchors", str(anchors), "--folder", folder]
+            command += ["--to", *asked.to, "--measure" if asked.measure else "--no-measure"]
+            row = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout.splitlines()[-1])
+        rows.append(row)
+        print(
+            f"{row['anchors']:9,} anchors, {row['gaussians']:10,} Gaussians, {row['views']:4} views: "
+            f"{row['seconds']:.1f} s (baking {row['baking']:.1f}), processor {row['processor']:.1f} s, "
+            f"{row['memory'] / 1e9:.2f} GB, files {row['bytes'] / 1e9:.2f} GB",
+            flush=True,
+        )
+    if len(rows) > 1:
+        first, last = rows[0], rows[-1]
+        times = last["gaussians"] / first["gaussians"]
+        exponents = (
+            f"{what} {math.log(last[what] / first[what]) / math.log(times):.2f}" for what in ("processor", "memory")
+        )
+        print("exponents: " + ", ".join(exponents))
+
+
+if __name__ == "__main__":
+    main()

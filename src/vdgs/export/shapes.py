@@ -1,0 +1,68 @@
+"""The mean of ellipsoids: that of the logarithms of their covariances (Arsigny, Fillard, Pennec and Ayache,
+"Log-Euclidean metrics for fast and simple calculus on diffusion tensors", 2006).
+
+Half of the logarithm of R diag(s²) Rᵀ is R diag(ln s) Rᵀ: symmetric, whatever the order and the signs of the axes, of
+which a mean of quaternions would depend; and its trace is the logarithm of the volume, which a mean of covariances
+would blow up. Dimensions: p ellipsoids, m means.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vdgs.kernels.rotations import rotation_matrices
+
+#: The six numbers of a symmetric matrix.
+UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+#: Rounds of Jacobi's method: each squares what is left beside the diagonal, at the end.
+SWEEPS = 5
+
+
+def logarithms(log_scales: Float[Tensor, "p 3"], quaternions: Float[Tensor, "p 4"]) -> Float[Tensor, "p 6"]:
+    """R diag(ln s) Rᵀ, as in `UPPER`."""
+    axes = rotation_matrices(quaternions)
+    scaled = axes * log_scales[:, None]
+    return torch.stack([(scaled[:, i] * axes[:, j]).sum(1) for i, j in UPPER], 1)
+
+
+def ellipsoids(logarithm: Float[Tensor, "m 6"]) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 4"]]:
+    """The inverse: logarithms of the scales and unit quaternions, wxyz. The axes come in any order.
+
+    Jacobi's method (Golub and Van Loan, Matrix Computations, 8.5), of all matrices at once.
+    """
+    values = logarithm.double().numpy()
+    a = np.empty((3, 3, len(values)))
+    for (i, j), column in zip(UPPER, values.T, strict=True):
+        a[i, j] = a[j, i] = column
+    q = np.zeros((4, len(values)))
+    q[0] = 1.0
+    for _ in range(SWEEPS):
+        for i, j in ((0, 1), (1, 2), (2, 0)):
+            half = _turn(a, i, j)
+            q = _times(q, np.cos(half), 3 - i - j, np.sin(half))
+    return torch.from_numpy(a[range(3), range(3)].T.astype(np.float32)), torch.from_numpy(q.T.astype(np.float32))
+
+
+def _turn(a: Float[np.ndarray, "3 3 m"], i: int, j: int) -> Float[np.ndarray, " m"]:
+    """Turn the axes i and j, which follow each other, so that a[i, j] becomes 0; returns half of the angles."""
+    apart = a[i, i] - a[j, j]
+    # The smaller of the two angles that do it, at most 45 degrees: axes keep their names where they can.
+    angle = 0.5 * np.arctan2(2 * a[i, j] * np.copysign(1.0, apart), np.abs(apart))
+    c, s = np.cos(angle), np.sin(angle)
+    a[i], a[j] = c * a[i] + s * a[j], c * a[j] - s * a[i]
+    a[:, i], a[:, j] = c * a[:, i] + s * a[:, j], c * a[:, j] - s * a[:, i]
+    return angle / 2
+
+
+def _times(q: Float[np.ndarray, "4 m"], w: np.ndarray, axis: int, v: np.ndarray) -> Float[np.ndarray, "4 m"]:
+    """The products of quaternions with (w, v along one axis)."""
+    after, last = 1 + (axis + 1) % 3, 1 + (axis + 2) % 3
+    product = np.empty_like(q)
+    product[0] = q[0] * w - q[1 + axis] * v
+    product[1 + axis] = q[1 + axis] * w + q[0] * v
+    product[after] = q[after] * w + q[last] * v
+    product[last] = q[last] * w - q[after] * v
+    return product

@@ -1,0 +1,32 @@
+"""Parts of a work on several threads, their results in order, never more than a few at once in memory."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+from vdgs.kernels import threads
+
+P = TypeVar("P")
+R = TypeVar("R")
+#: Beyond so many threads memory would grow more than speed.
+MOST = 8
+
+
+def in_order(work: Callable[[P], R], parts: Iterable[P]) -> Iterator[R]:
+    """work(part) of every part, in their order, on as many threads as kernels use."""
+    workers = max(1, min(MOST, threads()))
+    with ThreadPoolExecutor(workers) as pool:
+        under_way: deque[Future[R]] = deque()
+        try:
+            for part in parts:
+                under_way.append(pool.submit(work, part))
+                if len(under_way) > workers:
+                    yield under_way.popleft().result()
+            while under_way:
+                yield under_way.popleft().result()
+        finally:
+            for each in under_way:
+                each.cancel()
