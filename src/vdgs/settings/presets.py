@@ -45,7 +45,7 @@ PRESETS: dict[str, MethodConfig] = {
             iterations=0,
             resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
             rates=RateConfig(offsets=(0.02, 2e-4), features=(0.015, 0.015), log_scales=(0.014, 0.014)),
-            early=5.0,
+            early=3.0,
             growth=GrowthConfig(statistics_from=300, start=500, until=0.6, threshold=1e-4),
         ),
         partition=PartitionConfig(blocks="auto"),
