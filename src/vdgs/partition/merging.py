@@ -67,7 +67,8 @@ def merge(
             trained_here, kept, from_coarse = len(model.anchors), len(piece), 0
             own = own or has_own_decoder(model)
         unseen = int((visibility_of(piece.positions, cameras_of_block[index]) == 0).sum())
-        pieces.append(Part(len(piece), coarse.decoder if model is None else model.decoder))
+        # A copy: a tensor of a file keeps all of the file in memory.
+        pieces.append(Part(len(piece), coarse.decoder if model is None else model.decoder.copy()))
         selected.append(piece.tensors())
         became.append(MergedBlock(index, trained_here, kept, trained_here - kept, from_coarse, unseen))
     return replace(coarse, anchors=_joined(selected), parts=tuple(pieces) if own else ()), became
