@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import shutil
 import subprocess
 import sys
@@ -53,6 +54,8 @@ class Cluster:
     """A Ray cluster; every node but the head has one processor."""
 
     def __init__(self) -> None:
+        #: With which a driver is let in; Ray listens on all addresses.
+        self.token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
         here, source = Path(__file__).parent, Path(sys.modules["vdgs"].__file__ or "").parents[1]
         paths = [str(here / "startup"), str(here), str(source)]  # what nodes start can be paused, as `pausing` says
         environment = os.environ | {
@@ -60,7 +63,7 @@ class Cluster:
             "RAY_enable_worker_prestart": "0", "RAY_prestart_worker_first_driver": "0", "PYTHONWARNINGS": "ignore",
             "RAY_health_check_initial_delay_ms": "0", "RAY_health_check_period_ms": "1000",
             "RAY_memory_monitor_refresh_ms": "0",  # what other tests take is not for Ray to free
-            "VDGS_THREADS": "1", "OMP_NUM_THREADS": "1",
+            "VDGS_THREADS": "1", "OMP_NUM_THREADS": "1", **self.token,
         }  # fmt: skip
         self._server = subprocess.Popen(
             [sys.executable, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
