@@ -37,9 +37,10 @@ def tell(**facts):
 tell(address=cluster.address)
 own.pop("include_dashboard")
 for line in sys.stdin:
-    verb, name = line.split()
+    verb, name, *path = line.split()
     if verb == "add":
-        nodes[name] = cluster.add_node(num_cpus=1, **own)
+        where = {"env_vars": {"PYTHONPATH": path[0]}} if path else {}
+        nodes[name] = cluster.add_node(num_cpus=1, **own, **where)
         tell(raylet=nodes[name].all_processes["raylet"][0].process.pid)
     elif verb == "remove":
         cluster.remove_node(nodes.pop(name), allow_graceful=False)
@@ -69,16 +70,18 @@ class Cluster:
             [sys.executable, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             text=True, env=environment,
         )  # fmt: skip
-        self._raylets = dict[int, str]()
+        self._raylets, self.names = dict[int, str](), list[str]()
         self.address = str(self._answer()["address"])
 
-    def add(self, name: str) -> None:
-        """Start a node."""
-        self._raylets[int(self._ask("add", name)["raylet"])] = name
+    def add(self, name: str, *path: Path) -> None:
+        """Start a node, which finds its modules at another path if one is given."""
+        self._raylets[int(self._ask("add", name, *map(str, path))["raylet"])] = name
+        self.names.append(name)
 
     def remove(self, name: str) -> None:
         """Let a node die without a word."""
         self._ask("remove", name)
+        self.names.remove(name)
 
     def node_of(self, process: int) -> str:
         """On which node a command of a block runs: its keeper is a child of the node's own process."""

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import shutil
 import signal
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 from cli_support import begun, vdgs, wait_until
 from cluster_support import BLOCKS, MIDDLE, Cluster, alive, block_of, copy_run, make_run, models, parent_of, train_here
+from vdgs import cli
 
 pytestmark = [
     pytest.mark.xdist_group("ray"),
@@ -110,3 +112,22 @@ def test_a_driver_that_was_killed_finds_its_blocks_again_and_stops_them_when_ask
     assert models(run) == models(local)
     for block in (0, 1):
         assert "continuing at iteration 40" in (run / f"blocks/{block:02d}/output.log").read_text()
+
+
+def test_a_node_that_joins_late_and_cannot_work_on_the_run_is_named_and_avoided(cut, local, cluster, tmp_path):
+    run, stranger = copy_run(cut, tmp_path / "run"), tmp_path / "stranger"
+    source = Path(cli.__file__).parent
+    shutil.copytree(source, stranger / "vdgs", ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    (stranger / "vdgs/of_another_version.py").touch()
+    for name in cluster.names[1:]:
+        cluster.remove(name)
+    with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
+        driver.wait_until_paused(1)
+        cluster.add("stranger", stranger)
+        wait_until(lambda: "cannot work on the run" in driver.printed())
+        driver.go_on()
+        done = driver.finished()
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert models(run) == models(local)
+    assert done.stdout.count("crashed by a node that cannot work on the run") == 1
+    assert "not the same code" in done.stdout

@@ -75,10 +75,10 @@ def _ray(asked: ExecutorOptions, work: Work, question: Question) -> Chosen:
     from vdgs.errors import VdgsError
     from vdgs.executors.on_ray import RayExecutor, ask_nodes, nodes
 
-    there = nodes()
+    answers = ask_nodes(question, nodes())
+    there = nodes()  # one that died just before was still listed when it was asked
     if not there:
         raise VdgsError("The Ray cluster has no node with processors. See `ray status`.")
-    answers = ask_nodes(question, there)
     share = on_cluster(work, there, asked)
     notes, needs = [], share.needs
     if not any(
