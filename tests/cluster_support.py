@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import shutil
 import subprocess
 import sys
@@ -36,9 +37,10 @@ def tell(**facts):
 tell(address=cluster.address)
 own.pop("include_dashboard")
 for line in sys.stdin:
-    verb, name = line.split()
+    verb, name, *path = line.split()
     if verb == "add":
-        nodes[name] = cluster.add_node(num_cpus=1, **own)
+        where = {"env_vars": {"PYTHONPATH": path[0]}} if path else {}
+        nodes[name] = cluster.add_node(num_cpus=1, **own, **where)
         tell(raylet=nodes[name].all_processes["raylet"][0].process.pid)
     elif verb == "remove":
         cluster.remove_node(nodes.pop(name), allow_graceful=False)
@@ -53,6 +55,8 @@ class Cluster:
     """A Ray cluster; every node but the head has one processor."""
 
     def __init__(self) -> None:
+        #: With which a driver is let in; Ray listens on all addresses.
+        self.token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
         here, source = Path(__file__).parent, Path(sys.modules["vdgs"].__file__ or "").parents[1]
         paths = [str(here / "startup"), str(here), str(source)]  # what nodes start can be paused, as `pausing` says
         environment = os.environ | {
@@ -60,22 +64,24 @@ class Cluster:
             "RAY_enable_worker_prestart": "0", "RAY_prestart_worker_first_driver": "0", "PYTHONWARNINGS": "ignore",
             "RAY_health_check_initial_delay_ms": "0", "RAY_health_check_period_ms": "1000",
             "RAY_memory_monitor_refresh_ms": "0",  # what other tests take is not for Ray to free
-            "VDGS_THREADS": "1", "OMP_NUM_THREADS": "1",
+            "VDGS_THREADS": "1", "OMP_NUM_THREADS": "1", **self.token,
         }  # fmt: skip
         self._server = subprocess.Popen(
             [sys.executable, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             text=True, env=environment,
         )  # fmt: skip
-        self._raylets = dict[int, str]()
+        self._raylets, self.names = dict[int, str](), list[str]()
         self.address = str(self._answer()["address"])
 
-    def add(self, name: str) -> None:
-        """Start a node."""
-        self._raylets[int(self._ask("add", name)["raylet"])] = name
+    def add(self, name: str, *path: Path) -> None:
+        """Start a node, which finds its modules at another path if one is given."""
+        self._raylets[int(self._ask("add", name, *map(str, path))["raylet"])] = name
+        self.names.append(name)
 
     def remove(self, name: str) -> None:
         """Let a node die without a word."""
         self._ask("remove", name)
+        self.names.remove(name)
 
     def node_of(self, process: int) -> str:
         """On which node a command of a block runs: its keeper is a child of the node's own process."""

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import shutil
 import signal
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 from cli_support import begun, vdgs, wait_until
 from cluster_support import BLOCKS, MIDDLE, Cluster, alive, block_of, copy_run, make_run, models, parent_of, train_here
+from vdgs import cli
 
 pytestmark = [
     pytest.mark.xdist_group("ray"),
@@ -50,7 +52,7 @@ def another_code() -> None:
 
 def test_nodes_that_cannot_work_on_a_run_are_named_before_anything_starts(cut, cluster, tmp_path):
     run = copy_run(cut, tmp_path / "run")
-    done = vdgs(*on_ray(run, cluster), prepare=another_code)
+    done = vdgs(*on_ray(run, cluster), prepare=another_code, environment=cluster.token)
     assert done.returncode == 1
     assert f"node {os.uname().nodename}: its vdgs" in done.stderr
     assert "not the same code" in done.stderr
@@ -61,7 +63,7 @@ def test_nodes_that_cannot_work_on_a_run_are_named_before_anything_starts(cut, c
 def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, cluster, tmp_path):
     """A node dies under a block, one that joins late takes it; a command is killed, then the worker that keeps it."""
     run = copy_run(cut, tmp_path / "run")
-    with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1)) as driver:
+    with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
 
         def wait_for(count: int) -> dict[int, int]:
             """The process of each block that waits now, once so many have waited in all."""
@@ -92,12 +94,12 @@ def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, clus
 
 def test_a_driver_that_was_killed_finds_its_blocks_again_and_stops_them_when_asked(cut, local, cluster, tmp_path):
     run = copy_run(cut, tmp_path / "run")
-    with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1)) as first:
+    with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1), environment=cluster.token) as first:
         first.wait_until_paused(2)
         first.send_signal(signal.SIGKILL)
         first.finished()
         assert all(alive(process) for process in first.paused())
-        with begun(*on_ray(run, cluster)) as second:
+        with begun(*on_ray(run, cluster), environment=cluster.token) as second:
             wait_until(lambda: "is watched again" in second.printed())
             wait_until(lambda: second.printed().count("is watched again") == 2)
             second.send_signal(signal.SIGINT)
@@ -105,8 +107,27 @@ def test_a_driver_that_was_killed_finds_its_blocks_again_and_stops_them_when_ask
         assert done.returncode == 130, done.stderr + done.stdout
         assert "every block that was training is saved" in done.stderr
         assert not any(alive(process) for process in first.paused())
-    done = vdgs(*on_ray(run, cluster))
+    done = vdgs(*on_ray(run, cluster), environment=cluster.token)
     assert done.returncode == 0, done.stderr + done.stdout
     assert models(run) == models(local)
     for block in (0, 1):
         assert "continuing at iteration 40" in (run / f"blocks/{block:02d}/output.log").read_text()
+
+
+def test_a_node_that_joins_late_and_cannot_work_on_the_run_is_named_and_avoided(cut, local, cluster, tmp_path):
+    run, stranger = copy_run(cut, tmp_path / "run"), tmp_path / "stranger"
+    source = Path(cli.__file__).parent
+    shutil.copytree(source, stranger / "vdgs", ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    (stranger / "vdgs/of_another_version.py").touch()
+    for name in cluster.names[1:]:
+        cluster.remove(name)
+    with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
+        driver.wait_until_paused(1)
+        cluster.add("stranger", stranger)
+        wait_until(lambda: "cannot work on the run" in driver.printed())
+        driver.go_on()
+        done = driver.finished()
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert models(run) == models(local)
+    assert done.stdout.count("crashed by a node that cannot work on the run") == 1
+    assert "not the same code" in done.stdout

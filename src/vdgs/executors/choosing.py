@@ -13,6 +13,9 @@ from vdgs.executors.placement import Share, Work, by_queue, on_cluster, on_this_
 from vdgs.memory.estimate import in_gb
 from vdgs.settings.executors import ExecutorOptions
 
+#: Seconds to wait for what still holds a block: NFS lets go of what a lost node held after a minute and a half.
+PATIENCE_SECONDS = 300.0
+
 
 @dataclass(frozen=True)
 class Chosen:
@@ -72,10 +75,10 @@ def _ray(asked: ExecutorOptions, work: Work, question: Question) -> Chosen:
     from vdgs.errors import VdgsError
     from vdgs.executors.on_ray import RayExecutor, ask_nodes, nodes
 
-    there = nodes()
+    answers = ask_nodes(question, nodes())
+    there = nodes()  # one that died just before was still listed when it was asked
     if not there:
         raise VdgsError("The Ray cluster has no node with processors. See `ray status`.")
-    answers = ask_nodes(question, there)
     share = on_cluster(work, there, asked)
     notes, needs = [], share.needs
     if not any(
@@ -96,7 +99,8 @@ def _ray(asked: ExecutorOptions, work: Work, question: Question) -> Chosen:
         )
     names = len(there), sum(node.processors for node in there)
     line = f"over {names[0]} node{'s' if names[0] > 1 else ''} of Ray with {names[1]} processors, {_needs(share)} each"
-    return Chosen(RayExecutor(share.at_once, question=question), share, line, tuple(notes))
+    executor = RayExecutor(share.at_once, patience_seconds=PATIENCE_SECONDS, question=question)
+    return Chosen(executor, share, line, tuple(notes))
 
 
 def _slurm(asked: ExecutorOptions, work: Work, question: Question) -> Chosen:
@@ -105,7 +109,10 @@ def _slurm(asked: ExecutorOptions, work: Work, question: Question) -> Chosen:
     refuse_without_slurm()
     share = by_queue(work, asked)
     options = asked.slurm
-    executor = SlurmExecutor(share.at_once, poll_seconds=options.poll_seconds, question=question, options=options)
+    executor = SlurmExecutor(
+        share.at_once, poll_seconds=options.poll_seconds, patience_seconds=PATIENCE_SECONDS, question=question,
+        options=options,
+    )  # fmt: skip
     return Chosen(executor, share, f"as jobs of SLURM, {_needs(share)} each")
 
 

@@ -26,8 +26,6 @@ from vdgs.watching.interrupts import stop_requests
 GRACE_SECONDS, GRACE_POLL_SECONDS = 120.0, 0.05
 #: Free bytes below which a silent failure is put down to a full disk.
 FULL_BYTES = 1 << 20
-#: Seconds to wait for a process that still holds a task's folder, such as one whose driver was killed and that saves.
-PATIENCE_SECONDS = 60.0
 #: What a task asks for after it was ended for want of memory, times what it asked for before (choice).
 MORE_MEMORY = 1.5
 
@@ -39,6 +37,9 @@ class Policy:
     at_once: int
     retries: int = 2
     poll_seconds: float = 0.5
+    patience_seconds: float = 60.0
+    """How long to wait for a process that still holds a task's folder, such as one whose driver was killed and that
+    saves."""
 
     def __post_init__(self) -> None:
         if self.at_once < 1 or self.retries < 0:
@@ -86,7 +87,7 @@ class _Crew:
 
     def __init__(self, works: list[_Work], engine: Engine, policy: Policy, listener: Listener):
         self.works, self._engine, self._listener = works, engine, listener
-        self._at_once, self._retries = policy.at_once, policy.retries
+        self._at_once, self._retries, self._patience = policy.at_once, policy.retries, policy.patience_seconds
         self._by_name = {work.task.name: work for work in works}
         self._waiting = deque(works)
         self._stopping = False
@@ -188,7 +189,7 @@ class _Crew:
         if work.held_since is None:
             work.held_since = time.monotonic()
             self._listener.waits(work.task)
-        return time.monotonic() - work.held_since < PATIENCE_SECONDS
+        return time.monotonic() - work.held_since < self._patience
 
     def _stop(self, kill: bool) -> None:
         if not self._stopping:

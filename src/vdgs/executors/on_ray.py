@@ -125,7 +125,10 @@ def nodes() -> list[Node]:
 
 
 def ask_nodes(question: Question, there: Sequence[Node]) -> list[dict[str, Any]]:
-    """Every node's answer (`fitness.examine`). Raises VdgsError, naming nodes and what is wrong, if one is unfit."""
+    """Every node's answer (`fitness.examine`), but for nodes that are gone meanwhile.
+
+    Raises VdgsError, naming nodes and what is wrong, if one is unfit.
+    """
     import ray
 
     with question.asked() as plain:
@@ -135,8 +138,8 @@ def ask_nodes(question: Question, there: Sequence[Node]) -> list[dict[str, Any]]
             try:
                 answers.append(ray.get(answer, timeout=ANSWER_SECONDS))
             except ray.exceptions.RayError as error:
-                lines = [line for line in str(error).strip().splitlines() if line] or [type(error).__name__]
-                problems.append(f"node {node.name}: does not answer ({lines[-1].strip()})")
+                if node.identity in {each.identity for each in nodes()}:
+                    problems.append(f"node {node.name}: does not answer ({_last_line(error)})")
                 continue
             problems += [f"node {answers[-1]['node']}: {each}" for each in answers[-1]["problems"]]
     if problems:

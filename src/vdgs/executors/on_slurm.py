@@ -14,7 +14,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +65,9 @@ class SlurmExecutor(Policy):
     def run(self, tasks: Sequence[Task], listener: Listener) -> list[Outcome]:
         """As `Executor.run`."""
         assert self.question is not None
-        return run_crew(tasks, _Queue(self.question, self.options, self.at_once), self, listener)
+        # All go into the queue, where they wait without a driver too; SLURM lets so many at a time run.
+        everything = replace(self, at_once=max(1, len(tasks)))
+        return run_crew(tasks, _Queue(self.question, self.options, self.at_once), everything, listener)
 
 
 class _Queue:

@@ -15,7 +15,7 @@ class WatchOptions:
     save_every: Annotated[int, Range(1, MANY)] = 1000
     """Iterations between two checkpoints."""
     image_memory_gb: Annotated[float, Range(0, LARGE)] = 0.0
-    """Memory for decoded images; 0 takes a quarter of what is free."""
+    """Memory for decoded images; 0 takes a quarter of what is free. On a cluster: of one block."""
     tensorboard: bool = False
     """Also write TensorBoard events into the stage's folder (needs the extra `tensorboard`)."""
 
