@@ -91,8 +91,9 @@ def _plan_photographs(asked: RunRequest, console: Console) -> Plan | None:
             replace(asked, capture=request.output, photographs=(), options=replace(asked.options, gps=None)), console
         )
     tell(prepare(request), console)
+    folders = " ".join(map(str, (asked.capture, *asked.photographs)))
     console.print(
-        f"Training can be estimated once they are a capture: vdgs sfm {asked.capture} --output CAPTURE, then the same "
+        f"Training can be estimated once they are a capture: vdgs sfm {folders} --output CAPTURE, then the same "
         "with CAPTURE. Nothing was written.",
         highlight=False,
     )

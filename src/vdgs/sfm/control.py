@@ -212,7 +212,8 @@ def _named(header: str) -> str:
 def _by_name(collection: Collection) -> dict[str, list[Photograph | str]]:
     """Photographs, and names of those left out, by whole names, file names and those without endings, lower case."""
     found: dict[str, list[Photograph | str]] = {}
-    for photo in (*collection.photographs, *(each.name for each in collection.left_out)):
+    all_of_them: list[Photograph | str] = [*collection.photographs, *(each.name for each in collection.left_out)]
+    for photo in all_of_them:
         name = photo if isinstance(photo, str) else photo.name
         for key in {name.lower(), PurePosixPath(name).name.lower(), stem_of(name)}:
             found.setdefault(key, []).append(photo)

@@ -41,7 +41,11 @@ def draw_residuals(
         span = float(np.ptp(positions.enu[placed.rows, :2], axis=0).max())
         longest = float(np.linalg.norm(placed.residuals[:, :2], axis=1).max())
         factor = next((n for n in (100, 50, 20, 10, 5, 2) if n * longest <= LONGEST_ARROW * span), 1)
-    title = f"Recorded to placed position, {factor} times as long" if arrows else "The points from above"
+    title = (
+        f"From recorded to placed positions{f', drawn {factor} times as long' if factor > 1 else ''}"
+        if arrows
+        else "The points from above"
+    )
     figure, axes = _axes(title, metric=placed is not None)
     few = points[:: max(1, len(points) // 20_000)]
     low, high = np.quantile(few[:, :2], [0.01, 0.99], axis=0)
@@ -54,6 +58,9 @@ def draw_residuals(
             at[:, 0], at[:, 1], move[:, 0], move[:, 1], angles="xy", scale_units="xy", scale=1, width=0.003,
             color=[INK if trusted else ACCENT for trusted in placed.inliers], zorder=3,
         )  # fmt: skip
+    if placed is not None and not placed.inliers.all():
+        axes.plot([], [], color=ACCENT, label="not trusted")
+        axes.legend(frameon=False, loc="best")
     for name, place in marks.items():
         low, high = np.minimum(low, place[:2]), np.maximum(high, place[:2])
         axes.plot(*place[:2], "^", color=ACCENT, markersize=6, zorder=4)

@@ -28,7 +28,7 @@ OBLIQUE_DEG = 20.0
 #: Seconds of one core, measured on a Xeon without GPU (docs/sfm.md): a megapixel searched for features, a pair of
 #: photographs with 1000 features each compared (it goes with the square), a photograph placed, a megapixel written.
 #: Another machine may take half or twice as long.
-FEATURE_SECONDS, PAIR_SECONDS, MAPPING_SECONDS, WRITING_SECONDS = 0.3, 0.0062, 1.5, 0.35
+FEATURE_SECONDS, PAIR_SECONDS, MAPPING_SECONDS, WRITING_SECONDS = 0.25, 0.0055, 1.5, 0.05
 #: Features of a megapixel, about; searched finely three times as many, and it takes three times as long.
 FEATURES_A_MEGAPIXEL = 2500
 
