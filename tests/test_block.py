@@ -165,12 +165,15 @@ def test_a_cycle_lasts_from_decision_to_decision():
     assert not {*views_in_cycle(12, stage)} & {*views_in_cycle(15, stage)}
 
 
-def test_rates_restart_lower_and_iterations_scale():
+def test_rates_and_growth_restart_and_iterations_scale():
+    """The paper prints neither rates nor a start of growth for blocks: those of the coarse stage, unless asked."""
     method = MethodConfig(block=BlockConfig(scale_iterations=0.1))
     config = block_training(method, 500)
     assert config.iterations == 5000
-    assert config.growth.start == 100
-    assert config.rates.offsets == pytest.approx((0.004, 4e-5))
-    assert config.rates.log_scales == pytest.approx((0.0056, 0.0056))
-    assert config.rates.features == method.training.rates.features
+    assert (config.growth.statistics_from, config.growth.start) == (50, 150)
+    assert config.rates == method.training.rates
+    damped = block_training(replace(method, block=BlockConfig(offset_rate=0.4, scale_rate=0.8)), 500)
+    assert damped.rates.offsets == pytest.approx((0.004, 4e-5))
+    assert damped.rates.log_scales == pytest.approx((0.0056, 0.0056))
+    assert damped.rates.features == method.training.rates.features
     assert block_training(replace(method, block=BlockConfig(iterations=0)), 33).iterations == 500
