@@ -133,9 +133,10 @@ def decode_backward_adam(kernels: Operations, place: Place) -> Results:
 
 def project(kernels: Operations, place: Place) -> Results:
     a = place.anchors
+    # Of different lengths: to turn a ball changes nothing, and the gradient would be all rounding.
+    scales = (a.log_scales[:, :3] + 0.5 * place.random(len(a), 3, seed=4)).exp()
     leaves = tuple(
-        t.detach().clone().requires_grad_(True)
-        for t in (a.positions, a.log_scales[:, :3].exp(), place.random(len(a), 4, seed=3))
+        t.detach().clone().requires_grad_(True) for t in (a.positions, scales, place.random(len(a), 4, seed=3))
     )
     found = kernels.project(*leaves, place.camera)
     values = {"means_px": found.means_px, "conics": found.conics, "depths": found.depths}

@@ -16,7 +16,6 @@ from vdgs.kernels.gsplat import rasterise, rasterise_vjp
 from vdgs.kernels.gsplat.rasterise import GsplatUnavailable, load, reach_px
 from vdgs.kernels.reference.rasterise import rasterise as reference
 from vdgs.kernels.reference.rasterise import rasterise_vjp as reference_vjp
-from vdgs.kernels.types import Splats
 
 SCENES = {
     "ordinary": make_scene(120, 37, 29),
@@ -74,13 +73,12 @@ def test_the_way_back_gives_what_training_asks_for():
             assert_close(getattr(found, name), expected, 1e-4)
 
 
-@pytest.mark.parametrize(
-    ("tensor", "error"), [(torch.zeros(5, 3), ValueError), (torch.zeros(5, 2).double(), TypeError)]
-)
-def test_unsuitable_tensors_are_refused(tensor, error):
-    splats = Splats(tensor, torch.zeros(5, 3), torch.zeros(5), torch.zeros(5, 3), torch.zeros(5))
-    with pytest.raises(error, match="means_px"):
-        rasterise(splats, torch.zeros(3), 10, 10, engine=SimpleNamespace())
+def test_unsuitable_arguments_are_refused():
+    scene, engine = SCENES["ordinary"], SimpleNamespace()
+    with pytest.raises(TypeError, match="means_px must be float32"):
+        rasterise(*splats_of(scene.to(torch.float64).tensors), 37, 29, engine=engine)
+    with pytest.raises(ValueError, match="width"):
+        rasterise(*splats_of(scene.tensors), 0, 29, engine=engine)
 
 
 def test_without_compiled_kernels_the_error_says_so(monkeypatch: pytest.MonkeyPatch):

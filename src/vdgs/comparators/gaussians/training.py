@@ -18,7 +18,7 @@ from vdgs.cameras import Camera
 from vdgs.comparators.gaussians.density import DensityConfig, control_density, reset_logits
 from vdgs.errors import TrainingDiverged
 from vdgs.kernels import choose
-from vdgs.kernels.types import AdamState
+from vdgs.kernels.types import AdamState, Finite
 from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows
 from vdgs.storage.checkpoints import SavedState
 from vdgs.training import PSNR_INTERVAL, TrainingImages, view_at
@@ -205,13 +205,13 @@ def _move(
     state: GaussiansState, rows: Int64[Tensor, " v"], gradients: dict[str, Tensor], rates: dict[str, float], degree: int
 ) -> None:
     """One step of Adam for all Gaussians: those that the view does not show move on by their moments (program)."""
-    finite = True
+    finite: Finite = True
     for name, tensor in state.gaussians.tensors().items():
         if name == "rest" and not degree:
             continue  # gradients and moments are zero: nothing moves
         everywhere = state.room[name].index_copy_(0, rows, gradients[name])
         moved = AdamState(tensor, state.moments.first[name], state.moments.second[name], rates[name])
-        finite &= choose(tensor.device).adam_rows(moved, None, everywhere, state.iteration + 1)
+        finite = choose(tensor.device).adam_rows(moved, None, everywhere, state.iteration + 1) & finite
         everywhere.index_fill_(0, rows, 0.0)
     if not finite:
         raise TrainingDiverged(f"A gradient is not a finite number at iteration {state.iteration + 1}.")

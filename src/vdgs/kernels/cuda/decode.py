@@ -76,9 +76,9 @@ def decode(
     program.launch("decode_anchors", grid, block, *given, None, counts, *[None] * 7)
     ends = counts.cumsum(0)
     m = int(ends[-1]) if count else 0
+    empty = positions.new_empty
     splats = AnchorSplats(
-        *(positions.new_empty(shape) for shape in ((m, 2), (m, 3), (m,), (m, 3), (m,), (m,))),
-        source=positions.new_empty(m, dtype=torch.int32),
+        empty(m, 2), empty(m, 3), empty(m), empty(m, 3), empty(m), empty(m), empty(m, dtype=torch.int32)
     )
     program.launch(
         "decode_anchors", grid, block, *given, ends, None, splats.means_px, splats.conics, splats.depths,

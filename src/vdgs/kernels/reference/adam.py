@@ -60,7 +60,7 @@ def adam_rows(
     """
     check_rows(state, rows, gradient)
     factors = check_step(state, step, len(gradient), beta1, beta2, epsilon)
-    finite = torch.isfinite(gradient).all()
+    finite: Tensor | None = torch.isfinite(gradient).all()
     if may_look(gradient):
         if not bool(finite):
             return False
