@@ -11,6 +11,7 @@ import secrets
 import socket
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +21,7 @@ from rich.console import Console
 from vdgs.captures.heights import camera_height
 from vdgs.captures.overview import FOV_DEG
 from vdgs.errors import Interrupted, VdgsError
-from vdgs.memory.process import share_arenas
+from vdgs.memory.process import return_unused, share_arenas
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import TrainedRun
 from vdgs.settings.requests import ViewRequest
@@ -47,6 +48,8 @@ def view_run(asked: ViewRequest, console: Console, opened: Callable[[str], None]
     """
     _require_viser()
     share_arenas()
+    # Visitors may vanish while a picture is on its way to them.
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     port = free_port(asked.host, asked.port)
     run = open_or_last_saved(asked.run, asked.model, asked.device)
     if run.caution:
@@ -118,6 +121,7 @@ def serve(run: TrainedRun, host: str, port: int, console: Console) -> Iterator[V
     # visitors who left are held by circles of viser's until one finds them.
     gc.collect()
     gc.freeze()
+    return_unused()  # what opening the run took beside what it left
     worker = threading.Thread(target=studio.run, name="studio", daemon=True)
     worker.start()
     server.on_client_connect(comes)

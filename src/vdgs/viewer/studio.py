@@ -29,7 +29,7 @@ from vdgs.memory.process import return_unused
 from vdgs.viewer.layers import Shown
 
 #: A camera that has not moved for so long rests, seconds.
-REST = 0.12
+REST = 0.1
 #: A quick picture takes so long, and never has fewer pixels nor more than these.
 QUICK, FEWEST_PX, MOST_PX = 0.045, 240 * 160, 640 * 480
 #: A quick picture of each visitor who moves takes so long together, and no picture is given less than this.
@@ -40,11 +40,11 @@ FIRST_ANCHORS, FEWEST_ANCHORS = 20_000, 2_000
 LEARNING = 0.4
 #: Rows of a full picture are drawn for so long before others have their turn, and from about so many anchors at once:
 #: what they decode to is memory.
-TURN, TURN_ANCHORS, MOST_TURNS = 0.1, 60_000, 24
+TURN, TURN_ANCHORS, MOST_TURNS = 0.1, 40_000, 24
 #: Full pictures that are kept for others who stand at the same place.
 KEPT = 3
-#: With nothing to do for so long, memory is given back, seconds.
-IDLE = 1.0
+#: With nothing to do for so long (seconds), or after so many have left, memory is given back.
+IDLE, MOST_LEFT = 1.0, 16
 
 _Result = TypeVar("_Result")
 
@@ -108,6 +108,7 @@ class Studio:
         self._full_pictures: OrderedDict[Hashable, np.ndarray] = OrderedDict()
         self._changed = threading.Condition()
         self._closed = False
+        self._left = 0
 
     def seat(self, painter: Paints, deliver: Callable[[Frame], None], failed: Callable[[Exception], None]) -> Seat:
         """A place for a new visitor."""
@@ -121,6 +122,7 @@ class Studio:
         with self._changed:
             if seat in self._seats:
                 self._seats.remove(seat)
+                self._left += 1
             seat.work, seat.asked = None, None
 
     def ask(self, seat: Seat, camera: Camera, shown: Shown) -> None:
@@ -156,6 +158,8 @@ class Studio:
         """Work until `close`."""
         while True:
             wait = self.step()
+            if self._left >= MOST_LEFT:
+                self._tidy()
             with self._changed:
                 if self._closed:
                     return
@@ -164,10 +168,15 @@ class Studio:
                 told = self._changed.wait(IDLE if wait is None else wait)
                 if told or wait is not None or self._busy() or self._closed:
                     continue
-            gc.collect()  # who left is held by circles of theirs
-            return_unused()
+            self._tidy()
             with self._changed:
                 self._changed.wait_for(lambda: self._busy() or self._closed)
+
+    def _tidy(self) -> None:
+        """Give back what pictures and visitors took: who left is held by circles of theirs."""
+        self._left = 0
+        gc.collect()
+        return_unused()
 
     def _busy(self) -> bool:
         return bool(self._errands) or any(seat.quick_due for seat in self._seats)
@@ -195,7 +204,7 @@ class Studio:
 
     def _next(self, now: float) -> Seat | None:
         """Whose turn it is; they go to the end of the queue."""
-        for wants in (lambda s: s.quick_due, lambda s: s.full_due and now - s.moved >= REST):
+        for wants in (lambda s: s.quick_due, lambda s: s.full_due and now - s.moved >= REST - 1e-6):
             for seat in self._seats:
                 if seat.asked is not None and wants(seat):
                     self._seats.remove(seat)

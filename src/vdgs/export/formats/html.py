@@ -12,6 +12,7 @@ import html
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -111,9 +112,8 @@ def html_pieces(path: Path) -> Iterator[Gaussians]:
 
 def _of_fixed_colour(scene: Scene) -> Gaussians:
     """All of a scene in memory, without the coefficients that are not shown: 56 bytes each."""
-    parts = [[*piece.tensors().values()][:-1] for piece in scene.pieces()]
-    joined = [torch.cat(tensors) for tensors in zip(*parts, strict=True)]
-    return Gaussians(*joined, torch.zeros(len(joined[0]), 0, 3))
+    parts = [replace(piece, rest=torch.zeros(len(piece), 0, 3)) for piece in scene.pieces()]
+    return Gaussians(**{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()})
 
 
 def _fitting(whole: Gaussians, tried: int, factor: float, page: Page) -> Gaussians:
@@ -207,8 +207,14 @@ def _recorded(rows: UInt32[np.ndarray, "n 8"], factor: float, page: Page) -> str
 
     position, target = factor * np.array(page.position), factor * np.array(page.target)
     away = float(np.linalg.norm(position - target))
-    handler = WebsockMessageHandler()  # of no server: it only holds the list of recordings
-    recording: StateSerializer = handler.get_message_serializer(lambda message: True)
+
+    class Nowhere(WebsockMessageHandler):
+        """Of no server: it only holds the list of recordings."""
+
+        def get_message_buffer(self) -> Any:
+            raise NotImplementedError
+
+    recording: StateSerializer = Nowhere().get_message_serializer(lambda message: True)
     said: list[Any] = [
         messages.SetOrientationMessage("", _UPRIGHT),
         messages.SetCameraUpDirectionMessage((0.0, 0.0, 1.0), initial=True),
