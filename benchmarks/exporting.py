@@ -54,7 +54,7 @@ def made_up(anchors: int) -> tuple[AnchorModel, list[Camera]]:
     log_scales = torch.randn(anchors, 6, generator=generator) * 0.2 + math.log(0.7 * SPACING)
     tensors = Decoder.initial(OFFSETS, True, 0, 0, generator).tensors()
     # Every Gaussian is drawn, and none hides all behind it.
-    tensors["opacity_w2"] *= 0.1
+    tensors["opacity_w2"].zero_()
     tensors["opacity_b2"].fill_(0.2)
     model = AnchorModel(
         Anchors(positions, torch.randn(anchors, FEATURE_SIZE, generator=generator),
