@@ -52,10 +52,14 @@ def made_up(anchors: int) -> tuple[AnchorModel, list[Camera]]:
     row, column = torch.arange(anchors) // side, torch.arange(anchors) % side
     positions = torch.stack([column, row, torch.rand(anchors, generator=generator)], 1).float() * SPACING
     log_scales = torch.randn(anchors, 6, generator=generator) * 0.2 + math.log(0.7 * SPACING)
+    tensors = Decoder.initial(OFFSETS, True, 0, 0, generator).tensors()
+    # Every Gaussian is drawn, and none hides all behind it.
+    tensors["opacity_w2"].zero_()
+    tensors["opacity_b2"].fill_(0.2)
     model = AnchorModel(
         Anchors(positions, torch.randn(anchors, FEATURE_SIZE, generator=generator),
                 0.4 * torch.randn(anchors, OFFSETS, 3, generator=generator), log_scales),
-        Decoder.initial(OFFSETS, True, 0, 0, generator), SPACING, (0.5, 0.5, 0.5), {},
+        Decoder.from_tensors(tensors), SPACING, (0.5, 0.5, 0.5), {},
     )  # fmt: skip
     count = max(4, anchors // ANCHORS_PER_VIEW)
     # A picture holds SEEN_BY / count of the ground: its width at 4 to 3, from one focal length of 400 pixels.

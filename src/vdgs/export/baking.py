@@ -33,7 +33,7 @@ from vdgs.model.world import places, spawned
 #: A splat that makes less of a view than so many pixels did not show there.
 LEAST_PIXELS = 1e-3
 #: Anchors that a thread fits at once.
-ANCHORS_AT_ONCE = 8192
+ANCHORS_AT_ONCE = 4096
 #: Opacities are kept away from 0 and 1, where their logits have no end.
 OPACITY_MARGIN = 1e-4
 
