@@ -49,7 +49,7 @@ class Target:
         what is far from it (choice; docs/findings.md).
         """
         assert self.ground is not None
-        counted = self.counted or max(counted_in(self.mask, self.camera), 1)
+        counted = self.counted or (alpha.numel() if self.mask is None else max(int(self.mask.count_nonzero()), 1))
         root = (1.0 - alpha).clamp(min=0.0).add(NEARLY_OPAQUE).sqrt()
         shown = self.ground.to(alpha.dtype) * (weight / counted)
         return (shown * (root - NEARLY_OPAQUE**0.5)).sum(), shown / (-2.0 * root)

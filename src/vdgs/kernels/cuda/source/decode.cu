@@ -184,7 +184,7 @@ struct Moved {
 // 1 / sqrt(1 - beta2^u) of u = 1, 2, ... updates. `broken` [1] becomes 1 where a gradient is no number: that anchor stays.
 // For the gradients of the decoder, by matrix products: by outputs [v, k], [v, 7k], [v, 3k], hidden layers and by hidden
 // layers [3, v, 32], inputs [v, inputs]; all of these null where nobody wants them.
-extern "C" __global__ void __launch_bounds__(kThreads, 2)
+extern "C" __global__ void __launch_bounds__(kThreads, 1)
 move_anchors(const float* positions, float* features, float* offsets, float* log_scales, float* features_first,
              float* offsets_first, float* log_scales_first, float* features_second, float* offsets_second,
              float* log_scales_second, float features_rate, float offsets_rate, float log_scales_rate, float early,
