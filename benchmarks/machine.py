@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from vdgs.kernels.native.module import cores, isa, supported
+from vdgs.kernels.cores import cores
+from vdgs.kernels.native.module import isa, supported
 
 
 def describe() -> str:

@@ -173,15 +173,34 @@ def test_automatic_iterations_follow_the_number_of_photographs():
 def test_a_newer_version_takes_older_runs_as_they_are():
     """Keys as the first version of them made them, which knew nothing of the settings that came later."""
     settings = {"capture": {"images": None}} | to_dict(MethodConfig())
-    older = {name: dict(section) for name, section in settings.items()}
-    for section, names in SINCE.items():
-        for name in names:
-            del older[section][name]
-    assert stage_keys(settings, "model") == stage_keys(older, "model")
-    for section, names in SINCE.items():
-        for name in names:
-            changed = {**settings, section: {**settings[section], name: "other"}}
-            assert stage_keys(changed, "model") != stage_keys(settings, "model")
+    assert stage_keys(settings, "model") == stage_keys(_without(settings, SINCE), "model")
+    for path in _leaves(SINCE):
+        assert stage_keys(_changed(settings, path), "model") != stage_keys(settings, "model"), path
+
+
+def _leaves(since: dict, above: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    """Where the single settings are in a tree of them."""
+    paths = []
+    for name, value in since.items():
+        paths += _leaves(value, (*above, name)) if isinstance(value, dict) else [(*above, name)]
+    return paths
+
+
+def _without(settings: dict, since: dict) -> dict:
+    """Settings without those of a tree, nor groups of which nothing is left."""
+    kept = {}
+    for name, value in settings.items():
+        known = since.get(name)
+        left = _without(value, known) if isinstance(known, dict) else value
+        if name not in since or (isinstance(known, dict) and left):
+            kept[name] = left
+    return kept
+
+
+def _changed(settings: dict, path: tuple[str, ...]) -> dict:
+    """Settings with another value of one."""
+    name, *below = path
+    return {**settings, name: _changed(settings[name], tuple(below)) if below else "other"}
 
 
 def test_a_ramp_needs_a_frozen_decoder():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -71,7 +73,7 @@ def test_a_view_counts_once_in_a_cycle_at_whatever_resolution() -> None:
     again = share_in_cycle(points, [*cameras, cameras[0], cameras[3].resized(32, 24), cameras[3].resized(16, 12)])
     assert torch.equal(share, again)
     assert torch.equal(share, visibility_of(points, cameras).float() / 7)
-    moved = Camera(**{**cameras[0].__dict__, "cx": cameras[0].cx + 4})
+    moved = replace(cameras[0], cx=cameras[0].cx + 4)
     assert not torch.equal(share, share_in_cycle(points, [*cameras, moved]))
     with pytest.raises(ValueError, match="without cameras"):
         share_in_cycle(points, [])

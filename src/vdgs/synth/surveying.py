@@ -36,7 +36,7 @@ def true_visibility(tracer: Tracer, cameras: list[Camera], places: np.ndarray) -
 
 def _about(cameras: list[Camera], places: np.ndarray) -> list[Camera]:
     """The cameras whose frustum can hold any of the places, by the ball about them: few of many for a single view."""
-    if len(places) == 0:
+    if len(places) == 0 or not cameras:
         return []
     low, high = places.min(axis=0), places.max(axis=0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
