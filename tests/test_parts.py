@@ -101,7 +101,8 @@ def test_the_merged_scene_decodes_each_block_as_it_was_trained():
     for part, model in zip(merged.parts, trained, strict=True):
         assert model is not None
         given, own = part.decoder.tensors(), model.decoder.tensors()
-        assert given.keys() == own.keys() and all(torch.equal(given[name], own[name]) for name in own)
+        assert given.keys() == own.keys()
+        assert all(torch.equal(given[name], own[name]) for name in own)
     frozen, _ = merge(coarse, trained_apart(coarse, own=False), blocks, cameras, MergeConfig())
     assert frozen.parts == ()
 
