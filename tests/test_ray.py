@@ -119,6 +119,10 @@ def test_a_node_that_joins_late_and_cannot_work_on_the_run_is_named_and_avoided(
     source = Path(cli.__file__).parent
     shutil.copytree(source, stranger / "vdgs", ignore=shutil.ignore_patterns("*.so", "__pycache__"))
     (stranger / "vdgs/of_another_version.py").touch()
+    # An installation that leads to its sources by a hook would lead there from that node too.
+    (stranger / "sitecustomize.py").write_text(
+        "import sys\nsys.meta_path[:] = [each for each in sys.meta_path if 'editable' not in type(each).__module__]\n"
+    )
     for name in cluster.names[1:]:
         cluster.remove(name)
     with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
