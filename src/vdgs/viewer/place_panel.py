@@ -36,6 +36,8 @@ class PlacePanel:
         self._measuring = False
         self.clock = time.monotonic
         self._lock = threading.Lock()
+        #: Held while a place is shown: clicks come on several threads, and a folder takes one of them at a time.
+        self._showing = threading.Lock()
         self._last: tuple[float, float, float] | None = None
         self._build_measuring()
 
@@ -59,7 +61,8 @@ class PlacePanel:
             return
         place = visitor.errand(lambda: place_at(visitor.scene, name, position))
         if place is not None:
-            self._show(place)
+            with self._showing:
+                self._show(place)
 
     def _is_double(self, screen: tuple[float, float]) -> bool:
         """Whether this click is the second of two; a third one begins anew."""
