@@ -64,7 +64,7 @@ def run(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def viewer(run):
-    with serve(open_run(run), "127.0.0.1", free_port("127.0.0.1", None), Console(file=sys.stderr)) as opened:
+    with serve(open_run(run), "127.0.0.1", None, Console(file=sys.stderr)) as opened:
         yield opened
 
 
@@ -263,7 +263,7 @@ def test_nothing_of_the_machine_is_reached(viewer):
 
 @quiet
 def test_others_need_the_token(run):
-    with serve(open_run(run), "0.0.0.0", free_port("0.0.0.0", None), Console(file=sys.stderr)) as viewer:
+    with serve(open_run(run), "0.0.0.0", None, Console(file=sys.stderr)) as viewer:
         address, token = viewer.door.address(), viewer.door.token
         assert token is not None
         assert len(token) >= 32

@@ -50,14 +50,14 @@ def view_run(asked: ViewRequest, console: Console, opened: Callable[[str], None]
     share_arenas()
     # Visitors may vanish while a picture is on its way to them.
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
-    port = free_port(asked.host, asked.port)
+    free_port(asked.host, asked.port)  # said before the run is opened
     run = open_or_last_saved(asked.run, asked.model, asked.device)
     if run.caution:
         console.print(f"[yellow]warning[/] {run.caution}", highlight=False)
     # Ctrl-C is how it ends, not how it fails, from the moment that the address is printed. Asked for anew: what reads
     # captures has set a handler of its own.
     ending = contextlib.suppress(KeyboardInterrupt, Interrupted)
-    with ending, stop_requests(interrupts=True), serve(run, asked.host, port, console) as viewer:
+    with ending, stop_requests(interrupts=True), serve(run, asked.host, asked.port, console) as viewer:
         console.print(f"{run.line}: {viewer.door.address()}", highlight=False, soft_wrap=True)
         if viewer.door.token:
             console.print("Whoever has this address can see the scene. Ctrl-C ends it.", highlight=False)
@@ -94,11 +94,10 @@ class Viewer:
 
 
 @contextlib.contextmanager
-def serve(run: TrainedRun, host: str, port: int, console: Console) -> Iterator[Viewer]:
-    """A viewer of an opened run on a port, while the context lasts."""
-    door = Door(host, None if is_loopback(host) else secrets.token_urlsafe(24), port)
+def serve(run: TrainedRun, host: str, port: int | None, console: Console) -> Iterator[Viewer]:
+    """A viewer of an opened run on a port (None: the first that is free), while the context lasts."""
     scene, studio = Scene(run), Studio()
-    server = _start(door)
+    door, server = _listening(host, port)
     viewer = Viewer(server, door, scene, studio, {})
     _place_newcomers(server, run)
 
@@ -195,8 +194,22 @@ def free_port(host: str, port: int | None) -> int:
     raise VdgsError(f"--port {port}: cannot be used on {host} ({why}). Give another one.")
 
 
+def _listening(host: str, port: int | None) -> tuple[Door, Any]:
+    """A server that listens, and its door. A port that another program takes between the look and the start is passed
+    over, unless it was asked for: VdgsError then."""
+    token = None if is_loopback(host) else secrets.token_urlsafe(24)
+    for _ in range(TRIED_PORTS):
+        door = Door(host, token, free_port(host, port))
+        server = _start(door)
+        if server is not None:
+            return door, server
+        if port is not None:
+            break
+    raise VdgsError(f"--port {door.port}: was taken meanwhile. Give the command again.")
+
+
 def _start(door: Door) -> Any:
-    """A viser server behind a door."""
+    """A viser server behind a door; None if its port was taken meanwhile."""
     import viser
     import websockets.asyncio.server as sockets
 
@@ -221,8 +234,9 @@ def _start(door: Door) -> Any:
     finally:
         sockets.serve = unguarded  # type: ignore[misc]
     if not guarded or server.get_port() != door.port:
-        server.stop()
-        raise VdgsError(f"--port {door.port}: was taken meanwhile. Give the command again.")
+        with contextlib.redirect_stdout(io.StringIO()):  # it says that it stopped
+            server.stop()
+        return None
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
     server.gui.set_panel_label("vdgs")
     return server
