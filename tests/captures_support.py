@@ -51,6 +51,12 @@ def look_down(position: np.ndarray, tilt_deg: float = 0.0, yaw_deg: float = 0.0)
     return pose
 
 
+def camera_at(x: float, y: float, z: float = 4.0, tilt: float = 0.0, yaw: float = 0.0, width: int = 64) -> Camera:
+    """A camera of 4 to 3 and 53° across at a place, looking down but for its tilt (degrees)."""
+    height = width * 3 // 4
+    return Camera(look_down(np.array([x, y, z]), tilt, yaw), width, width, width / 2, height / 2, width, height)
+
+
 def tiny_scene(
     columns: int = 4, rows: int = 3, width: int = 64, height: int = 48, altitude: float = 10.0,
     points: int = 400, seed: int = 0,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
@@ -24,46 +25,56 @@ TURNED_DEG = 3.0
 MARK_WRONG_PX = 8.0
 
 
-def facts_of(
-    model: pycolmap.Reconstruction,
-    prepared: Prepared,
-    kinds: Sequence[Kind],
-    placed: Placed | None,
-    origin: tuple[float, float, float] | None,
-    *,
-    survey: tuple[SurveyFacts, ...],
-    left_out: Sequence[LeftOut],
-    components: Sequence[int],
-    pairs: int,
-    held: tuple[bool, str],
-    seconds: float,
-) -> ReconstructionFacts:
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What the steps of a reconstruction left beside the model, which lies where it belongs."""
+
+    #: Kinds of camera, as the features were found with.
+    kinds: Sequence[Kind]
+    #: How the model was placed by positions, and where its origin is (latitude, longitude, altitude); None: it was not.
+    placed: Placed | None
+    origin: tuple[float, float, float] | None
+    #: Surveyed points and how far off the model has them.
+    survey: tuple[SurveyFacts, ...]
+    left_out: Sequence[LeftOut]
+    #: Photographs of each part that came out, the largest first.
+    components: Sequence[int]
+    #: Pairs of photographs that were compared.
+    pairs: int
+    #: Whether the focal lengths of EXIF were held, and why.
+    held: tuple[bool, str]
+    seconds: float
+
+
+def facts_of(model: pycolmap.Reconstruction, prepared: Prepared, outcome: Outcome) -> ReconstructionFacts:
     """The facts of a model that lies where it belongs."""
+    placed, held = outcome.placed, outcome.held
     collection, positions, look = prepared.collection, prepared.positions, prepared.look
     images = [image for image in model.images.values() if image.has_pose]
     metric = placed is not None
     height = _height(model, images) if metric else None
     forwards = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
     tilt = float(np.median(np.degrees(np.arccos(np.clip(-forwards[:, 2], -1, 1))))) if metric else None
-    cameras = _cameras(model, kinds)
+    cameras = _cameras(model, outcome.kinds)
     turned = tilt_against_attitudes(model, collection.photographs) if metric else None
     georeferenced = placed.how if placed else f"none: {_why_not(positions)}; scale, north and up are not known"
     warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned)]
-    warnings += _survey_warnings(survey)
+    warnings += _survey_warnings(outcome.survey)
     if not metric:
         warnings.append(f"not georeferenced ({_why_not(positions)}): the scale of the scene is arbitrary.")
     return ReconstructionFacts(
         found=len(collection.photographs) + len(collection.left_out), registered=len(images),
-        components=tuple(components), pairs=pairs, points=model.num_points3D(),
+        components=tuple(outcome.components), pairs=outcome.pairs, points=model.num_points3D(),
         track_length=float(model.compute_mean_track_length()),
         reprojection_px=float(model.compute_mean_reprojection_error()), georeferenced=georeferenced,
-        altitude_reference=_altitudes(prepared) if metric else "", origin=origin,
+        altitude_reference=_altitudes(prepared) if metric else "", origin=outcome.origin,
         residual_rms_m=_rms(placed), positions_left_out=int((~placed.inliers).sum()) if placed else 0,
         focal_held=held[0], focal_reason=held[1], height_m=height, recorded_height_m=look.height_m, tilt_deg=tilt,
         attitude_difference_deg=turned, cameras=cameras,
-        photographs=_photographs(collection, positions, placed, left_out), warnings=tuple(warnings),
-        advice=tuple(_advice(look, held[0], len(images), len(collection.photographs), metric)), seconds=seconds,
-        survey=survey,
+        photographs=_photographs(collection, positions, placed, outcome.left_out), warnings=tuple(warnings),
+        advice=tuple(_advice(look, held[0], len(images), len(collection.photographs), metric)),
+        seconds=outcome.seconds,
+        survey=outcome.survey,
     )  # fmt: skip
 
 

@@ -29,7 +29,7 @@ from vdgs.settings.plain import to_dict
 from vdgs.settings.sfm import SfmRequest
 from vdgs.sfm import aligning, features, mapping, matching, surveying, writing
 from vdgs.sfm.collection import LeftOut
-from vdgs.sfm.facts import facts_of, why_left_out
+from vdgs.sfm.facts import Outcome, facts_of, why_left_out
 from vdgs.sfm.figures import draw_positions, draw_residuals
 from vdgs.sfm.preparing import Prepared, check_disk, in_time, prepare, tell
 from vdgs.sfm.telling import tell_facts
@@ -117,11 +117,11 @@ def _steps(prepared: Prepared, work: Work, keys: dict[str, str], console: Consol
     )
     placed, origin, surveyed = _place(models[0], prepared, held[0])
     _write(prepared, work, models[0], keys["capture"], threads, console)
-    facts = facts_of(
-        models[0], prepared, kinds, placed, origin, survey=surveyed, left_out=left_out,
-        components=[model.num_reg_images() for model in models], pairs=pairs, held=held,
-        seconds=time.monotonic() - began,
+    outcome = Outcome(
+        kinds, placed, origin, surveyed, left_out, [model.num_reg_images() for model in models], pairs, held,
+        time.monotonic() - began,
     )  # fmt: skip
+    facts = facts_of(models[0], prepared, outcome)
     points = aligning.points_of(models[0])
     marks = dict(zip((each.name for each in surveyed), _places(prepared), strict=False))
     draw_residuals(points, prepared.positions, placed, marks, output / FIGURE)
