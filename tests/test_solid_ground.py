@@ -21,7 +21,7 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.frustum import project
 from vdgs.model.ground import CELLS, at_size, known_cells, solid_cells
 from vdgs.model.render import decode_view, render
-from vdgs.model.sizes import REACH, SPAN, largest_log_scales
+from vdgs.model.sizes import REACH, SPAN, SPREAD, largest_log_scales
 from vdgs.runs.ground import ground_of
 from vdgs.settings.method import AnchorConfig, BlockConfig, GrowthConfig, LossConfig
 from vdgs.training import Stage, train
@@ -216,22 +216,23 @@ def test_an_anchor_in_the_centre_of_a_camera_has_a_size_that_can_be_trained():
     assert largest_log_scales(torch.tensor([[0.0, 0.0, 20.0]]), [camera_at()]).isfinite().all()
 
 
-def test_training_leaves_no_gaussian_larger_than_its_bound():
-    """Scales are driven up by a loss that wants them large; anchors that grow are bounded too."""
+def test_training_leaves_no_gaussian_larger_than_its_bound_nor_far_from_its_anchor():
+    """Scales begin too large, of Gaussians and of the unit of their offsets; anchors that grow are bounded too."""
     stage, state = block_stage(BlockConfig())
     growth = GrowthConfig(interval=10, statistics_from=0, start=10, until=0.8, threshold=1e-6, gate=0.05)
     config = replace(stage.config, iterations=47, average=0.1, growth=growth)
     cameras = Photographs().cameras
     stage = replace(stage, config=config, largest=lambda places: largest_log_scales(places, cameras) - 3.0)
     state.largest = stage.largest_at(state.anchors.positions)
-    state.anchors.log_scales[:, 3:] += 2.0
+    state.anchors.log_scales.add_(4.0)
     before = len(state.anchors)
     train(state, stage, stop=lambda: False, after_step=lambda *_: None)
     anchors, decoder = state.result()
     assert len(anchors) != before
     bound = largest_log_scales(anchors.positions, cameras) - 3.0
-    assert (anchors.log_scales[:, 3:] <= bound[:, None] + 1e-5).all()
-    assert (anchors.log_scales[:, 3:] > bound[:, None] - 0.5).any()
+    for scales, most in ((anchors.log_scales[:, :3], bound + math.log(SPREAD)), (anchors.log_scales[:, 3:], bound)):
+        assert (scales <= most[:, None] + 1e-5).all()
+        assert (scales > most[:, None] - 0.5).any()
     model = AnchorModel(anchors, decoder, stage.voxel, (0.0, 0.0, 0.0), {})
     for camera in cameras:
         rows, splats = decode_view(model, camera)

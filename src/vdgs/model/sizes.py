@@ -1,9 +1,13 @@
-"""How large a Gaussian may be: no larger than the pictures that train it can show.
+"""How large a Gaussian may be, and how far from its anchor: no larger than the pictures that train it can show.
 
 A Gaussian that spans a whole picture and reaches beyond it is held in place by nothing: its edges lie outside of all
 photographs, and seen from between the cameras it hangs as a veil in front of everything. Rule (choice): in the picture
 of any training camera that holds the anchor's place, the ellipse within which one of its Gaussians is drawn at all
 (alpha of at least 1/255, at full opacity) is no longer than `SPAN` of the longer side.
+
+The three scales that are the unit of an anchor's offsets may be `SPREAD` times that. Nothing else keeps Gaussians about
+their anchor, where visibility, blocks, culling and growth take them to be. Unbounded, a few anchors of every real scene
+strew theirs over all of it, where they hang as patches in the colours of somewhere else.
 """
 
 from __future__ import annotations
@@ -26,6 +30,9 @@ from vdgs.model.groups import Groups
 #: its anchor, and a view nearer than all cameras. With larger bounds, views of a town held some that were larger than
 #: the picture: docs/findings.md).
 SPAN = 0.25
+#: The unit of an anchor's offsets over the largest Gaussian's standard deviation, at most (choice: at 1, ground that
+#: few photographs show stays open; docs/findings.md).
+SPREAD = 4.0
 #: From the middle of a Gaussian of opacity 1 to where it is no longer drawn, in standard deviations.
 REACH = math.sqrt(-2.0 * math.log(ALPHA_MIN))
 

@@ -36,7 +36,7 @@ class AnchorConfig:
     """Also start anchors on ground that cameras see but that holds no sparse points: woods, water, fields (choice)."""
     bound_sizes: bool = True
     """No Gaussian may be longer than a quarter of the pictures that train it: none can hang as a veil before a whole
-    view (choice)."""
+    view. The unit of an anchor's offsets is bounded with them: its Gaussians stay about it (choice)."""
     distance: bool = False
     """Feed the distance between camera and anchor to the decoder too."""
     appearance: Annotated[int, Range(0, 1024)] = 0

@@ -2,9 +2,10 @@
 
 `paper`     the paper's numbers. Where it is silent, or a reading of it leaves a scene that cannot be used, our choices
             stay: gaps are filled and outliers start no anchor, ground is asked to be opaque before a background of the
-            mean colour, Gaussians are bounded in size; cameras are assigned by `coverage`, join their best block, and
-            blocks are topped up; what lies around a block is drawn; the gate of compensated growth is lower where few
-            cameras look, and g is added to means; only anchors that a photograph shows are moved.
+            mean colour, Gaussians are bounded in size and stay about their anchors; cameras are assigned by `coverage`,
+            join their best block, and blocks are topped up; what lies around a block is drawn; the gate of compensated
+            growth is lower where few cameras look, and g is added to means; only anchors that a photograph shows are
+            moved.
 `literal`   none of those. What remains ours has no reading without a choice: the threshold tau, the number of clusters'
             starts, the width of a ring, who owns a place, how volumes are weighted in scenes of another scale.
 `laptop`    a good result in minutes on a CPU; docs/findings.md says what each of its departures brings.
@@ -53,7 +54,7 @@ PRESETS: dict[str, MethodConfig] = {
         block=BlockConfig(
             iterations=0,
             sampling="roots",
-            resolutions=((0.0, 2), (0.3, 1)),
+            resolutions=((0.0, 1),),
             average=0.5,
             crop="pixels",
             offset_rate=2.0,

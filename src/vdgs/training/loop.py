@@ -18,6 +18,7 @@ from vdgs.errors import TrainingDiverged
 from vdgs.kernels import choose
 from vdgs.kernels.types import AnchorSplats, DecoderWeights, SplatGradients, Splats
 from vdgs.model.render import decode_rows, visible_rows
+from vdgs.model.sizes import SPREAD
 from vdgs.training.averaging import Average, counts_in_mean
 from vdgs.training.background import background_at
 from vdgs.training.growing import grow, reorder
@@ -146,9 +147,11 @@ def _move(
 
 @torch.no_grad()
 def _bound_sizes(state: TrainingState) -> None:
-    """Let no Gaussian be larger than pictures can show: the decoder only makes an anchor's scales smaller."""
-    scales = state.anchors.log_scales[:, 3:]
-    torch.minimum(scales, state.largest[:, None], out=scales)
+    """Let no Gaussian be larger than pictures can show (the decoder only makes an anchor's scales smaller), nor an
+    anchor strew them: the unit of its offsets is bounded too."""
+    offsets, sizes = state.anchors.log_scales[:, :3], state.anchors.log_scales[:, 3:]
+    torch.minimum(sizes, state.largest[:, None], out=sizes)
+    torch.minimum(offsets, state.largest[:, None] + math.log(SPREAD), out=offsets)
 
 
 def _average(state: TrainingState) -> None:
