@@ -15,7 +15,8 @@ from test_cuda_compiling import needs_nvrtc
 from vdgs.cameras import Camera
 from vdgs.kernels import native
 from vdgs.kernels.cuda import cache
-from vdgs.kernels.cuda.decode import PROGRAM, PackedCamera, decode
+from vdgs.kernels.cuda.camera import PackedCamera
+from vdgs.kernels.cuda.decode import PROGRAM, decode
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.driver import cuda_driver
 from vdgs.kernels.cuda.launching import Program, read_header

@@ -10,7 +10,8 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels.cuda.decode import ANCHORS_OF_A_BLOCK, PROGRAM, PackedCamera, check_decoder
+from vdgs.kernels.cuda.camera import PackedCamera
+from vdgs.kernels.cuda.decode import ANCHORS_OF_A_BLOCK, PROGRAM, check_decoder
 from vdgs.kernels.cuda.launching import Argument, Program
 from vdgs.kernels.reference.adam import check_updates, tables_on
 from vdgs.kernels.reference.decode_adam import decode_backward_adam as by_torch
