@@ -14,7 +14,7 @@ from decode_scenes import Scene, looking_down, turned
 from test_cuda_compiling import needs_nvrtc
 from vdgs.cameras import Camera
 from vdgs.kernels import native
-from vdgs.kernels.cuda import cache
+from vdgs.kernels.cuda import cache, decode_adam
 from vdgs.kernels.cuda.camera import PackedCamera
 from vdgs.kernels.cuda.decode import PROGRAM, decode
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
@@ -193,6 +193,19 @@ class TestMoving:
         for found, expected in zip((*ours[1], *ours[3]), (*theirs[1], *theirs[3]), strict=True):
             error = float((found - expected).norm() / expected.norm().clamp(min=1e-6))
             assert error < 1e-4, error
+
+    def test_piece_by_piece_anchors_move_to_the_same_bits(self, moving, monkeypatch):
+        """The decoder's gradients are sums of those of pieces."""
+        scene, rows = Scene.random(45, 10), torch.arange(0, 45, 2)
+        whole = moved_by(moving, scene, turned(), rows)
+        monkeypatch.setattr(decode_adam, "PIECE", 9)
+        program = moving.keywords["program"]
+        program.driver.launched.clear()
+        pieces = moved_by(moving, scene, turned(), rows)
+        assert [grid for _, grid, _ in program.driver.launched] == [(2, 1, 1), (2, 1, 1), (1, 1, 1)]
+        assert all(torch.equal(one, other) for one, other in zip(whole[1], pieces[1], strict=True))
+        for one, other in zip(whole[3], pieces[3], strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6 * float(one.abs().max()))
 
     def test_a_frozen_decoder_costs_nothing(self, moving):
         scene, rows = Scene.random(20, 4), torch.arange(20)
