@@ -19,7 +19,7 @@ from vdgs.kernels.cuda.camera import PackedCamera
 from vdgs.kernels.cuda.decode import PROGRAM, decode
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.driver import cuda_driver
-from vdgs.kernels.cuda.launching import Program, read_header
+from vdgs.kernels.cuda.launching import Program, read_header, read_source
 from vdgs.kernels.reference.decode import decode as reference
 from vdgs.kernels.reference.decode_adam import decode_backward_adam as by_reference
 from vdgs.kernels.types import AdamState, AnchorSplats, SplatGradients
@@ -227,6 +227,16 @@ class TestMoving:
             results.append(moved_by(moving, Scene.random(17, 10), turned(), torch.arange(17)))
         assert all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
         assert all(torch.equal(one, other) for one, other in zip(results[0][3], results[1][3], strict=True))
+
+    def test_a_missing_barrier_would_be_noticed(self, tmp_path):
+        """The only one, of warps: it keeps a lane from counting up what others have not read yet."""
+        before, after = read_source(PROGRAM.name).split("__syncwarp();")
+        without = build_on_host(PROGRAM.name, tmp_path, before + after)
+        scene, results = Scene.random(9, 4), []
+        for turns in (0, 1):
+            program = Program(PROGRAM.name, HostDriver(without, turns), PROGRAM.headers)
+            results.append(moved_by(partial(decode_backward_adam, program=program), scene, turned(), torch.arange(9)))
+        assert not all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
 
     def test_states_that_anneal_apart_are_refused(self, moving):
         scene = Scene.random(4, 3)
