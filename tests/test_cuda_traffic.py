@@ -125,7 +125,7 @@ def comparing(program: CountedProgram) -> None:
     torch.autograd.grad(photometric_loss(leaf, target, None, program=program).loss, leaf)
 
 
-def test_the_table(counted, capsys):
+def test_the_table(counted):
     """For people; what must hold is below."""
     pixels, (n, kept) = WIDTH * HEIGHT, counted.culled
     rows: list[tuple[str, str, int, tuple[Bytes, Bytes]]] = [
@@ -151,15 +151,14 @@ def test_the_table(counted, capsys):
         ("SSIM + L1: backward", "pixel", pixels, counted.of("photometric_backward")),
     ]  # fmt: skip
     kinds = [each.name for each in fields(Bytes)]
-    with capsys.disabled():
-        print(
-            f"\n{V} anchors in view, {counted.showing} of them show {counted.splats} splats of {counted.opaque} opaque "
-            f"offsets; {counted.drawn} splats in {counted.entries} entries; {WIDTH}x{HEIGHT} pixels"
-        )
-        print(f"{'bytes read / written':28}{'each':12}" + "".join(f"{kind:>18}" for kind in kinds))
-        for name, unit, count, (read, written) in rows:
-            each = (f"{getattr(read, kind) / count:.0f} / {getattr(written, kind) / count:.0f}" for kind in kinds)
-            print(f"{name:28}{unit:12}" + "".join(f"{cell:>18}" for cell in each))
+    print(
+        f"\n{V} anchors in view, {counted.showing} of them show {counted.splats} splats of {counted.opaque} opaque "
+        f"offsets; {counted.drawn} splats in {counted.entries} entries; {WIDTH}x{HEIGHT} pixels"
+    )
+    print(f"{'bytes read / written':28}{'each':12}" + "".join(f"{kind:>18}" for kind in kinds))
+    for name, unit, count, (read, written) in rows:
+        each = (f"{getattr(read, kind) / count:.0f} / {getattr(written, kind) / count:.0f}" for kind in kinds)
+        print(f"{name:28}{unit:12}" + "".join(f"{cell:>18}" for cell in each))
     assert all(read.once + written.once > 0 for *_, (read, written) in rows)
 
 
