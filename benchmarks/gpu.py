@@ -39,7 +39,8 @@ from vdgs.kernels.gsplat.rasterise import GsplatUnavailable
 
 #: Sources and the headers that they include.
 SOURCES = {
-    "decode.cu": ("gaussian_math.h", "image_formation.h"), "loss.cu": (), "rasterise.cu": ("image_formation.h",),
+    "cull.cu": ("gaussian_math.h", "image_formation.h"), "decode.cu": ("gaussian_math.h", "image_formation.h"),
+    "loss.cu": (), "rasterise.cu": ("image_formation.h",), "statistics.cu": (),
 }  # fmt: skip
 #: How many dB the town may come out better or worse than on the processor: two trainings differ by rounding.
 TOWN_DB = 0.5

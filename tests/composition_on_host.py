@@ -11,11 +11,13 @@ import gsplat_stand_in
 from cuda_on_host import HostDriver, build_on_host
 from vdgs.kernels.composed import rasteriser as choosing
 from vdgs.kernels.cuda import cache, loss
+from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.decode import PROGRAM as DECODE
 from vdgs.kernels.cuda.rasterise import PROGRAM as RASTERISE
+from vdgs.kernels.cuda.statistics import PROGRAM as STATISTICS
 from vdgs.kernels.reference import adam
 
-PROGRAMS = (loss.PROGRAM, RASTERISE, DECODE)
+PROGRAMS = (loss.PROGRAM, RASTERISE, DECODE, CULL, STATISTICS)
 
 
 def build(folder: Path) -> dict[str, HostDriver]:

@@ -224,6 +224,12 @@ inline int __any_sync(unsigned, int mine) {
   return 0;
 }
 
+// For those who watch what threads do: the block that runs, and its thread.
+extern "C" unsigned long long host_block() {
+  return (static_cast<unsigned long long>(blockIdx.z) * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x;
+}
+extern "C" unsigned long long host_thread() { return static_cast<unsigned long long>(host::running - host::fibers.data()); }
+
 #define HOST_KERNEL(name) \
   extern "C" void host_##name(void** arguments) { host::Caller<name>::call(arguments); }
 

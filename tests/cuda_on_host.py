@@ -27,23 +27,31 @@ def host_compiler() -> str | None:
     return next(filter(None, map(shutil.which, filter(None, (os.environ.get("CXX"), "c++", "g++", "clang++")))), None)
 
 
-def build_on_host(source: str, folder: Path, text: str | None = None) -> ctypes.CDLL:
+def build_on_host(source: str, folder: Path, text: str | None = None, counted: bool = False) -> ctypes.CDLL:
     """A source of vdgs.kernels.cuda as a library for the processor; `host_NAME` runs one thread of a kernel.
 
-    `text` is compiled instead of the source's own.
+    `text` is compiled instead of the source's own. `counted`: what it reads and writes can be counted
+    (cuda_traffic.py).
     """
     text = text or read_source(source)
     kernels = re.findall(r'extern "C" __global__ void(?: __launch_bounds__\([\w, ]+\))?\s+(\w+)\(', text)
     assert kernels, f"no kernel in {source}"
     exported = "\n".join(f"HOST_KERNEL({name})" for name in kernels)
     (folder / "host.cpp").write_text(f'#include "cuda_on_host.h"\n{text}\n{exported}\n')
-    library = folder / "host.so"
-    # Fibers jump between stacks, which fortified longjmp takes for an attack.
-    command = [str(host_compiler()), "-std=c++17", "-O1", "-U_FORTIFY_SOURCE", "-fPIC", "-shared"]
-    command += ["-I", str(HERE), "-I", str(SHARED), str(folder / "host.cpp")]
-    done = subprocess.run([*command, "-o", str(library)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    library, built = folder / "host.so", folder / "host.o"
+    # Fibers jump between stacks, which fortified longjmp takes for an attack. Before every access to memory the thread
+    # sanitizer calls a function; its own library, which is not asked for when linking, has other ones.
+    watched = ["-fsanitize=thread"] if counted else []
+    _run_compiler(*watched, "-I", str(HERE), "-I", str(SHARED), "-c", str(folder / "host.cpp"), "-o", str(built))
+    counting = [str(HERE / "cuda_traffic.cpp")] if counted else []
+    _run_compiler("-shared", str(built), *counting, "-o", str(library))
     return ctypes.CDLL(str(library))
+
+
+def _run_compiler(*options: str) -> None:
+    command = [str(host_compiler()), "-std=c++17", "-O1", "-U_FORTIFY_SOURCE", "-fPIC", *options]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 class Stuck(Exception):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 from pathlib import Path
 
 import pytest
@@ -48,12 +49,14 @@ class StandIn:
 
 #: By source: its shared headers and its kernels.
 SOURCES = {
+    "cull.cu": (("gaussian_math.h", "image_formation.h"), {"mark_anchors", "write_rows"}),
     "decode.cu": (("gaussian_math.h", "image_formation.h"), {"decode_anchors", "move_anchors"}),
     "loss.cu": ((), {"photometric_forward", "photometric_backward", "photometric_total"}),
     "rasterise.cu": (
         ("image_formation.h",),
         {"splat_tiles", "splat_entries", "rasterise_forward", "rasterise_backward", "gather_gradients"},
     ),
+    "statistics.cu": ((), {"add_view"}),
 }
 
 
@@ -70,6 +73,15 @@ def test_every_source_compiles_for_every_card_and_spills_nothing(source, archite
     assert all(each.spilled_bytes == 0 for each in found)
     assert all(0 < each.registers <= (255 if each.kernel == "move_anchors" else 64) for each in found)
     assert all(each.shared_bytes <= 16384 for each in found)
+
+
+def test_shared_headers_lean_on_nothing_of_the_processors():
+    """Those who bring vectors of their own include them, not the other way round."""
+    shared = Path(launching.__file__).parents[1] / "shared"
+    names = {path.name for path in shared.glob("*.h")}
+    assert names >= {"gaussian_math.h", "image_formation.h"}
+    for name in names:
+        assert set(re.findall(r'#include "(.*)"', launching.read_header(name))) <= names
 
 
 @needs_nvrtc

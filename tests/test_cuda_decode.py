@@ -14,11 +14,12 @@ from decode_scenes import Scene, looking_down, turned
 from test_cuda_compiling import needs_nvrtc
 from vdgs.cameras import Camera
 from vdgs.kernels import native
-from vdgs.kernels.cuda import cache
-from vdgs.kernels.cuda.decode import PROGRAM, PackedCamera, decode
+from vdgs.kernels.cuda import cache, decode_adam
+from vdgs.kernels.cuda.camera import PackedCamera
+from vdgs.kernels.cuda.decode import PROGRAM, decode
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.driver import cuda_driver
-from vdgs.kernels.cuda.launching import Program, read_header
+from vdgs.kernels.cuda.launching import Program, read_header, read_source
 from vdgs.kernels.reference.decode import decode as reference
 from vdgs.kernels.reference.decode_adam import decode_backward_adam as by_reference
 from vdgs.kernels.types import AdamState, AnchorSplats, SplatGradients
@@ -193,6 +194,19 @@ class TestMoving:
             error = float((found - expected).norm() / expected.norm().clamp(min=1e-6))
             assert error < 1e-4, error
 
+    def test_piece_by_piece_anchors_move_to_the_same_bits(self, moving, monkeypatch):
+        """The decoder's gradients are sums of those of pieces."""
+        scene, rows = Scene.random(45, 10), torch.arange(0, 45, 2)
+        whole = moved_by(moving, scene, turned(), rows)
+        monkeypatch.setattr(decode_adam, "PIECE", 9)
+        program = moving.keywords["program"]
+        program.driver.launched.clear()
+        pieces = moved_by(moving, scene, turned(), rows)
+        assert [grid for _, grid, _ in program.driver.launched] == [(2, 1, 1), (2, 1, 1), (1, 1, 1)]
+        assert all(torch.equal(one, other) for one, other in zip(whole[1], pieces[1], strict=True))
+        for one, other in zip(whole[3], pieces[3], strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6 * float(one.abs().max()))
+
     def test_a_frozen_decoder_costs_nothing(self, moving):
         scene, rows = Scene.random(20, 4), torch.arange(20)
         assert moved_by(moving, scene, turned(), rows, frozen=True)[3] is None
@@ -213,6 +227,16 @@ class TestMoving:
             results.append(moved_by(moving, Scene.random(17, 10), turned(), torch.arange(17)))
         assert all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
         assert all(torch.equal(one, other) for one, other in zip(results[0][3], results[1][3], strict=True))
+
+    def test_a_missing_barrier_would_be_noticed(self, tmp_path):
+        """The only one, of warps: it keeps a lane from counting up what others have not read yet."""
+        before, after = read_source(PROGRAM.name).split("__syncwarp();")
+        without = build_on_host(PROGRAM.name, tmp_path, before + after)
+        scene, results = Scene.random(9, 4), []
+        for turns in (0, 1):
+            program = Program(PROGRAM.name, HostDriver(without, turns), PROGRAM.headers)
+            results.append(moved_by(partial(decode_backward_adam, program=program), scene, turned(), torch.arange(9)))
+        assert not all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
 
     def test_states_that_anneal_apart_are_refused(self, moving):
         scene = Scene.random(4, 3)

@@ -49,7 +49,9 @@ def test_all_of_it_runs_and_agrees(gpu, drivers, tmp_path, monkeypatch, capsys):
     assert code == 0, said.err
     for operation in OPERATIONS:
         assert f"{operation}: " in said.out or f"{operation} by cuda: " in said.out
-    for line in ("rasterise_vjp by gsplat: gradient means_px", "rasterise_backward", "a generated town", "cuda   "):
+    for kernel in ("rasterise_backward", "mark_anchors", "write_rows", "add_view", "move_anchors"):
+        assert f"{kernel:22}" in said.out
+    for line in ("rasterise_vjp by gsplat: gradient means_px", "a generated town", "cuda   "):
         assert line in said.out
     assert "gsplat  40x32" in said.out
     assert "cuda    40x32" in said.out

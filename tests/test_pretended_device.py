@@ -55,7 +55,7 @@ def trained_on(device: torch.device, steps: int, **changes: Any) -> TrainingStat
 #: What a step waits for: how many anchors are visible, how many splats they show, how many tiles these reach, whether
 #: the loss is a number, and whether the gradients were.
 WAITS = {
-    "kernels/reference/cull.py: cull: nonzero": 1,
+    "kernels/cuda/cull.py: cull: _local_scalar_dense": 1,
     "kernels/cuda/decode.py: decode: _local_scalar_dense": 1,
     "training/loop.py: train_step: tolist": 1,
     "training/loop.py: _move: _local_scalar_dense": 1,
@@ -99,7 +99,7 @@ def test_a_step_waits_for_the_card_only_where_it_must(rasteriser):
         # gsplat's wait of this kind is in its compiled part.
         tiles = {"kernels/cuda/rasterise.py: _entries: _local_scalar_dense": 1} if rasteriser == "cuda" else {}
         surroundings = {
-            "kernels/reference/cull.py: cull: nonzero": 2,
+            "kernels/cuda/cull.py: cull: _local_scalar_dense": 2,
             "kernels/cuda/decode.py: decode: _local_scalar_dense": 2,
         }
         assert dict(waits) == WAITS | tiles | surroundings

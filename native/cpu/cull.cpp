@@ -2,29 +2,13 @@
 #include <vector>
 
 #include "bindings.h"
-#include "gaussian_math.h"
+#include "gaussian.h"
 #include "threads.h"
 
 namespace vdgs {
 namespace {
 
 constexpr int64_t kPiece = 8192;
-
-// Squared distance in px outside of 0 .. size, and the factor from world to px (squared) at its bound.
-struct Side {
-  F16 outside_squared, stretch;
-};
-
-VDGS_INLINE Side look(float focal, float centre, float size, float limit, F16 position, F16 inverse_z,
-                      bool orthographic) {
-  const F16 zero = splat(0.0f);
-  const F16 slope = position * inverse_z;
-  const F16 pixel = fma(splat(focal), slope, splat(centre));
-  const F16 outside = max(max(zero - pixel, pixel - splat(size)), zero);
-  const F16 bounded = orthographic ? zero : min(abs(slope), splat(limit));
-  const F16 scale = splat(focal) * inverse_z;
-  return {outside * outside, scale * scale * fma(bounded, bounded, splat(1.0f))};
-}
 
 // The largest of the first three log-scales of each of sixteen anchors.
 VDGS_INLINE F16 largest_log_scale(const float* log_scales) {
@@ -41,17 +25,11 @@ VDGS_INLINE unsigned visible(const Camera& camera, const float* positions, const
   Vec3<F16> x;
   load3(positions, x.x, x.y, x.z);
   const Vec3<F16> local = into_camera(camera, x);
-  const M16 before = gt(local.z, splat(camera.near));
-  if (none(before)) return 0;
-  const F16 inverse_z = camera.orthographic ? splat(1.0f) : splat(1.0f) / local.z;
-  const Side sx = look(camera.fx, camera.cx, camera.width, camera.limit_x, local.x, inverse_z, camera.orthographic);
-  const Side sy = look(camera.fy, camera.cy, camera.height, camera.limit_y, local.y, inverse_z, camera.orthographic);
-  const F16 least = splat(9.0f * kDilationPx2);
-  const M16 surely = before & le(sx.outside_squared, least) & le(sy.outside_squared, least);
-  if (bits(surely) == bits(before)) return bits(surely);  // most batches of a sorted model: no scales needed
-  const F16 reach = splat(9.0f) * exp(splat(2.0f) * largest_log_scale(log_scales));
-  return bits(before & le(sx.outside_squared, fma(reach, sx.stretch, least)) &
-              le(sy.outside_squared, fma(reach, sy.stretch, least)));
+  if (none(gt(local.z, splat(camera.near)))) return 0;
+  const Sight<F16> sight = sight_of(camera, local);
+  const M16 surely = sight.surely();
+  if (bits(surely) == bits(sight.before)) return bits(surely);  // most batches of a sorted model: no scales needed
+  return bits(sight.holds(largest_log_scale(log_scales)));
 }
 
 // The last, incomplete sixteen: copied, so that nothing is read behind the end.

@@ -1,6 +1,6 @@
 // Projection of free Gaussians (not spawned by anchors), sixteen at a time.
 #include "bindings.h"
-#include "gaussian_math.h"
+#include "gaussian.h"
 #include "threads.h"
 
 namespace vdgs {

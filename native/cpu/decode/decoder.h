@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <memory>
 
-#include "gaussian_math.h"
+#include "gaussian.h"
 #include "cpu/products.h"
 
 namespace vdgs {

@@ -110,6 +110,8 @@ OPERATIONS = tuple(sorted(name for name in vars(Operations) if not name.startswi
 #: (`reference`), own kernels (`cuda`) or gsplat's. Of several the first that can be used; gsplat cannot tell median
 #: depth, so that pictures with depth are always drawn by the own kernels.
 ON_A_CARD: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATIONS, ("reference",)) | {
+    "add_view_statistics": ("cuda",),
+    "cull": ("cuda",),
     "decode": ("cuda",),
     "decode_backward_adam": ("cuda",),
     "photometric_loss": ("cuda",),

@@ -4,15 +4,13 @@
 """
 
 from vdgs.kernels.composed.rasteriser import rasterise, rasterise_vjp
-from vdgs.kernels.cuda import decode, decode_backward_adam, photometric_loss
+from vdgs.kernels.cuda import add_view_statistics, cull, decode, decode_backward_adam, photometric_loss
 from vdgs.kernels.reference import (
     adam_rows,
-    add_view_statistics,
     cell_centres,
     cell_keys,
     contains,
     count_visibility,
-    cull,
     group_cells,
     group_max,
     mark_visible,

@@ -3,9 +3,19 @@
 Not all operations of `vdgs.kernels` are here: `vdgs.kernels.composed` adds what a card needs besides.
 """
 
+from vdgs.kernels.cuda.cull import cull
 from vdgs.kernels.cuda.decode import decode
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.loss import photometric_loss
 from vdgs.kernels.cuda.rasterise import rasterise, rasterise_vjp
+from vdgs.kernels.cuda.statistics import add_view_statistics
 
-__all__ = ["decode", "decode_backward_adam", "photometric_loss", "rasterise", "rasterise_vjp"]
+__all__ = [
+    "add_view_statistics",
+    "cull",
+    "decode",
+    "decode_backward_adam",
+    "photometric_loss",
+    "rasterise",
+    "rasterise_vjp",
+]

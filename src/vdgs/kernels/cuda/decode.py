@@ -10,35 +10,14 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.kernels.constants import FRUSTUM_MARGIN
+from vdgs.kernels.cuda.camera import PackedCamera
 from vdgs.kernels.cuda.launching import Argument, Program
 from vdgs.kernels.reference.decode import decode as by_torch
-from vdgs.kernels.types import FEATURE_SIZE, AnchorSplats, DecoderWeights
+from vdgs.kernels.types import FEATURE_SIZE, HIDDEN_SIZE, AnchorSplats, DecoderWeights, HeadWeights
 
 #: Warps of a block, each with an anchor: kWarps of the source. A lane an offset.
 ANCHORS_OF_A_BLOCK, MOST_OFFSETS = 8, 32
 PROGRAM = Program("decode.cu", headers=("gaussian_math.h", "image_formation.h"))
-
-
-class PackedCamera(ctypes.Structure):
-    """`Camera` of gaussian_math.h, field by field."""
-
-    _fields_ = (
-        *((name, 3 * ctypes.c_float) for name in ("right", "down", "forward", "centre")),
-        *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "width", "height", "near", "limit_x", "limit_y")),
-        ("orthographic", ctypes.c_bool),
-    )  # fmt: skip
-
-    @staticmethod
-    def of(camera: Camera) -> PackedCamera:
-        """As `unpack_camera` of gaussian_math.h makes it of the same numbers."""
-        numbers = [float(each) for each in camera.packed]
-        axes, translation = [numbers[:3], numbers[3:6], numbers[6:9]], numbers[9:12]
-        centre = [-sum(axis[i] * shift for axis, shift in zip(axes, translation, strict=True)) for i in range(3)]
-        fx, fy, cx, cy, width, height, orthographic, near, whole_width, whole_height = numbers[12:]
-        limits = (FRUSTUM_MARGIN * 0.5 * side / focal for side, focal in ((whole_width, fx), (whole_height, fy)))
-        vectors = (tuple(vector) for vector in (*axes, centre))
-        return PackedCamera(*vectors, fx, fy, cx, cy, width, height, near, *limits, bool(orthographic))
 
 
 def decode(
@@ -63,8 +42,7 @@ def decode(
         return by_torch(*anchors, weights, camera, rows)
     k, inputs = offsets.shape[1], weights.opacity.w1.shape[1]
     check_decoder(k, weights, anchors)
-    # Neighbouring lanes read neighbouring weights.
-    heads = [t.detach().t().contiguous() if t.ndim == 2 else t.detach().contiguous() for t in weights.tensors()]
+    heads = [tensor for head in (weights.opacity, weights.covariance, weights.colour) for tensor in by_lanes(head, k)]
     count = len(positions) if rows is None else len(rows)
     given: list[Argument] = [
         *(t.detach().contiguous() for t in anchors), *heads, PackedCamera.of(camera),
@@ -72,19 +50,27 @@ def decode(
         ctypes.c_int(inputs == FEATURE_SIZE + 4),
     ]  # fmt: skip
     grid, block = (-(-count // ANCHORS_OF_A_BLOCK),), (32 * ANCHORS_OF_A_BLOCK,)
-    counts = positions.new_empty(count, dtype=torch.int64)
-    program.launch("decode_anchors", grid, block, *given, None, counts, *[None] * 7)
-    ends = counts.cumsum(0)
+    shown, counts = (positions.new_empty(count, dtype=torch.int32) for _ in range(2))
+    program.launch("decode_anchors", grid, block, *given, shown, counts, *[None] * 8)
+    ends = counts.cumsum(0, dtype=torch.int32)
     m = int(ends[-1]) if count else 0
     empty = positions.new_empty
     splats = AnchorSplats(
         empty(m, 2), empty(m, 3), empty(m), empty(m, 3), empty(m), empty(m), empty(m, dtype=torch.int32)
     )
     program.launch(
-        "decode_anchors", grid, block, *given, ends, None, splats.means_px, splats.conics, splats.depths,
+        "decode_anchors", grid, block, *given, shown, None, ends, splats.means_px, splats.conics, splats.depths,
         splats.colours, splats.opacities, splats.volumes, splats.source,
     )  # fmt: skip
     return splats
+
+
+def by_lanes(head: HeadWeights, k: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """A head as the kernels take it forwards, so that neighbouring lanes read neighbouring numbers: w1 [inputs, 32],
+    b1 [32], w2 [32, c, k], b2 [c, k], with c outputs an offset."""
+    w1, b1, w2, b2 = (tensor.detach() for tensor in head.tensors())
+    by_offset = w2.reshape(k, -1, HIDDEN_SIZE).permute(2, 1, 0), b2.reshape(k, -1).t()
+    return w1.t().contiguous(), b1.contiguous(), by_offset[0].contiguous(), by_offset[1].contiguous()
 
 
 def check_decoder(k: int, weights: DecoderWeights, anchors: Sequence[Tensor]) -> None:

@@ -1,23 +1,24 @@
 // The mathematics of image formation, written once: the projection of a Gaussian, what an anchor
 // spawns, and their derivatives.
 //
-// Every function is a template over the scalar T: `float` for one Gaussian, or `F16` (simd.h) for
-// sixteen at once. No containers, no exceptions, no standard library beyond scalar functions, so that
-// the same text compiles for a GPU. The torch twins in src/vdgs/kernels/reference are the oracle.
+// Every function is a template over the scalar T: `float` for one Gaussian, or a vector of the processor's that
+// brings the operations below with it (native/gaussian.h: sixteen at once). No containers, no exceptions, no
+// standard library beyond scalar functions, so that the same text compiles for a GPU. The torch twins in
+// src/vdgs/kernels/reference are the oracle.
 #pragma once
 
 #if defined(__CUDACC__) || defined(__CUDACC_RTC__)
 #define VDGS_FN __host__ __device__ __forceinline__
 #else
 #define VDGS_FN inline __attribute__((always_inline))
-#include "simd/math.h"
+#include <math.h>
 #endif
 
 #include "image_formation.h"
 
 namespace vdgs {
 
-// The operations of simd.h for a plain float.
+// The operations of a scalar, for a plain float.
 VDGS_FN float fma(float a, float b, float c) { return a * b + c; }
 VDGS_FN float sqrt(float a) { return ::sqrtf(a); }
 VDGS_FN float abs(float a) { return ::fabsf(a); }
@@ -38,12 +39,6 @@ template <>
 struct Constant<float> {
   static VDGS_FN float of(float a) { return a; }
 };
-#ifdef VDGS_INLINE
-template <>
-struct Constant<F16> {
-  static VDGS_FN F16 of(float a) { return splat(a); }
-};
-#endif
 template <class T>
 VDGS_FN T constant(float a) {
   return Constant<T>::of(a);
@@ -153,6 +148,55 @@ VDGS_FN Quaternion<T> rotation_gradient(Quaternion<T> q, const Columns<T>& g) {
           two * (q.y * xy + q.z * xz + q.w * wx - two * q.x * (g.b.y + g.c.z)),
           two * (q.x * xy + q.z * yz + q.w * wy - two * q.y * (g.a.x + g.c.z)),
           two * (q.x * xz + q.y * yz + q.w * wz - two * q.z * (g.a.x + g.b.y))};
+}
+
+// ---------------------------------------------------------------------------------------- culling
+
+// Along one side of the image: the squared distance in px of a centre from 0 .. size, and the factor (squared) from
+// world to px at its bound.
+template <class T>
+struct Reach {
+  T outside_squared, stretch;
+};
+
+template <class T>
+VDGS_FN Reach<T> reach_of(float focal, float centre, float size, float limit, T position, T inverse_z,
+                          bool orthographic) {
+  const T zero = constant<T>(0.0f);
+  const T slope = position * inverse_z;
+  const T pixel = fma(constant<T>(focal), slope, constant<T>(centre));
+  const T outside = max(max(zero - pixel, pixel - constant<T>(size)), zero);
+  const T bounded = orthographic ? zero : min(abs(slope), constant<T>(limit));
+  const T scale = constant<T>(focal) * inverse_z;
+  return {outside * outside, scale * scale * fma(bounded, bounded, constant<T>(1.0f))};
+}
+
+// Where a centre lies beside the image; the bound is explained in src/vdgs/kernels/reference/cull.py.
+template <class T>
+struct Sight {
+  Reach<T> x, y;
+  Mask<T> before;  // the camera
+
+  // Whether a Gaussian of any size is kept: the dilation alone reaches the image.
+  VDGS_FN Mask<T> surely() const {
+    const T least = constant<T>(9.0f * kDilationPx2);
+    return before & le(x.outside_squared, least) & le(y.outside_squared, least);
+  }
+  // Whether one is kept whose largest scale is exp(log_scale).
+  VDGS_FN Mask<T> holds(T log_scale) const {
+    const T least = constant<T>(9.0f * kDilationPx2), reach = constant<T>(9.0f) * exp(constant<T>(2.0f) * log_scale);
+    return before & le(x.outside_squared, fma(reach, x.stretch, least)) &
+           le(y.outside_squared, fma(reach, y.stretch, least));
+  }
+};
+
+// Of a centre in the camera's axes.
+template <class T>
+VDGS_FN Sight<T> sight_of(const Camera& camera, Vec3<T> local) {
+  const T inverse_z = camera.orthographic ? constant<T>(1.0f) : constant<T>(1.0f) / local.z;
+  return {reach_of(camera.fx, camera.cx, camera.width, camera.limit_x, local.x, inverse_z, camera.orthographic),
+          reach_of(camera.fy, camera.cy, camera.height, camera.limit_y, local.y, inverse_z, camera.orthographic),
+          gt(local.z, constant<T>(camera.near))};
 }
 
 // ---------------------------------------------------------------------------------------- projection

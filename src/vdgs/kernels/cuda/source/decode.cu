@@ -1,12 +1,11 @@
 // Anchors to splats in one step: vdgs.kernels.reference.decode on a GPU, without autograd.
 //
-// A warp an anchor: 32 lanes are the 32 units of a hidden layer, and then up to 32 offsets. What an anchor is made of is
-// read once, and only splats are written: hidden layers, opacities, covariances and Gaussians never leave the registers.
-// Opacity comes first; the other heads are asked only where an offset is opaque. Projection and spawning are
-// gaussian_math.h, which the processor uses too.
+// A warp an anchor: 32 lanes are the 32 units of a hidden layer, and then up to 32 offsets. Only splats are written: hidden
+// layers, opacities, covariances and Gaussians never leave the registers. Opacity comes first; the other heads are asked
+// only where an offset is opaque. Projection and spawning are gaussian_math.h, which the processor uses too.
 //
-// It runs twice: first to count the splats of each anchor, then, once there is room for them, to write them behind those
-// of the anchors before. Results are the same bits every time.
+// It runs twice: first to say which offsets of each anchor show, then, once there is room, to write their splats behind
+// those of the anchors before, without reading what shows nothing. Results are the same bits every time.
 #include "gaussian_math.h"
 
 namespace {
@@ -20,12 +19,10 @@ constexpr unsigned kAllLanes = 0xffffffffu;
 constexpr int kFeatures = 32;
 constexpr int kHidden = kWarp;
 
-// One MLP. Weights lie so that neighbouring lanes read neighbouring numbers: w1 [inputs, 32], w2 [32, outputs].
+// One MLP, c outputs an offset. Weights lie so that neighbouring lanes read neighbouring numbers: w1 [inputs, 32], w2
+// [32, c, k], b2 [c, k].
 struct Head {
-  const float* w1;
-  const float* b1;
-  const float* w2;
-  const float* b2;
+  const float *w1, *b1, *w2, *b2;
 };
 
 // What a head sees: a feature each lane, and what all of them know.
@@ -50,15 +47,16 @@ __device__ float hidden_of(const Head& head, const Inputs& inputs, bool with_dis
   return fmaxf(sum, 0.0f);
 }
 
-// Outputs `first` ... of a head, which differ from lane to lane; lanes that want none still lend their unit.
+// Outputs of a head for the offset of each lane; lanes that want none still lend their unit.
 template <int count>
-__device__ void outputs_of(const Head& head, float hidden, int outputs, int first, bool wanted, float (&out)[count]) {
-  for (int c = 0; c < count; ++c) out[c] = wanted ? head.b2[first + c] : 0.0f;
+__device__ void outputs_of(const Head& head, float hidden, int k, bool wanted, float (&out)[count]) {
+  const int lane = threadIdx.x % kWarp;
+  for (int c = 0; c < count; ++c) out[c] = wanted ? head.b2[c * k + lane] : 0.0f;
+  const float* weight = head.w2 + lane;
   for (int j = 0; j < kHidden; ++j) {
     const float unit = __shfl_sync(kAllLanes, hidden, j);
-    for (int c = 0; c < count; ++c) {
-      if (wanted) out[c] = fmaf(head.w2[j * outputs + first + c], unit, out[c]);
-    }
+    for (int c = 0; c < count; ++c, weight += k)
+      if (wanted) out[c] = fmaf(*weight, unit, out[c]);
   }
 }
 
@@ -70,18 +68,22 @@ __device__ Vec3<float> exp_of(Vec3<float> a) { return {expf(a.x), expf(a.y), exp
 
 }  // namespace
 
-// A warp an anchor of `rows` [v] (null: all). `ends` [v]: where the splats of each anchor end; null: they are counted
-// instead, into `counts` [v], and nothing else is written.
+// A warp an anchor of `rows` [v] (null: all). Without `ends`, the offsets that each anchor shows are written into `shown`
+// [v], a bit each, and how many they are into `counts` [v], and nothing else. With them (`ends` [v]: where the splats of
+// each anchor end), those offsets become splats.
 extern "C" __global__ void __launch_bounds__(kThreads)
 decode_anchors(const float* positions, const float* features, const float* offsets, const float* log_scales,
                const float* o_w1, const float* o_b1, const float* o_w2, const float* o_b2, const float* c_w1,
                const float* c_b1, const float* c_w2, const float* c_b2, const float* r_w1, const float* r_b1,
                const float* r_w2, const float* r_b2, vdgs::Camera camera, const long long* rows, long long count,
-               int k, int with_distance, const long long* ends, long long* counts, float* means_px, float* conics,
+               int k, int with_distance, unsigned* shown, int* counts, const int* ends, float* means_px, float* conics,
                float* depths, float* colours, float* opacities, float* volumes, int* source) {
   const long long visible = static_cast<long long>(blockIdx.x) * kWarps + threadIdx.x / kWarp;
-  if (visible >= count) return;  // whole warps
   const int lane = threadIdx.x % kWarp;
+  if (visible >= count) return;  // whole warps
+  const unsigned wanted = ends ? shown[visible] : kAllLanes;
+  if (!wanted) return;
+  const bool asked = lane < k && (wanted >> lane & 1u);
   const long long row = rows ? rows[visible] : visible;
 
   Inputs inputs{features[row * kFeatures + lane], {}, 0.0f};
@@ -96,35 +98,32 @@ decode_anchors(const float* positions, const float* features, const float* offse
 
   const Head opacity_head{o_w1, o_b1, o_w2, o_b2};
   float opacity[1];
-  outputs_of(opacity_head, hidden_of(opacity_head, inputs, with_distance), k, lane, lane < k, opacity);
+  outputs_of(opacity_head, hidden_of(opacity_head, inputs, with_distance), k, asked, opacity);
   opacity[0] = tanhf(opacity[0]);
-  const float* offset_at = offsets + (row * k + (lane < k ? lane : 0)) * 3;
-  const Vec3<float> offset = read(offset_at);
-  const bool opaque = whole && lane < k && opacity[0] > 0.0f && is_finite(offset);
-  if (!__any_sync(kAllLanes, opaque)) {
-    if (!ends && lane == 0) counts[visible] = 0;
+  const bool opaque = whole && asked && opacity[0] > 0.0f;
+  const Vec3<float> offset = opaque ? read(offsets + (row * k + lane) * 3) : Vec3<float>{};
+  if (!ends && !__any_sync(kAllLanes, opaque)) {
+    if (lane == 0) shown[visible] = 0u, counts[visible] = 0;
     return;
   }
 
   const Head covariance_head{c_w1, c_b1, c_w2, c_b2};
   float covariance[7];
-  outputs_of(covariance_head, hidden_of(covariance_head, inputs, with_distance), 7 * k, 7 * lane, lane < k, covariance);
+  outputs_of(covariance_head, hidden_of(covariance_head, inputs, with_distance), k, asked, covariance);
   const vdgs::Gaussian<float> gaussian = vdgs::spawn(anchor, offset, covariance);
   const vdgs::Projection<float> p = vdgs::project(camera, gaussian);
-  const bool kept = opaque && p.valid && vdgs::on_image(camera, p, opacity[0]);
-  const unsigned all_kept = __ballot_sync(kAllLanes, kept);
   if (!ends) {
-    if (lane == 0) counts[visible] = __popc(all_kept);
+    const bool kept = opaque && is_finite(offset) && p.valid && vdgs::on_image(camera, p, opacity[0]);
+    const unsigned all_kept = __ballot_sync(kAllLanes, kept);
+    if (lane == 0) shown[visible] = all_kept, counts[visible] = __popc(all_kept);
     return;
   }
-  if (!all_kept) return;
 
   const Head colour_head{r_w1, r_b1, r_w2, r_b2};
   float colour[3];
-  outputs_of(colour_head, hidden_of(colour_head, inputs, with_distance), 3 * k, 3 * lane, lane < k, colour);
-  if (!kept) return;
-  const long long before = visible ? ends[visible - 1] : 0;
-  const long long at = before + __popc(all_kept & ((1u << lane) - 1u));
+  outputs_of(colour_head, hidden_of(colour_head, inputs, with_distance), k, asked, colour);
+  if (!asked) return;
+  const long long at = ends[visible] - __popc(wanted >> lane);
   means_px[2 * at] = p.drawn.x, means_px[2 * at + 1] = p.drawn.y;
   conics[3 * at] = p.drawn.conic_xx, conics[3 * at + 1] = p.drawn.conic_xy, conics[3 * at + 2] = p.drawn.conic_yy;
   depths[at] = p.drawn.depth;
@@ -169,21 +168,22 @@ struct Moved {
   float* second;
   float rate, root;  // that of this anchor, with both corrections of the bias
 
-  __device__ void step(long long at, float gradient) const {
+  // `value`: what it is now.
+  __device__ void step(long long at, float value, float gradient) const {
     const float m = fmaf(0.9f, first[at], 0.1f * gradient), v = fmaf(0.999f, second[at], 0.001f * gradient * gradient);
     first[at] = m;
     second[at] = v;
-    parameter[at] -= rate * m / fmaf(sqrtf(v), root, 1e-15f);
+    parameter[at] = value - rate * m / fmaf(sqrtf(v), root, 1e-15f);
   }
 };
 
 }  // namespace
 
-// A warp an anchor of `rows` [v]: what it looked like once more, the gradients of its splats back to it, and its step of
-// Adam. `begins` [v + 1]: where its splats begin. `updates` [n] counts up; `lacking` and `roots` [t] hold 1 - beta1^u and
+// A warp an anchor of `rows` [v], from the place `first` on as many as `count`: what it looked like once more, the gradients
+// of its splats back to it, and its step of Adam. `begins` [v + 1]: where its splats begin. `updates` [n] counts up; `lacking` and `roots` [t] hold 1 - beta1^u and
 // 1 / sqrt(1 - beta2^u) of u = 1, 2, ... updates. `broken` [1] becomes 1 where a gradient is no number: that anchor stays.
-// For the gradients of the decoder, by matrix products: by outputs [v, k], [v, 7k], [v, 3k], hidden layers and by hidden
-// layers [3, v, 32], inputs [v, inputs]; all of these null where nobody wants them.
+// For the gradients of the decoder, by matrix products, with c for `count`: by outputs [c, k], [c, 7k], [c, 3k], hidden
+// layers and by hidden layers [3, c, 32], inputs [c, inputs]; all of these null where nobody wants them.
 extern "C" __global__ void __launch_bounds__(kThreads, 1)
 move_anchors(const float* positions, float* features, float* offsets, float* log_scales, float* features_first,
              float* offsets_first, float* log_scales_first, float* features_second, float* offsets_second,
@@ -191,55 +191,56 @@ move_anchors(const float* positions, float* features, float* offsets, float* log
              const float* o_w1t, const float* o_b1, const float* c_w1t, const float* c_b1, const float* c_w2t,
              const float* c_b2, const float* r_w1t, const float* r_b1, const float* o_w1, const float* o_w2,
              const float* c_w1, const float* c_w2, const float* r_w1, const float* r_w2, vdgs::Camera camera,
-             const long long* rows, long long count, int k, int inputs_wide, const long long* begins,
+             const long long* rows, long long first, long long count, int k, int inputs_wide, const int* begins,
              const float* by_means_px, const float* by_conics, const float* by_colours, const float* by_opacities,
              float by_volume, const int* source, const float* colour_values, const float* opacity_values, int* updates,
              const float* lacking, const float* roots, int most_updates, int* broken, float* by_opacity_out,
              float* by_covariance_out, float* by_colour_out, float* hidden_out, float* by_hidden_out, float* inputs_out) {
-  const long long visible = static_cast<long long>(blockIdx.x) * kWarps + threadIdx.x / kWarp;
-  if (visible >= count) return;  // whole warps
+  const long long place = static_cast<long long>(blockIdx.x) * kWarps + threadIdx.x / kWarp, visible = first + place;
+  if (place >= count) return;  // whole warps
   const int lane = threadIdx.x % kWarp;
-  const long long row = rows[visible];
+  const long long row = rows[visible], begin = begins[visible];
+  const int drawn = static_cast<int>(begins[visible + 1] - begin);
   const bool with_distance = inputs_wide == kFeatures + 4, has_offset = lane < k;
 
+  // All that moves, read once: it is needed here, and where it moves.
   Inputs inputs{features[row * kFeatures + lane], {}, 0.0f};
-  const Vec3<float> position = read(positions + 3 * row);
-  const Vec3<float> ray = {position.x - camera.centre.x, position.y - camera.centre.y, position.z - camera.centre.z};
-  inputs.distance = sqrtf(vdgs::dot(ray, ray));
-  inputs.direction = camera.orthographic ? camera.forward : (1.0f / inputs.distance) * ray;
-  const vdgs::Anchor<float> anchor{position, exp_of(read(log_scales + 6 * row)), exp_of(read(log_scales + 6 * row + 3))};
-  const long long begin = begins[visible];
-  const int drawn = static_cast<int>(begins[visible + 1] - begin);
-
-  // The splat of the lane's offset, if it has one.
-  long long splat = -1;
-  for (int s = 0; s < drawn; ++s) {
-    if (source[begin + s] - visible * k == lane) splat = begin + s;
+  const long long offset_at = (row * k + lane) * 3;
+  const Vec3<float> offset = has_offset ? read(offsets + offset_at) : Vec3<float>{};
+  const Vec3<float> log_extent = read(log_scales + 6 * row), log_size = read(log_scales + 6 * row + 3);
+  vdgs::Anchor<float> anchor{{}, exp_of(log_extent), exp_of(log_size)};
+  if (drawn > 0) {
+    anchor.position = read(positions + 3 * row);
+    const Vec3<float> x = anchor.position, c = camera.centre, ray = {x.x - c.x, x.y - c.y, x.z - c.z};
+    inputs.distance = sqrtf(vdgs::dot(ray, ray));
+    inputs.direction = camera.orthographic ? camera.forward : (1.0f / inputs.distance) * ray;
   }
+
+  long long splat = -1;  // that of the lane's offset, if it has one
+  for (int s = 0; s < drawn; ++s)
+    if (source[begin + s] - visible * k == lane) splat = begin + s;
   float by_opacity[1] = {}, by_covariance[7] = {}, by_colour[3] = {}, by_scales[6] = {};
   Vec3<float> by_offset{};
   float hidden[3] = {}, by_hidden[3] = {}, by_feature = 0.0f;
   if (drawn > 0) {
-    const Head opacity_head{o_w1t, o_b1, nullptr, nullptr}, covariance_head{c_w1t, c_b1, c_w2t, c_b2},
-        colour_head{r_w1t, r_b1, nullptr, nullptr};
-    hidden[0] = hidden_of(opacity_head, inputs, with_distance);
+    const Head covariance_head{c_w1t, c_b1, c_w2t, c_b2};
+    hidden[0] = hidden_of({o_w1t, o_b1, nullptr, nullptr}, inputs, with_distance);
     hidden[1] = hidden_of(covariance_head, inputs, with_distance);
-    hidden[2] = hidden_of(colour_head, inputs, with_distance);
+    hidden[2] = hidden_of({r_w1t, r_b1, nullptr, nullptr}, inputs, with_distance);
     float covariance[7];
-    outputs_of(covariance_head, hidden[1], 7 * k, 7 * lane, has_offset, covariance);
+    outputs_of(covariance_head, hidden[1], k, splat >= 0, covariance);
     if (splat >= 0) {
-      const Vec3<float> offset = read(offsets + (row * k + lane) * 3);
       const vdgs::Gaussian<float> gaussian = vdgs::spawn(anchor, offset, covariance);
       const vdgs::Projection<float> p = vdgs::project(camera, gaussian);
-      const vdgs::Footprint<float> by_drawn{by_means_px[2 * splat], by_means_px[2 * splat + 1], 0.0f,
-                                            by_conics[3 * splat], by_conics[3 * splat + 1], by_conics[3 * splat + 2]};
+      const float *by_px = by_means_px + 2 * splat, *by_conic = by_conics + 3 * splat;
+      const vdgs::Footprint<float> by_drawn{by_px[0], by_px[1], 0.0f, by_conic[0], by_conic[1], by_conic[2]};
       vdgs::Gaussian<float> by_gaussian = vdgs::project_backward(camera, gaussian, p, by_drawn);
       const Vec3<float> s = gaussian.scale;
       by_gaussian.scale = by_gaussian.scale + by_volume * Vec3<float>{s.y * s.z, s.x * s.z, s.x * s.y};
       const vdgs::SpawnGradient<float> g = vdgs::spawn_backward(anchor, offset, covariance, gaussian, by_gaussian);
       by_offset = g.offset;
-      by_scales[0] = g.log_extent.x, by_scales[1] = g.log_extent.y, by_scales[2] = g.log_extent.z;
-      by_scales[3] = g.log_size.x, by_scales[4] = g.log_size.y, by_scales[5] = g.log_size.z;
+      const Vec3<float> e = g.log_extent, z = g.log_size;
+      by_scales[0] = e.x, by_scales[1] = e.y, by_scales[2] = e.z, by_scales[3] = z.x, by_scales[4] = z.y, by_scales[5] = z.z;
       for (int c = 0; c < 7; ++c) by_covariance[c] = g.covariance[c];
       for (int c = 0; c < 3; ++c) {
         const float value = colour_values[3 * splat + c];
@@ -257,17 +258,17 @@ move_anchors(const float* positions, float* features, float* offsets, float* log
   }
   if (by_opacity_out) {
     if (has_offset) {
-      const long long at = visible * k + lane;
+      const long long at = place * k + lane;
       by_opacity_out[at] = by_opacity[0];
       for (int c = 0; c < 7; ++c) by_covariance_out[7 * at + c] = by_covariance[c];
       for (int c = 0; c < 3; ++c) by_colour_out[3 * at + c] = by_colour[c];
     }
     for (int head = 0; head < 3; ++head) {
-      hidden_out[(head * count + visible) * kHidden + lane] = hidden[head];
-      by_hidden_out[(head * count + visible) * kHidden + lane] = by_hidden[head];
+      hidden_out[(head * count + place) * kHidden + lane] = hidden[head];
+      by_hidden_out[(head * count + place) * kHidden + lane] = by_hidden[head];
     }
     // An anchor that shows nothing may be made of anything: zeros for it, which times zero are zero.
-    float* out = inputs_out + visible * inputs_wide;
+    float* out = inputs_out + place * inputs_wide;
     out[lane] = drawn > 0 ? inputs.feature : 0.0f;
     const float rest[4] = {inputs.direction.x, inputs.direction.y, inputs.direction.z, inputs.distance};
     if (lane < inputs_wide - kFeatures) out[kFeatures + lane] = drawn > 0 ? rest[lane] : 0.0f;
@@ -276,24 +277,22 @@ move_anchors(const float* positions, float* features, float* offsets, float* log
   bool sound = is_finite(by_feature) && is_finite(by_offset);
   for (float each : by_scales) sound = sound && is_finite(each);
   const bool stays = __any_sync(kAllLanes, !sound);  // and what follows overwrites what the lanes have read
-  const int made = updates[row], place = made < most_updates ? made : most_updates - 1;
+  const int made = updates[row], nth = made < most_updates ? made : most_updates - 1;
   __syncwarp();
   if (lane == 0) updates[row] = made + 1;
-  if (stays) {
-    if (lane == 0) *broken = 1;
-    return;
-  }
-  const float root = roots[place], faster = (root < early ? root : early) / lacking[place];
+  if (stays && lane == 0) *broken = 1;
+  if (stays) return;
+  const float root = roots[nth], faster = (root < early ? root : early) / lacking[nth];
   const Moved feature{features, features_first, features_second, features_rate * faster, root};
-  feature.step(row * kFeatures + lane, by_feature);
+  feature.step(row * kFeatures + lane, inputs.feature, by_feature);
   if (has_offset) {
     const Moved moved{offsets, offsets_first, offsets_second, offsets_rate * faster, root};
-    const long long at = (row * k + lane) * 3;
-    moved.step(at, by_offset.x), moved.step(at + 1, by_offset.y), moved.step(at + 2, by_offset.z);
+    moved.step(offset_at, offset.x, by_offset.x), moved.step(offset_at + 1, offset.y, by_offset.y);
+    moved.step(offset_at + 2, offset.z, by_offset.z);
   }
   const Moved scale{log_scales, log_scales_first, log_scales_second, log_scales_rate * faster, root};
+  const float log_scale[6] = {log_extent.x, log_extent.y, log_extent.z, log_size.x, log_size.y, log_size.z};
 #pragma unroll
-  for (int i = 0; i < 6; ++i) {
-    if (lane == i) scale.step(6 * row + i, by_scales[i]);
-  }
+  for (int i = 0; i < 6; ++i)
+    if (lane == i) scale.step(6 * row + i, log_scale[i], by_scales[i]);
 }

@@ -1,0 +1,59 @@
+"""Growth's statistics of one view on a GPU (source/statistics.cu)."""
+
+from __future__ import annotations
+
+import ctypes
+
+import torch
+from jaxtyping import Bool, Float, Int32, Int64
+from torch import Tensor
+
+from vdgs.kernels.cuda.launching import Program
+from vdgs.kernels.reference.statistics import check_inside, check_sources
+from vdgs.kernels.types import Statistics
+
+#: Threads of a block: kThreads of the source.
+THREADS = 256
+PROGRAM = Program("statistics.cu")
+
+
+def add_view_statistics(
+    statistics: Statistics,
+    visible: Int64[Tensor, "v"],
+    inside: Bool[Tensor, "v"],
+    source: Int32[Tensor, "m"],
+    opacities: Float[Tensor, "m"],
+    gradient_px: Float[Tensor, "m 2"],
+    width: int,
+    height: int,
+    *,
+    program: Program = PROGRAM,
+) -> None:
+    """As `reference.statistics.add_view_statistics`, for tensors on a CUDA device; float32, and sums contiguous.
+
+    One pass, same bits every time, nothing waits for the device, which does not look whether sources belong to the
+    visible anchors. Raises ValueError or TypeError for unsuitable tensors, CudaUnavailable where the kernel cannot be
+    run.
+    """
+    sums, k = statistics.tensors(), statistics.gradient.shape[1]
+    check_sources(source, visible, k)
+    check_inside(inside, visible)
+    _check_types(sums | {"opacities": opacities, "gradient_px": gradient_px}, source)
+    m, v = len(source), len(visible)
+    if opacities.shape != (m,) or gradient_px.shape != (m, 2):
+        raise ValueError(
+            f"opacities {list(opacities.shape)} and gradient_px {list(gradient_px.shape)} must be [{m}] and [{m}, 2]"
+        )
+    program.launch(
+        "add_view", (-(-max(m, v) // THREADS),), (THREADS,), visible.contiguous(), inside.contiguous(),
+        ctypes.c_longlong(v), source.contiguous(), opacities.detach().contiguous(), gradient_px.contiguous(),
+        ctypes.c_longlong(m), ctypes.c_int(k), ctypes.c_float(width / 2), ctypes.c_float(height / 2), *sums.values(),
+    )  # fmt: skip
+
+
+def _check_types(floats: dict[str, Tensor], source: Tensor) -> None:
+    for name, tensor in floats.items():
+        if tensor.dtype != torch.float32:
+            raise TypeError(f"{name} must be float32, not {tensor.dtype}")
+    if source.dtype != torch.int32:
+        raise TypeError(f"source must be int32, not {source.dtype}")
