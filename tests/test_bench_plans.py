@@ -100,7 +100,7 @@ def test_blocks_as_printed_take_back_what_the_laptop_changes():
     alone = {
         name: METHODS[name].settings(base, scene.budget)
         for name in (
-            "frozen-decoder", "even-sampling", "by-votes", "share-0.45", "printed-rates", "full-size", "last-model",
+            "frozen-decoder", "even-sampling", "by-votes", "share-0.45", "printed-rates", "half-size", "last-model",
             "printed-compensation",
         )
     }  # fmt: skip
@@ -109,7 +109,7 @@ def test_blocks_as_printed_take_back_what_the_laptop_changes():
     again = {name: getattr(paper.block, name) for name in ("offset_rate", "scale_rate", "feature_rate")}
     assert set(again.values()) == {1.0}  # the paper prints no rates for blocks
     assert alone["printed-rates"] == replace(base, block=replace(base.block, **again))
-    assert alone["full-size"] == replace(base, block=replace(base.block, resolutions=paper.block.resolutions))
+    assert alone["half-size"] == replace(base, block=replace(base.block, resolutions=((0.0, 2), (0.3, 1))))
     assert alone["last-model"] == replace(base, block=replace(base.block, average=paper.block.average))
     compensation = paper.block.compensation
     assert alone["printed-compensation"] == replace(base, block=replace(base.block, compensation=compensation))

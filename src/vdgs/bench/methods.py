@@ -332,7 +332,7 @@ _CHOICES = [
         "compensation-of-sums", "compensation as printed, of sums", with_compensation_of_sums,
         differs="T_low = 0.20, β_g = 2, γ = 0.9; g is added to the sums of gradients",
     ),
-    Method("full-size", "full size throughout", with_block(resolutions=((0.0, 1),))),
+    Method("half-size", "photographs halved at first", with_block(resolutions=((0.0, 2), (0.3, 1)))),
     Method("last-model", "the last model, no mean", with_block(average=0.0)),
     Method(
         "printed-compensation", "compensation as printed", lambda config, _: with_printed_compensation(config),

@@ -35,7 +35,7 @@ _ABLATION = (
 
 #: Each departs from the full method in one choice, or says beside it in what else.
 CHOICES = (
-    "full", "frozen-decoder", "even-sampling", "by-votes", "printed-rates", "damped-rates", "full-size", "last-model",
+    "full", "frozen-decoder", "even-sampling", "by-votes", "printed-rates", "damped-rates", "half-size", "last-model",
     "whole-photographs", "no-anchor-generation", "printed-compensation", "compensation-of-sums", "share-0.45",
     "literal-assignment", "leave-one-out", "frustum", "no-context", "free-ring", "free-best-seen", "ramp",
     "ramp-best-seen", "literal-gate", "cap", "dense-adam", "printed", "printed-damped",
