@@ -93,7 +93,7 @@ def _folder(question: Mapping[str, Any]) -> list[str]:
 
 _WITHOUT_LOCKS = (
     "{}: locks of files (flock) {}. Mount that file system with them (NFS 4; Lustre: -o flock), or two machines may "
-    "write the same block"
+    "write the same files"
 )
 
 
