@@ -17,8 +17,9 @@ from vdgs.captures.capture import Capture, View
 from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
 from vdgs.errors import RunError
-from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
+from vdgs.evaluation.evaluate import evaluate
 from vdgs.evaluation.lpips import load_lpips
+from vdgs.evaluation.measured_model import EvaluationSettings, MeasuredModel, ModelFacts
 from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.seen import seen_map
 from vdgs.model.anchor_model import AnchorModel
