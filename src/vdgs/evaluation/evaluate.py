@@ -14,7 +14,7 @@ time.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from vdgs.captures.capture import View
 from vdgs.errors import RunError
 from vdgs.evaluation import pictures, saving
 from vdgs.evaluation.by_visibility import VisibilityHistogram, mean_or_none, view_bins
@@ -74,7 +75,7 @@ def evaluate(
     Raises RunError without views, CaptureError where a photograph or mask does not fit its camera,
     TrainingDiverged where a render is not finite.
     """
-    refuse_without_views(photographs, output)
+    refuse_without_views(photographs.views, output)
     inputs = ViewInputs(photographs, model, lpips, settings or EvaluationSettings(), output)
     measured = (_unless_stopped(index, inputs) for index in range(len(photographs.views)))
     return conclude(
@@ -83,9 +84,9 @@ def evaluate(
     )  # fmt: skip
 
 
-def refuse_without_views(photographs: ReferenceViews, output: Path) -> None:
+def refuse_without_views(views: Sequence[View], output: Path) -> None:
     """Raise RunError where there is nothing to measure."""
-    if not photographs.views:
+    if not views:
         raise RunError(
             f"{output}: there are no test views to evaluate. Hold some out when the capture is read "
             "(by default every 8th image is)."

@@ -90,25 +90,15 @@ class BlockFigures:
     seams: SeamMetrics
 
 
-def evaluate_blocks(
-    photographs: ReferenceViews,
-    render_coarse: Callable[[Camera], Raster],
-    render_merged: Callable[[Camera], Raster],
-    render_block: Callable[[int, Camera], Raster | None],
-    blocks: Blocks,
-    output: Path,
-) -> dict[str, Any]:
+def evaluate_blocks(inputs: BlockInputs, output: Path) -> dict[str, Any]:
     """Measure every test view, write `output`, and return what `by_block.json` holds. One view is in memory at a time,
     and those that are drawn.
 
-    `render_merged` draws depth; the labels follow from the median one. `render_block(index, camera)` is the image of a
-    block as it was trained, among its frozen surroundings; None where the block was not trained, whose figure is then
-    null. Raises RunError without views.
+    The figure of a block that was not trained is null. Raises RunError without views.
     """
-    views = photographs.views
+    views = inputs.photographs.views
     if not views:
         raise RunError(f"{output}: there are no test views. Hold some out when the capture is read.")
-    inputs = BlockInputs(photographs, render_coarse, render_merged, render_block, blocks)
     measured, seen = list[BlockFigures](), list[SeamView]()
     for view, stem in zip(views, saving.file_stems([view.name for view in views]), strict=True):
         stop_if_asked()
@@ -118,7 +108,7 @@ def evaluate_blocks(
         seen = [seen[place] for place in worth_seeing([each.border_pixels for each in seen])]
     for each in seen:
         save_picture(output / "seams" / f"{each.stem}.png", each)
-    return conclude(measured, len(blocks), output)
+    return conclude(measured, len(inputs.blocks), output)
 
 
 def worth_seeing(border_pixels: Sequence[int]) -> list[int]:

@@ -18,6 +18,7 @@ from typing import Any
 from uuid import uuid4
 
 from vdgs import __version__
+from vdgs.captures.capture import View
 from vdgs.runs.locks import hold, is_locked
 from vdgs.storage.files import write_text
 
@@ -57,6 +58,11 @@ class Question:
             for file in ("here", ".lock"):
                 (held / file).unlink(missing_ok=True)
             held.rmdir()
+
+
+def photographs_of(views: Sequence[View]) -> list[Path]:
+    """The files of photographs, and of masks where they have any."""
+    return [path for view in views for path in (view.image_path, view.mask_path) if path is not None]
 
 
 def examine(question: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from vdgs.errors import RunError, VdgsError
 from vdgs.executors.errand import Errand, Wish
-from vdgs.executors.fitness import Question
+from vdgs.executors.fitness import Question, photographs_of
 from vdgs.executors.kinds import BLOCKS
 from vdgs.executors.placement import Share
 from vdgs.memory.estimate import Need, estimate
@@ -73,10 +73,7 @@ def train_blocks(
 
 def _question(run: RunFolder) -> Question:
     """What a machine must see: the run, its coarse model and its photographs."""
-    files = [run.config_file, run.coarse.model]
-    for view in open_capture(run).train_views:
-        files += [view.image_path] if view.mask_path is None else [view.image_path, view.mask_path]
-    return Question(run.path, files)
+    return Question(run.path, [run.config_file, run.coarse.model, *photographs_of(open_capture(run).train_views)])
 
 
 def _command(run: RunFolder, index: int, share: Share, options: WatchOptions, device: str) -> list[str]:
