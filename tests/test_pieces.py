@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from captures_support import tiny_scene, write_colmap
 from cli_support import begun, vdgs, wait_until
-from cluster_support import COARSE, copy_run, evaluated, merge_run, train_here
+from cluster_support import COARSE, alive, copy_run, evaluated, merge_run, train_here
 from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.by_block import BlockMetrics, SeamMetrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
@@ -153,16 +153,22 @@ def test_pieces_of_other_work_go_unless_they_are_at_work(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def merged(tmp_path_factory) -> Path:
-    """A run of two blocks with six test views, merged."""
+def uncut(tmp_path_factory) -> Path:
+    """A run with a coarse model of ten photographs, and ten others to test with."""
     folder = tmp_path_factory.mktemp("pieces")
-    capture, run = folder / "capture", folder / "cut"
-    write_colmap(capture, tiny_scene())
-    cut = ("--blocks", "2", "--assignment.min-cameras", "3")
-    for command in (("coarse", capture, "--output", run, *COARSE, "--test-every", "2"), ("partition", run, *cut)):
-        done = vdgs(*command)
-        assert done.returncode == 0, done.stderr + done.stdout
-    return merge_run(train_here(run, folder / "local"), folder / "merged")
+    write_colmap(folder / "capture", tiny_scene(columns=5, rows=4))
+    done = vdgs("coarse", folder / "capture", "--output", folder / "coarse", *COARSE, "--test-every", "2")
+    assert done.returncode == 0, done.stderr + done.stdout
+    return folder / "coarse"
+
+
+@pytest.fixture(scope="module")
+def merged(uncut) -> Path:
+    """Cut into two blocks, trained and merged."""
+    run = copy_run(uncut, uncut.parent / "cut")
+    done = vdgs("partition", run, "--blocks", "2", "--assignment.min-cameras", "3")
+    assert done.returncode == 0, done.stderr + done.stdout
+    return merge_run(train_here(run, run.parent / "local"), run.parent / "merged")
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +187,7 @@ def test_views_measured_in_pieces_are_those_of_one_process(merged, measured, tmp
     run = copy_run(merged, tmp_path / "run")
     done = vdgs("eval", run, "--jobs", "2")
     assert done.returncode == 0, done.stderr + done.stdout
-    assert "2 of 2 pieces done" in done.stdout
+    assert "4 of 4 pieces done" in done.stdout
     assert evaluated(run / "evaluation") == measured
     assert json.loads((run / "evaluation/metrics.json").read_text())["fps"] is None
     assert not (run / "evaluation/pieces").exists()
@@ -190,7 +196,7 @@ def test_views_measured_in_pieces_are_those_of_one_process(merged, measured, tmp
 
 def test_whatever_is_stopped_or_killed_views_that_were_measured_are_not_measured_again(merged, measured, tmp_path):
     run = copy_run(merged, tmp_path / "run")
-    with begun("eval", run, "--jobs", "2", pause_at=("*/pieces/*/00000[14].npz", 1)) as first:
+    with begun("eval", run, "--jobs", "2", pause_at=("*/pieces/*/00000[13].npz", 1)) as first:
         first.wait_until_paused(2)
         first.send_signal(signal.SIGINT)
         done = first.finished()
@@ -198,9 +204,9 @@ def test_whatever_is_stopped_or_killed_views_that_were_measured_are_not_measured
     assert "every piece that was at work is saved. The same command continues" in done.stderr
     (work,) = (run / "evaluation/pieces").iterdir()
     kept = {file: file.stat().st_mtime_ns for file in work.glob("*/*.npz")}
-    assert {file.stem for file in kept} == {"000000", "000003"}
-    assert {json.loads(file.read_text())["state"] for file in work.glob("*/status.json")} == {"stopped"}
-    with begun("eval", run, "--jobs", "2", pause_at=("*/pieces/*/000002.npz", 1)) as second:
+    assert {file.stem for file in kept} == {"000000", "000002"}
+    assert {json.loads(file.read_text())["state"] for file in work.glob("0[01]/status.json")} == {"stopped"}
+    with begun("eval", run, "--jobs", "2", pause_at=("*/pieces/*/000001.npz", 1)) as second:
         second.wait_until_paused(1)
         second.kill_paused()  # the piece alone: it is started again
         wait_until(lambda: "crashed by SIGKILL" in second.printed())
@@ -211,14 +217,36 @@ def test_whatever_is_stopped_or_killed_views_that_were_measured_are_not_measured
     assert evaluated(run / "evaluation") == measured
 
 
+def test_cameras_scored_in_pieces_are_assigned_as_by_one_process(tmp_path, uncut):
+    """Also where the driver was killed after it had cut, and then the piece that was left."""
+    one, run = copy_run(uncut, tmp_path / "one"), copy_run(uncut, tmp_path / "run")
+    cut = ("--blocks", "3", "--assignment.min-cameras", "3")
+    assert vdgs("partition", one, *cut).returncode == 0
+    with begun("partition", run, *cut, "--jobs", "2", pause_at=("*/pieces/*/000001.npz", 1)) as first:
+        first.wait_until_paused(1)
+        first.send_signal(signal.SIGKILL)
+        first.finished()
+        (piece,) = first.paused()
+        wait_until(lambda: not alive(piece))
+    with begun("partition", run, *cut, "--jobs", "2", pause_at=("*/pieces/*/000001.npz", 1)) as second:
+        second.wait_until_paused(1)
+        second.kill_paused()
+        done = second.finished()
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "1 of 2 pieces to score cameras" in done.stdout
+    assert "piece 01: crashed by SIGKILL" in done.stdout
+    assert evaluated(run / "partition") == evaluated(one / "partition")
+    assert vdgs("partition", run, "--piece", "0").returncode == 1
+
+
 def test_what_a_piece_cannot_do_is_said_in_its_words(merged, tmp_path):
     run = copy_run(merged, tmp_path / "run")
     weights = tmp_path / "none.pth"
     done = vdgs("eval", run, "--jobs", "2", "--lpips-weights", weights)
     assert done.returncode == 1
-    assert "2 of 2 pieces failed:" in done.stderr
-    assert done.stderr.count("none.pth") >= 2
+    assert "4 of 4 pieces failed:" in done.stderr
+    assert done.stderr.count("none.pth") >= 4
     assert "NN/output.log. The same command tries them again" in done.stderr
     done = vdgs("eval", run, "--piece", "7")
     assert done.returncode == 1
-    assert "--piece 7: there are 2 pieces, numbered from 0" in done.stderr
+    assert "--piece 7: there are 4 pieces, numbered from 0" in done.stderr

@@ -75,7 +75,7 @@ def _stages(run: RunFolder, capture: Capture, asked: RunRequest, console: Consol
     measure_visibility(run, console)
     _measure(run, "coarse", asked, console)
     _title(console, "blocks")
-    partition_run(run, console, asked.device)
+    partition_run(run, console, asked.device, _wish(asked))
     _title(console, "block training")
     try:
         train_blocks(run.path, asked.watching, asked.jobs, console, asked.device, asked.where)

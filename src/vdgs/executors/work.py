@@ -101,17 +101,21 @@ class PieceWork:
 
 @contextmanager
 def alone(output: Path, key: str | None = None) -> Iterator[None]:
-    """Be the one process that works for a folder, but for pieces of the work with this `key`; what pieces of other work
-    have left is removed.
+    """Be the one process that works for a folder, but for pieces of the work with this `key` (`clear`).
 
     Raises RunError where another process works for it, or pieces of other work do without their driver.
     """
     with hold(output):
-        for work in (output / PIECES).glob("*"):
-            if work.name != key:
-                _refuse_at_work(work)
-                shutil.rmtree(work)
+        clear(output, key)
         yield
+
+
+def clear(output: Path, key: str | None = None) -> None:
+    """Remove what pieces of other work than that with this `key` have left. Raises RunError where they are at work."""
+    for work in (output / PIECES).glob("*"):
+        if work.name != key:
+            _refuse_at_work(work)
+            shutil.rmtree(work)
 
 
 def remove(work: PieceWork) -> None:
