@@ -24,6 +24,9 @@ BLOCKS = ("--save-every", "20", "--block.iterations", "60", "--redo")
 #: Where each block waits once, on its way or when it is continued there.
 MIDDLE = "*/blocks/0?/checkpoints/00000040.json"
 
+#: Figures that depend on the machine and on what else it does.
+TIMES = ("fps", "render_seconds", "seconds", "peak_memory_bytes")
+
 #: Serves commands, one line each: starts and removes nodes. Nodes have one processor; the head has none.
 SERVER = """
 import json, os, sys, warnings
@@ -114,8 +117,17 @@ def parent_of(process: int) -> int:
 
 def block_of(process: int) -> int:
     """Which block a process trains."""
+    return _number_after("--block", process)
+
+
+def piece_of(process: int) -> int:
+    """Which piece of other work a process does."""
+    return _number_after("--piece", process)
+
+
+def _number_after(option: str, process: int) -> int:
     words = Path(f"/proc/{process}/cmdline").read_bytes().decode().split("\0")
-    return int(words[words.index("--block") + 1])
+    return int(words[words.index(option) + 1])
 
 
 def make_run(folder: Path) -> Path:
@@ -136,6 +148,14 @@ def train_here(run: Path, to: Path) -> Path:
     return local
 
 
+def merge_run(trained: Path, to: Path) -> Path:
+    """A copy of a run whose blocks are trained, merged."""
+    merged = copy_run(trained, to)
+    done = vdgs("merge", merged)
+    assert done.returncode == 0, done.stderr + done.stdout
+    return merged
+
+
 def copy_run(run: Path, to: Path) -> Path:
     return Path(shutil.copytree(run, to, ignore=shutil.ignore_patterns(".lock")))
 
@@ -153,3 +173,18 @@ def alive(process: int) -> bool:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+def evaluated(folder: Path) -> dict[str, object]:
+    """What an evaluation wrote, by name, without what depends on the machine."""
+    found: dict[str, object] = {}
+    for file in sorted(each for each in folder.rglob("*") if each.is_file() and each.name[0] != "."):
+        name, content = file.relative_to(folder).as_posix(), file.read_bytes()
+        found[name] = _without(json.loads(content), TIMES) if file.suffix == ".json" else content
+    return found
+
+
+def _without(value: Any, names: tuple[str, ...]) -> Any:
+    if isinstance(value, dict):
+        return {name: _without(each, names) for name, each in value.items() if name not in names}
+    return [_without(each, names) for each in value] if isinstance(value, list) else value

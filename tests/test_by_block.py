@@ -29,7 +29,7 @@ from vdgs.evaluation.by_block import (
     label_map,
 )
 from vdgs.evaluation.reference_views import ReferenceViews
-from vdgs.evaluation.seams import SEAM_VIEWS, block_table, evaluate_blocks
+from vdgs.evaluation.seams import SEAM_VIEWS, BlockInputs, block_table, evaluate_blocks
 from vdgs.kernels.types import Raster
 from vdgs.model.render import render
 
@@ -259,7 +259,7 @@ class Plane:
 
     def evaluate(self, output: Path, mask: np.ndarray | None = None) -> dict:
         photographs = ReferenceViews(self.views, self.load_image, lambda _: mask)
-        return evaluate_blocks(photographs, self.coarse, self.merged, self.block, quadrants(), output)
+        return evaluate_blocks(BlockInputs(photographs, self.coarse, self.merged, self.block, quadrants()), output)
 
 
 ONE_BLOCK = camera_above(-3.5, -3.5, 2.0)

@@ -19,8 +19,9 @@ from rich.console import Console
 from evaluation_support import as_render, load_mask, noisy, photograph, psnr, real_photographs, ssim, view
 from vdgs.errors import CaptureError, RunError, TrainingDiverged
 from vdgs.evaluation import metrics, pictures, saving
-from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
+from vdgs.evaluation.evaluate import evaluate
 from vdgs.evaluation.lpips import Lpips, LpipsScores
+from vdgs.evaluation.measured_model import EvaluationSettings, MeasuredModel, ModelFacts
 from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.storage.files import jsonable, write_json
 

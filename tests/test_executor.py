@@ -15,11 +15,11 @@ from rich.console import Console
 
 from cli_support import PATIENCE_SECONDS, wait_until
 from vdgs.executors import local
-from vdgs.executors.blocks import BlockCommand, run_blocks
 from vdgs.executors.executor import Listener, Outcome, Task
 from vdgs.executors.lines import Lines
 from vdgs.executors.local import LocalExecutor
 from vdgs.executors.parent import PARENT, stop_when_parent_dies
+from vdgs.executors.pieces import Piece, run_pieces
 from vdgs.runs.folder import StageFolder
 
 #: What every fake block begins with: it knows its folder, can say how far it is, and lists the SIGTERMs it gets.
@@ -49,18 +49,16 @@ sys.exit(130)
 """
 
 
-def job(root: Path, index: int, script: str) -> BlockCommand:
+def job(root: Path, index: int, script: str) -> Piece:
     folder = StageFolder(root / f"{index:02d}")
     who = f"block = {index}\n"
-    return BlockCommand(
-        index, folder, [sys.executable, "-S", "-c", PRELUDE + who + textwrap.dedent(script), str(folder.path)]
-    )
+    return Piece(index, folder, [sys.executable, "-S", "-c", PRELUDE + who + textwrap.dedent(script), str(folder.path)])
 
 
 def run(jobs, *, at_once=2, retries=2, terminal=False):
     """Outcomes, and what was printed."""
     console = Console(file=io.StringIO(), width=120, height=40, force_terminal=terminal, color_system=None)
-    outcomes = run_blocks(jobs, LocalExecutor(at_once, retries, poll_seconds=0.02), console)
+    outcomes = run_pieces(jobs, LocalExecutor(at_once, retries, poll_seconds=0.02), console)
     return outcomes, console.file.getvalue()
 
 
@@ -197,7 +195,7 @@ def test_a_full_disk_is_named(tmp_path):
 
 
 def test_a_command_that_is_not_there_is_named(tmp_path):
-    (outcome,), _ = run([BlockCommand(0, StageFolder(tmp_path), ["/nowhere/python"])])
+    (outcome,), _ = run([Piece(0, StageFolder(tmp_path), ["/nowhere/python"])])
     assert outcome.state == "failed"
     assert "/nowhere/python" in outcome.why
 
@@ -262,7 +260,7 @@ DRIVER = """
 import json, sys
 from pathlib import Path
 from rich.console import Console
-from vdgs.executors.blocks import BlockCommand, run_blocks
+from vdgs.executors.pieces import Piece, run_pieces
 from vdgs.executors.local import LocalExecutor
 from vdgs.runs.folder import StageFolder
 
@@ -276,9 +274,9 @@ class Counted(LocalExecutor):
         return super().run(tasks, listener)
 
 jobs = [
-    BlockCommand(index, StageFolder(Path(folder)), command) for index, folder, command in json.loads(sys.argv[1])
+    Piece(index, StageFolder(Path(folder)), command) for index, folder, command in json.loads(sys.argv[1])
 ]
-outcomes = run_blocks(jobs, Counted(2, poll_seconds=0.02), Console())
+outcomes = run_pieces(jobs, Counted(2, poll_seconds=0.02), Console())
 print("OUTCOMES", json.dumps([[o.state, o.attempts, o.why] for o in outcomes]))
 """
 
@@ -286,7 +284,7 @@ print("OUTCOMES", json.dumps([[o.state, o.attempts, o.why] for o in outcomes]))
 class Driver:
     """A process that runs jobs; begins once the first two say that they are ready."""
 
-    def __init__(self, jobs: list[BlockCommand], root: Path):
+    def __init__(self, jobs: list[Piece], root: Path):
         self._looks, self._root = root / "looks", root
         argument = json.dumps([[made.index, str(made.folder.path), made.command] for made in jobs])
         command = [sys.executable, "-c", DRIVER, argument, str(self._looks)]

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from vdgs.executors.blocks import default_jobs
 from vdgs.executors.output import explanation
-from vdgs.executors.progress import BlockProgress, Figures, read_figures, seconds_left_overall
+from vdgs.executors.pieces import default_jobs
+from vdgs.executors.progress import Figures, PieceProgress, read_figures, seconds_left_overall
 from vdgs.executors.table import duration, progress_line, progress_table
 
 
@@ -20,11 +20,11 @@ from vdgs.executors.table import duration, progress_line, progress_table
 def test_any_status_can_be_shown(tmp_path_factory, status):
     path = tmp_path_factory.getbasetemp() / "any_status.json"
     path.write_text(json.dumps({"state": "running", **status}))
-    row = BlockProgress(0)
+    row = PieceProgress(0)
     row.started()
     row.observe(read_figures(path), 1.0)
     console = Console(file=io.StringIO(), width=200)
-    console.print(progress_table([row, BlockProgress(1)], 1, 10))
+    console.print(progress_table([row, PieceProgress(1)], 1, 10))
     assert "0/2 done" in console.file.getvalue()
     assert "1 running" in progress_line([row], 1)
 
@@ -44,7 +44,7 @@ def test_default_jobs_on_known_machines():
 
 
 def test_time_left_follows_from_speed_and_what_waits():
-    first, second, third = rows = [BlockProgress(i) for i in range(3)]
+    first, second, third = rows = [PieceProgress(i) for i in range(3)]
     assert seconds_left_overall(rows, 2) is None
     first.started()
     first.observe(Figures(iteration=0, iterations=100), 0.0)
@@ -58,7 +58,7 @@ def test_time_left_follows_from_speed_and_what_waits():
 
 
 def test_a_new_attempt_has_a_speed_of_its_own():
-    row = BlockProgress(0)
+    row = PieceProgress(0)
     row.started()
     for second in range(3):
         row.observe(Figures(iteration=100 * second, iterations=1000), float(second))
@@ -67,7 +67,7 @@ def test_a_new_attempt_has_a_speed_of_its_own():
 
 
 def test_the_table_fits_the_screen_and_keeps_what_matters():
-    rows = [BlockProgress(i) for i in range(40)]
+    rows = [PieceProgress(i) for i in range(40)]
     rows[37].started()
     rows[38].state = "failed"
     console = Console(file=io.StringIO(), width=80)

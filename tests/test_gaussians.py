@@ -23,7 +23,7 @@ from vdgs.comparators.gaussians.training import (
     train,
 )
 from vdgs.errors import RunError, Stopped, VdgsError
-from vdgs.evaluation.evaluate import EvaluationSettings
+from vdgs.evaluation.measured_model import EvaluationSettings
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.watching import WatchOptions

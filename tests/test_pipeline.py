@@ -13,6 +13,7 @@ import torch
 
 from captures_support import tiny_scene, write_colmap
 from cli_support import begun, do_tasks_here, entry_point, is_free, vdgs, wait_until
+from vdgs.evaluation.alone import BlocksAlone
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
 from vdgs.model.visibility import visibility_of
@@ -20,7 +21,6 @@ from vdgs.partition.assignment.saving import load_scores
 from vdgs.partition.blocks import load_blocks, places_of
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
-from vdgs.stages.evaluate import BlocksAlone
 
 pytestmark = pytest.mark.xdist_group("pipeline")
 

@@ -1,4 +1,4 @@
-"""Blocks on a real Ray of several nodes on this machine: whatever is lost, the models are those of the local run."""
+"""Work on a real Ray of several nodes on this machine: whatever is lost, the results are those of the local run."""
 
 import importlib.util
 import os
@@ -10,7 +10,20 @@ from pathlib import Path
 import pytest
 
 from cli_support import begun, vdgs, wait_until
-from cluster_support import BLOCKS, MIDDLE, Cluster, alive, block_of, copy_run, make_run, models, parent_of, train_here
+from cluster_support import (
+    BLOCKS,
+    MIDDLE,
+    Cluster,
+    alive,
+    block_of,
+    copy_run,
+    evaluated,
+    make_run,
+    merge_run,
+    models,
+    parent_of,
+    train_here,
+)  # fmt: skip
 from vdgs import cli
 
 pytestmark = [
@@ -112,6 +125,26 @@ def test_a_driver_that_was_killed_finds_its_blocks_again_and_stops_them_when_ask
     assert models(run) == models(local)
     for block in (0, 1):
         assert "continuing at iteration 40" in (run / f"blocks/{block:02d}/output.log").read_text()
+
+
+def test_views_are_measured_on_nodes_for_whatever_driver_lives(local, cluster, tmp_path):
+    """The driver is killed; the next finds the piece, and the worker that keeps it is killed."""
+    run = merge_run(local, tmp_path / "run")
+    here = copy_run(run, tmp_path / "here")
+    assert vdgs("eval", here).returncode == 0
+    command = ("eval", run, "--executor", "ray", "--address", cluster.address)
+    with begun(*command, pause_at=("*/pieces/*/000001.npz", 1), environment=cluster.token) as first:
+        first.wait_until_paused(1)
+        first.send_signal(signal.SIGKILL)
+        first.finished()
+        with begun(*command, environment=cluster.token) as second:
+            wait_until(lambda: "piece 00: is still at work" in second.printed())
+            os.kill(parent_of(first.paused()[0]), signal.SIGKILL)
+            wait_until(lambda: "piece 00: crashed by the loss of its worker" in second.printed())
+            first.go_on()
+            done = second.finished()
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert evaluated(run / "evaluation") == evaluated(here / "evaluation")
 
 
 def test_a_node_that_joins_late_and_cannot_work_on_the_run_is_named_and_avoided(cut, local, cluster, tmp_path):

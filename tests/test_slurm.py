@@ -1,4 +1,4 @@
-"""Blocks as jobs of SLURM: a real one of this machine where it is installed, and always a stand-in for its commands."""
+"""Work as jobs of SLURM: a real one of this machine where it is installed, and always a stand-in for its commands."""
 
 import os
 import signal
@@ -9,7 +9,20 @@ from pathlib import Path
 import pytest
 
 from cli_support import Command, begun, vdgs, wait_until
-from cluster_support import BLOCKS, MIDDLE, alive, block_of, copy_run, make_run, models, parent_of, train_here
+from cluster_support import (
+    BLOCKS,
+    MIDDLE,
+    alive,
+    block_of,
+    copy_run,
+    evaluated,
+    make_run,
+    merge_run,
+    models,
+    parent_of,
+    piece_of,
+    train_here,
+)  # fmt: skip
 from slurm_support import is_installed, real, stand_in
 from vdgs.executors import slurm_commands
 from vdgs.executors.executor import Needs
@@ -21,6 +34,7 @@ pytestmark = [
     pytest.mark.xdist_group("slurm"),
     pytest.mark.skipif(sys.platform != "linux", reason="who is whose parent is read from /proc"),
 ]
+OWN = ("--processors", "1", "--memory-gb", "1", "--slurm.poll-seconds", "0.2", "--slurm.time", "1:00:00")
 WITHOUT = "SLURM is not installed: apt-get install slurmctld slurmd slurm-client"
 
 
@@ -49,8 +63,7 @@ def slurm(request, tmp_path, monkeypatch) -> str:
 
 
 def by_slurm(run: Path) -> tuple[object, ...]:
-    own = ("--processors", "1", "--memory-gb", "1", "--slurm.poll-seconds", "0.2", "--slurm.time", "1:00:00")
-    return ("train", run, *BLOCKS, "--executor", "slurm", *own)
+    return ("train", run, *BLOCKS, "--executor", "slurm", *OWN)
 
 
 def variables() -> dict[str, str]:
@@ -122,6 +135,32 @@ def test_a_driver_that_was_killed_finds_its_jobs_again_and_stops_them_when_asked
     done = vdgs(*by_slurm(run), environment=variables())
     assert done.returncode == 0, done.stderr + done.stdout
     assert models(run) == models(local)
+
+
+def test_views_are_measured_by_jobs_for_whatever_driver_lives(slurm, local, tmp_path):
+    """The driver is killed; the next finds the jobs, one of which is killed, another's time is up."""
+    run = merge_run(local, tmp_path / "run")
+    here = copy_run(run, tmp_path / "here")
+    assert vdgs("eval", here, "--views", "training").returncode == 0
+    command = ("eval", run, "--views", "training", "--executor", "slurm", *OWN)
+    with begun(*command, pause_at=("*/pieces/*/00000[13].npz", 1), environment=variables()) as first:
+        first.wait_until_paused(2)
+        first.send_signal(signal.SIGKILL)
+        first.finished()
+        with begun(*command, environment=variables()) as second:
+            wait_until(lambda: second.printed().count("is watched again") >= 2)
+            waiting = {piece_of(process): process for process in first.paused()}
+            os.kill(waiting[0], signal.SIGKILL)
+            wait_until(lambda: "piece 00: crashed by SIGKILL" in second.printed())
+            subprocess.run(["scancel", "--batch", "--signal=USR1", element_of(waiting[1])], check=True)
+            let_go_on_at_once(element_of(waiting[1]))
+            first.go_on()
+            done = second.finished()
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "4 of 4 pieces done" in done.stdout
+    assert "piece 01: crashed" not in done.stdout
+    assert evaluated(run / "evaluation_training") == evaluated(here / "evaluation_training")
+    assert not (run / "slurm").exists()
 
 
 def test_what_slurm_refuses_is_said_in_its_own_words(cut, tmp_path, monkeypatch):

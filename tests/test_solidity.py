@@ -21,7 +21,8 @@ from evaluation_support import load_mask, photograph, psnr, view
 from vdgs.cameras import Camera
 from vdgs.evaluation import metrics
 from vdgs.evaluation.depth_errors import NAMES, DepthErrors, errors_of_view
-from vdgs.evaluation.evaluate import MeasuredModel, evaluate
+from vdgs.evaluation.evaluate import evaluate
+from vdgs.evaluation.measured_model import MeasuredModel
 from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.seen import seen_map
 from vdgs.evaluation.solidity import PSNRS_SEEN, Rendered, larger_than_picture

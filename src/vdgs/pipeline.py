@@ -13,6 +13,7 @@ from vdgs.captures.capture import Capture
 from vdgs.errors import RunError, VdgsError
 from vdgs.evaluation.lpips import refuse_missing
 from vdgs.evaluation.of_run import evaluation_folder
+from vdgs.executors.errand import Wish
 from vdgs.maps.mapping import can_map, is_mapped, map_run
 from vdgs.report import write_report
 from vdgs.report.terminal import next_step, whole_standing
@@ -24,7 +25,7 @@ from vdgs.settings.requests import MapRequest, RunRequest
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.sfm.request import of_photographs, sfm_request
 from vdgs.stages.coarse import train_coarse
-from vdgs.stages.evaluate import evaluate_stage, is_measured
+from vdgs.stages.evaluate import Measuring, evaluate_stage, is_measured
 from vdgs.stages.merge import merge_run
 from vdgs.stages.partition import partition_run
 from vdgs.stages.train import train_blocks
@@ -74,7 +75,7 @@ def _stages(run: RunFolder, capture: Capture, asked: RunRequest, console: Consol
     measure_visibility(run, console)
     _measure(run, "coarse", asked, console)
     _title(console, "blocks")
-    partition_run(run, console, asked.device)
+    partition_run(run, console, asked.device, _wish(asked))
     _title(console, "block training")
     try:
         train_blocks(run.path, asked.watching, asked.jobs, console, asked.device, asked.where)
@@ -118,7 +119,13 @@ def _measure(run: RunFolder, which: Literal["coarse", "merged"], asked: RunReque
     if is_measured(run, which, asked.lpips_weights, asked.bins):
         console.print(f"{evaluation_folder(run, which)}: already measured; nothing to do", highlight=False)
         return
-    evaluate_stage(run.path, which, asked.lpips_weights, asked.bins, console, device=asked.device)
+    measuring = Measuring(run.path, which, asked.lpips_weights, asked.bins, device=asked.device)
+    evaluate_stage(measuring, console, _wish(asked))
+
+
+def _wish(asked: RunRequest) -> Wish:
+    """Where pieces of stages other than the blocks are done: where blocks are trained, if that is a cluster."""
+    return Wish(asked.where, asked.jobs if asked.where.executor != "local" else 0, device=asked.device)
 
 
 def _verdict(run: RunFolder, console: Console) -> None:

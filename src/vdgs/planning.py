@@ -18,7 +18,7 @@ from vdgs.captures.images import ImageCache
 from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import read_reconstruction
 from vdgs.errors import VdgsError
-from vdgs.executors.blocks import default_jobs
+from vdgs.executors.pieces import default_jobs
 from vdgs.kernels import threads as threads_available
 from vdgs.memory.estimate import GROWTH, Need, estimate, in_gb
 from vdgs.memory.process import available_bytes

@@ -24,8 +24,9 @@ from torch import Tensor
 from vdgs.bench.definitions import RENDERS, Method
 from vdgs.captures.capture import Capture, View
 from vdgs.errors import VdgsError
-from vdgs.evaluation.evaluate import MeasuredModel, evaluate
+from vdgs.evaluation.evaluate import evaluate
 from vdgs.evaluation.lpips import load_lpips
+from vdgs.evaluation.measured_model import MeasuredModel
 from vdgs.evaluation.of_run import cached_photographs
 from vdgs.evaluation.saving import file_stems
 from vdgs.storage.tensors import size_and_checksum

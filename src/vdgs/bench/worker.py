@@ -93,9 +93,9 @@ def _merge(at: _Working) -> None:
 
 
 def _evaluate(at: _Working) -> None:
-    from vdgs.stages.evaluate import evaluate_stage
+    from vdgs.stages.evaluate import Measuring, evaluate_stage
 
-    evaluate_stage(at.run.path, "best", at.job.lpips_weights, at.job.bins, at.console)
+    evaluate_stage(Measuring(at.run.path, "best", at.job.lpips_weights, at.job.bins), at.console)
 
 
 def _gaussians(at: _Working) -> None:

@@ -106,6 +106,27 @@ class BlockMetrics:
         for name, total in self._sums.items():
             total += np.bincount(keys, weights=squared_errors[name][counted], minlength=len(total))
 
+    def merge(self, other: BlockMetrics) -> None:
+        """Count what another one counted; view by view, in their order, with the bits of one that counted all."""
+        self._pixels += other._pixels
+        for name, total in self._sums.items():
+            total += other._sums[name]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What was counted: for files."""
+        return {
+            "pixels": self._pixels, "names": np.array([*self._sums], np.str_), "sums": np.stack([*self._sums.values()]),
+        }  # fmt: skip
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, np.ndarray]) -> BlockMetrics:
+        """The inverse of `arrays`."""
+        found = cls(len(arrays["pixels"]), [str(name) for name in arrays["names"]])
+        found._pixels += arrays["pixels"]
+        for name, sums in zip(arrays["names"], arrays["sums"], strict=True):
+            found._sums[str(name)] += sums
+        return found
+
     def rows(self) -> list[dict[str, Any]]:
         """For each block: block, pixels, and `psnr_NAME` in dB of each render, NaN where it has none."""
         return [{"block": index, **self._figures([index])} for index in range(len(self._pixels))]
@@ -143,6 +164,27 @@ class SeamMetrics:
             self._pixels[place] += np.count_nonzero(where)
             for name, sums in self._sums.items():
                 sums[place] += errors[name][where].sum()
+
+    def merge(self, other: SeamMetrics) -> None:
+        """Count what another one counted; view by view, in their order, with the bits of one that counted all."""
+        self._pixels += other._pixels
+        for name, total in self._sums.items():
+            total += other._sums[name]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What was counted: for files."""
+        return {
+            "pixels": self._pixels, "names": np.array([*self._sums], np.str_), "sums": np.stack([*self._sums.values()]),
+        }  # fmt: skip
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, np.ndarray]) -> SeamMetrics:
+        """The inverse of `arrays`."""
+        found = cls()
+        found._pixels += arrays["pixels"]
+        for name, sums in zip(arrays["names"], arrays["sums"], strict=True):
+            found._sums[str(name)] += sums
+        return found
 
     def figures(self) -> dict[str, Any]:
         """Means at the border and elsewhere, their ratio for each render, and `seam_mae`, `seam_mse`: the ratio of the

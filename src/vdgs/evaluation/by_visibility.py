@@ -57,6 +57,40 @@ class VisibilityHistogram:
             total += np.bincount(keys, weights=values[name][seen], minlength=KEYS)
             self._empty_sums[name] += float(values[name][empty].sum())
 
+    def merge(self, other: VisibilityHistogram) -> None:
+        """Count what another one counted. Merged view by view, in their order, sums have the bits of one histogram to
+        which the views were added."""
+        keys = np.flatnonzero(other._counts)
+        self._counts[keys] += other._counts[keys]
+        self._empty_count += other._empty_count
+        for name, total in self._sums.items():
+            total[keys] += other._sums[name][keys]
+            self._empty_sums[name] += other._empty_sums[name]
+
+    @property
+    def names(self) -> list[str]:
+        return [*self._sums]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What was counted, without the places where nothing was: for files."""
+        keys = np.flatnonzero(self._counts)
+        return {
+            "names": np.array(self.names, np.str_), "keys": keys, "counts": self._counts[keys],
+            "sums": np.stack([total[keys] for total in self._sums.values()]),
+            "empty_count": np.array(self._empty_count), "empty_sums": np.array([*self._empty_sums.values()]),
+        }  # fmt: skip
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, np.ndarray]) -> VisibilityHistogram:
+        """The inverse of `arrays`."""
+        found = cls([str(name) for name in arrays["names"]])
+        found._counts[arrays["keys"]] = arrays["counts"]
+        found._empty_count = int(arrays["empty_count"])
+        for name, sums, empty in zip(found.names, arrays["sums"], arrays["empty_sums"], strict=True):
+            found._sums[name][arrays["keys"]] = sums
+            found._empty_sums[name] = float(empty)
+        return found
+
     def bins(self, n_bins: int = QUANTILE_BINS) -> list[Bin]:
         """Quantile bins, least visible first: lower and upper V (whole, inclusive), pixels, a figure per name.
 

@@ -35,6 +35,24 @@ class DepthErrors:
         self._counts += np.bincount(key_of(errors), minlength=KEYS)
         self._near += int(np.count_nonzero(errors <= NEAR))
 
+    def merge(self, other: DepthErrors) -> None:
+        """Count what another one counted."""
+        self._counts += other._counts
+        self._near += other._near
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What was counted, without the places where nothing was: for files."""
+        keys = np.flatnonzero(self._counts)
+        return {"keys": keys, "counts": self._counts[keys], "near": np.array(self._near)}
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, np.ndarray]) -> DepthErrors:
+        """The inverse of `arrays`."""
+        found = cls()
+        found._counts[arrays["keys"]] = arrays["counts"]
+        found._near = int(arrays["near"])
+        return found
+
     @property
     def count(self) -> int:
         return int(self._counts.sum())

@@ -17,8 +17,9 @@ from vdgs.captures.capture import Capture, View
 from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
 from vdgs.errors import RunError
-from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
+from vdgs.evaluation.evaluate import evaluate
 from vdgs.evaluation.lpips import load_lpips
+from vdgs.evaluation.measured_model import EvaluationSettings, MeasuredModel, ModelFacts
 from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.seen import seen_map
 from vdgs.model.anchor_model import AnchorModel
@@ -39,10 +40,33 @@ def evaluate_run(
     run: TrainedRun, lpips_weights: Path | None, bins: int, console: Console, views: Views = "test"
 ) -> None:
     """Measure a model of a run and print a table. Writes `evaluation_folder`."""
-    if bins < 1:
-        raise RunError(f"--bins is {bins}; it must be at least 1")
+    refuse_bins(bins)
     output = evaluation_folder(run.folder, run.name, views)
     lpips, note = load_lpips(lpips_weights)
+    model, chosen = measured_model(run, views), views_of(run.capture, views)
+    with cached_photographs(chosen) as photographs:
+        evaluate(
+            photographs, model, output, lpips=lpips, lpips_note=note, console=console, settings=settings_of(bins, views)
+        )
+    console.print(f"pictures and figures: {output}", highlight=False)
+
+
+def refuse_bins(bins: int) -> None:
+    if bins < 1:
+        raise RunError(f"--bins is {bins}; it must be at least 1")
+
+
+def settings_of(bins: int, views: Views) -> EvaluationSettings:
+    return EvaluationSettings(visibility_bins=bins, title=f"{views} views")
+
+
+def views_of(capture: Capture, views: Views) -> list[View]:
+    """The views that are measured."""
+    return list(capture.test_views if views == "test" else capture.train_views)
+
+
+def measured_model(run: TrainedRun, views: Views) -> MeasuredModel:
+    """The opened model as the evaluation sees it."""
     facts = ModelFacts(
         model=run.name,
         n_anchors=len(run.model.anchors),
@@ -52,26 +76,18 @@ def evaluate_run(
         model_identity=run.status.model,
         key=run.key,
     )
-    chosen = run.capture.test_views if views == "test" else run.capture.train_views
     coarse = coarse_of(run)
-    model = MeasuredModel(
+    return MeasuredModel(
         lambda camera: render(run.model, camera),
         visibility_map(coarse),
         facts,
         background=run.model.background,
         seen_map=seen_by_run(coarse),
-        true_depth=true_depth(run.capture, chosen),
+        true_depth=true_depth(run.capture, views_of(run.capture, views)),
         render_depth=lambda camera: render(run.model, camera, depth=True),
         camera_height=camera_height(run.capture),
         splats_of=lambda camera: decode_view(run.model, camera)[1],
     )
-    with cached_photographs(chosen) as photographs:
-        evaluate(
-            photographs, model, output,
-            lpips=lpips, lpips_note=note, console=console,
-            settings=EvaluationSettings(visibility_bins=bins, title=f"{views} views"),
-        )  # fmt: skip
-    console.print(f"pictures and figures: {output}", highlight=False)
 
 
 @contextmanager

@@ -6,8 +6,8 @@ OUTPUT/seams/NAME.png   coarse | merged | merged with the borders of blocks | er
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +69,10 @@ class SeamView:
 
 
 @dataclass(frozen=True, eq=False)
-class _Inputs:
-    """Where the images of a view come from."""
+class BlockInputs:
+    """Where the images of a view come from. `render_merged` draws depth; the labels follow from the median one.
+    `render_block(index, camera)` is the image of a block as it was trained, among its frozen surroundings; None where
+    it was not trained."""
 
     photographs: ReferenceViews
     render_coarse: Callable[[Camera], Raster]
@@ -79,77 +81,88 @@ class _Inputs:
     blocks: Blocks
 
 
-@dataclass(eq=False)
-class _Gathered:
-    """What accumulates over the views; of the pictures, only the best so far."""
+@dataclass(frozen=True, eq=False)
+class BlockFigures:
+    """What one view says of the blocks."""
 
+    row: dict[str, Any]
     by_block: BlockMetrics
-    seams: SeamMetrics = field(default_factory=SeamMetrics)
-    views: list[dict[str, Any]] = field(default_factory=list)
-    worth_seeing: list[SeamView] = field(default_factory=list)
+    seams: SeamMetrics
 
 
-def evaluate_blocks(
-    photographs: ReferenceViews,
-    render_coarse: Callable[[Camera], Raster],
-    render_merged: Callable[[Camera], Raster],
-    render_block: Callable[[int, Camera], Raster | None],
-    blocks: Blocks,
-    output: Path,
-) -> dict[str, Any]:
+def evaluate_blocks(inputs: BlockInputs, output: Path) -> dict[str, Any]:
     """Measure every test view, write `output`, and return what `by_block.json` holds. One view is in memory at a time,
     and those that are drawn.
 
-    `render_merged` draws depth; the labels follow from the median one. `render_block(index, camera)` is the image of a
-    block as it was trained, among its frozen surroundings; None where the block was not trained, whose figure is then
-    null. Raises RunError without views.
+    The figure of a block that was not trained is null. Raises RunError without views.
     """
-    views = photographs.views
+    views = inputs.photographs.views
     if not views:
         raise RunError(f"{output}: there are no test views. Hold some out when the capture is read.")
-    inputs = _Inputs(photographs, render_coarse, render_merged, render_block, blocks)
-    gathered = _Gathered(BlockMetrics(len(blocks), RENDERS))
+    measured, seen = list[BlockFigures](), list[SeamView]()
     for view, stem in zip(views, saving.file_stems([view.name for view in views]), strict=True):
         stop_if_asked()
-        _measure(view, stem, inputs, gathered)
-    result = jsonable(
+        figures, picture = measure_view(view, stem, inputs)
+        measured.append(figures)
+        seen.append(picture)
+        seen = [seen[place] for place in worth_seeing([each.border_pixels for each in seen])]
+    for each in seen:
+        save_picture(output / "seams" / f"{each.stem}.png", each)
+    return conclude(measured, len(inputs.blocks), output)
+
+
+def worth_seeing(border_pixels: Sequence[int]) -> list[int]:
+    """Which of the views are drawn, by the number of border pixels of each: those with most, the first of equals."""
+    best = sorted(range(len(border_pixels)), key=lambda place: -border_pixels[place])[:SEAM_VIEWS]
+    return [place for place in best if border_pixels[place]]
+
+
+def save_picture(path: Path, view: SeamView) -> None:
+    saving.write_png(path, np.asarray(seam_picture(view)))
+
+
+def conclude(measured: Iterable[BlockFigures], blocks: int, output: Path) -> dict[str, Any]:
+    """Gather views, in their order, into what `by_block.json` holds, and write it: once its pictures are complete."""
+    by_block, seams, rows = BlockMetrics(blocks, RENDERS), SeamMetrics(), list[dict[str, Any]]()
+    for figures in measured:
+        by_block.merge(figures.by_block)
+        seams.merge(figures.seams)
+        rows.append(figures.row)
+    result: dict[str, Any] = jsonable(
         {
-            "blocks": gathered.by_block.rows(),
-            "all": gathered.by_block.everywhere(),
-            "seams": {"border_px": BORDER_PX, **gathered.seams.figures()},
-            "views": gathered.views,
+            "blocks": by_block.rows(),
+            "all": by_block.everywhere(),
+            "seams": {"border_px": BORDER_PX, **seams.figures()},
+            "views": rows,
         }
     )
-    for seen in gathered.worth_seeing:
-        saving.write_png(output / "seams" / f"{seen.stem}.png", np.asarray(seam_picture(seen)))
-    write_json(output / "by_block.json", result)  # last: where it stands, the pictures are complete
+    write_json(output / "by_block.json", result)
     return result
 
 
-def _measure(view: View, stem: str, inputs: _Inputs, gathered: _Gathered) -> None:
+def measure_view(view: View, stem: str, inputs: BlockInputs) -> tuple[BlockFigures, SeamView]:
+    """Measure a view; what it comes to, and what a picture of it shows."""
+    by_block, seams = BlockMetrics(len(inputs.blocks), RENDERS), SeamMetrics()
     reference, mask = inputs.photographs.load_image(view), inputs.photographs.load_mask(view)
     drawn = inputs.render_merged(view.camera)
     labels = label_map(drawn, view.camera, inputs.blocks)
     coarse, merged = _eight_bits(inputs.render_coarse(view.camera)), _eight_bits(drawn)
     squared = {"coarse": squared_error(coarse, reference), "merged": squared_error(merged, reference)}
     alone = _alone(view.camera, labels, reference, inputs)
-    gathered.by_block.add(labels, squared | {"alone": alone}, mask)
+    by_block.add(labels, squared | {"alone": alone}, mask)
     errors = {f"mse_{name}": values for name, values in squared.items()}
     errors["mae_coarse"] = pictures.absolute_error(coarse, reference)
     errors["mae_merged"] = pictures.absolute_error(merged, reference)
-    gathered.seams.add(labels, errors, mask)
+    seams.add(labels, errors, mask)
     kept = border_pixels(labels) if mask is None else border_pixels(labels) & mask
     seen = SeamView(view.name, stem, coarse, merged, reference, mask, labels, kept)
-    best = sorted([*gathered.worth_seeing, seen], key=lambda each: -each.border_pixels)
-    gathered.worth_seeing = [each for each in best[:SEAM_VIEWS] if each.border_pixels]
-    gathered.views.append(
-        {
-            "name": view.name,
-            "border_pixels": seen.border_pixels,
-            **{f"psnr_{name}": psnr_of(masked_mean(values, mask)) for name, values in squared.items()},
-            **{f"psnr_{name}_border": _psnr_within(values, kept) for name, values in squared.items()},
-        }
-    )
+    row = {
+        "name": view.name,
+        "border_pixels": seen.border_pixels,
+        **{f"psnr_{name}": psnr_of(masked_mean(values, mask)) for name, values in squared.items()},
+        **{f"psnr_{name}_border": _psnr_within(values, kept) for name, values in squared.items()},
+    }
+    return BlockFigures(row, by_block, seams), seen
 
 
 def _psnr_within(values: Float[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"]) -> float | None:
@@ -157,7 +170,7 @@ def _psnr_within(values: Float[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"
 
 
 def _alone(
-    camera: Camera, labels: Int16[np.ndarray, "h w"], reference: UInt8[np.ndarray, "h w 3"], inputs: _Inputs
+    camera: Camera, labels: Int16[np.ndarray, "h w"], reference: UInt8[np.ndarray, "h w 3"], inputs: BlockInputs
 ) -> Float[np.ndarray, "h w"]:
     """Squared error of each block's own render where the block is shown, NaN where there is none."""
     errors = np.full(labels.shape, np.nan)

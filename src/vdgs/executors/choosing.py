@@ -13,18 +13,18 @@ from vdgs.executors.placement import Share, Work, by_queue, on_cluster, on_this_
 from vdgs.memory.estimate import in_gb
 from vdgs.settings.executors import ExecutorOptions
 
-#: Seconds to wait for what still holds a block: NFS lets go of what a lost node held after a minute and a half.
+#: Seconds to wait for what still holds a piece of work: NFS lets go of what a lost node held after a minute and a half.
 PATIENCE_SECONDS = 300.0
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """What runs blocks, and what each gets."""
+    """What runs pieces of work, and what each gets."""
 
     executor: Executor
     share: Share
     line: str
-    """Where blocks run and with what, in words."""
+    """Where they run and with what, in words."""
     notes: tuple[str, ...] = ()
     """What a person should know before it begins."""
 
@@ -39,8 +39,8 @@ class Machine:
 
 @contextmanager
 def choose(asked: ExecutorOptions, work: Work, machine: Machine, question: Callable[[], Question]) -> Iterator[Chosen]:
-    """Be ready to run blocks while the context lasts. `question` says what machines must see; asked of other machines
-    only.
+    """Be ready to run pieces of work while the context lasts. `question` says what machines must see; asked of other
+    machines only.
 
     Raises VdgsError, before anything starts, for options that do not work, where there is no such cluster, and where a
     machine cannot work on the run.
@@ -60,13 +60,13 @@ def choose(asked: ExecutorOptions, work: Work, machine: Machine, question: Calla
 def _local(work: Work, machine: Machine) -> Chosen:
     share = on_this_machine(work, machine.cores, machine.free_bytes)
     line = (
-        f"{share.at_once} at once with {share.needs.processors} thread(s) each; by estimate a block takes at most "
-        f"{in_gb(work.block_bytes)} beside its photographs, of {in_gb(machine.free_bytes)} free"
+        f"{share.at_once} at once with {share.needs.processors} thread(s) each; by estimate a {work.kind.one} takes "
+        f"at most {in_gb(work.piece_bytes)} beside its photographs, of {in_gb(machine.free_bytes)} free"
     )
-    short = share.at_once * work.block_bytes > machine.free_bytes
+    short = share.at_once * work.piece_bytes > machine.free_bytes
     note = (
-        f"[yellow]warning[/] {share.at_once} at once may run out of memory. What helps: less --jobs, more --blocks, "
-        "--block.growth.max-anchors"
+        f"[yellow]warning[/] {share.at_once} at once may run out of memory. What helps: "
+        f"{', '.join(('less --jobs', *work.kind.smaller))}"
     )
     return Chosen(LocalExecutor(share.at_once), share, line, (note,) if short else ())
 
@@ -85,17 +85,17 @@ def _ray(asked: ExecutorOptions, work: Work, question: Question) -> Chosen:
         node.processors >= needs.processors and node.memory_bytes >= needs.memory_bytes and node.gpus >= needs.gpus
         for node in there
     ):
-        notes.append(f"[yellow]note[/] no node has {_needs(share)} now: blocks wait until one joins that has")
-    if needs.memory_bytes and needs.memory_bytes < work.block_bytes:
+        notes.append(f"[yellow]note[/] no node has {_needs(share)} now: {work.kind.many} wait until one joins that has")
+    if needs.memory_bytes and needs.memory_bytes < work.piece_bytes:
         notes.append(
-            f"[yellow]warning[/] by estimate a block takes at most {in_gb(work.block_bytes)}, more than any node has. "
-            "What helps: more --blocks, --block.growth.max-anchors"
+            f"[yellow]warning[/] by estimate a {work.kind.one} takes at most {in_gb(work.piece_bytes)}, more than any "
+            "node has." + (f" What helps: {', '.join(work.kind.smaller)}" if work.kind.smaller else "")
         )
     processors = sorted({answer["processor"] for answer in answers})
     if len(processors) > 1:
         notes.append(
-            f"[yellow]note[/] nodes have different processors ({', '.join(processors)}): a block that changes between "
-            "them ends with other last bits. With VDGS_ISA=avx2 (or portable) all compute alike"
+            f"[yellow]note[/] nodes have different processors ({', '.join(processors)}): what they compute differs in "
+            "its last bits. With VDGS_ISA=avx2 (or portable) all compute alike"
         )
     names = len(there), sum(node.processors for node in there)
     line = f"over {names[0]} node{'s' if names[0] > 1 else ''} of Ray with {names[1]} processors, {_needs(share)} each"

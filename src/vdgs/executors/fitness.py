@@ -18,6 +18,7 @@ from typing import Any
 from uuid import uuid4
 
 from vdgs import __version__
+from vdgs.captures.capture import View
 from vdgs.runs.locks import hold, is_locked
 from vdgs.storage.files import write_text
 
@@ -59,6 +60,11 @@ class Question:
             held.rmdir()
 
 
+def photographs_of(views: Sequence[View]) -> list[Path]:
+    """The files of photographs, and of masks where they have any."""
+    return [path for view in views for path in (view.image_path, view.mask_path) if path is not None]
+
+
 def examine(question: Mapping[str, Any]) -> dict[str, Any]:
     """This machine's answer: its `node`, the `processor`'s instructions, and the `problems` that it sees, in words."""
     problems = [*_folder(question), *_files(question["files"]), *_code(question)]
@@ -93,7 +99,7 @@ def _folder(question: Mapping[str, Any]) -> list[str]:
 
 _WITHOUT_LOCKS = (
     "{}: locks of files (flock) {}. Mount that file system with them (NFS 4; Lustre: -o flock), or two machines may "
-    "write the same block"
+    "write the same files"
 )
 
 

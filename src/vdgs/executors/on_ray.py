@@ -55,7 +55,7 @@ def connected(address: str | None) -> Iterator[None]:
     variables, own = {"RAY_USAGE_STATS_ENABLED": "0"}, dict[str, Any]()
     if where == "local":
         own = {"include_dashboard": False, "object_store_memory": OBJECT_BYTES}
-        variables["RAY_worker_niceness"] = "0"  # as blocks have it that are processes of this machine
+        variables["RAY_worker_niceness"] = "0"  # as tasks have it that are processes of this machine
         # Ray listens on all addresses: let in who has the token, which is nobody else.
         variables |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     before = {name: os.environ.get(name) for name in variables}

@@ -1,4 +1,4 @@
-"""A block's process ends with the process that started it, even if that one was killed without a word."""
+"""The process of a task ends with the process that started it, even if that one was killed without a word."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a place is shared out among blocks: how many at once, with how many threads, memory and photographs each."""
+"""How a place is shared out among pieces of work: how many at once, with how many threads and how much memory each."""
 
 from __future__ import annotations
 
@@ -6,20 +6,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from vdgs.executors.blocks import default_jobs
 from vdgs.executors.executor import Needs
+from vdgs.executors.kinds import BLOCKS, Kind
+from vdgs.executors.pieces import default_jobs
 from vdgs.settings.executors import ExecutorOptions
 
-#: Processors of a block where nobody knows how many there are (choice).
+#: Processors of a piece where nobody knows how many there are (choice).
 PROCESSORS = 4
-#: Share of its memory that a block keeps decoded photographs in, and GB where nobody knows how much there is (choice).
+#: Share of its memory that a piece keeps decoded photographs in, and GB where nobody knows how much there is (choice).
 IMAGES_SHARE, IMAGES_GB = 0.25, 1.0
 #: GB for photographs at least (choice): those of a step and of the next.
 LEAST_IMAGES_GB = 0.1
 
 
 class Place(Protocol):
-    """A machine that blocks can be sent to."""
+    """A machine that pieces can be sent to."""
 
     @property
     def processors(self) -> int:
@@ -34,18 +35,19 @@ class Place(Protocol):
 class Work:
     """What is to be shared out."""
 
-    blocks: int
-    block_bytes: int
-    """What the largest block takes by estimate, beside its photographs."""
+    pieces: int
+    piece_bytes: int
+    """What the largest piece takes by estimate, beside its photographs."""
     jobs: int = 0
-    """Blocks at once that a person asked for; 0: as many as there is room for."""
+    """Pieces at once that a person asked for; 0: as many as there is room for."""
     image_gb: float = 0.0
     """Memory for photographs that a person asked for; 0: by the memory that there is."""
+    kind: Kind = BLOCKS
 
 
 @dataclass(frozen=True)
 class Share:
-    """What a block gets."""
+    """What a piece gets."""
 
     at_once: int
     needs: Needs
@@ -53,43 +55,43 @@ class Share:
 
 
 def on_this_machine(work: Work, cores: int, free_bytes: int) -> Share:
-    """Of one machine: as many blocks at once as there are cores and memory for; photographs share one budget."""
-    at_once, threads = default_jobs(work.blocks, cores, free_bytes, work.block_bytes)
+    """Of one machine: as many pieces at once as there are cores and memory for; photographs share one budget."""
+    at_once, threads = default_jobs(work.pieces, cores, free_bytes, work.piece_bytes)
     if work.jobs:
-        at_once = min(work.jobs, work.blocks)
+        at_once = min(work.jobs, work.pieces)
         threads = max(1, cores // at_once)
     budget = work.image_gb or free_bytes * IMAGES_SHARE / 1e9
-    return Share(at_once, Needs(threads, work.block_bytes), budget / at_once)
+    return Share(at_once, Needs(threads, work.piece_bytes), budget / at_once)
 
 
 def on_cluster(work: Work, places: Sequence[Place], asked: ExecutorOptions) -> Share:
-    """Of machines that are known: all blocks at once if there are processors for that, with as many as each can have.
+    """Of machines that are known: all pieces at once if there are processors for that, with as many as each can have.
 
-    A block asks for the memory that it takes by estimate and for its photographs, or for all of the largest machine
-    where that is less. `Work.image_gb` is of one block here.
+    A piece asks for the memory that it takes by estimate and for its photographs, or for all of the largest machine
+    where that is less. `Work.image_gb` is of one piece here.
     """
-    at_once = min(work.blocks, work.jobs or work.blocks)
+    at_once = min(work.pieces, work.jobs or work.pieces)
     processors = asked.processors or _processors(at_once, places)
     most = max(place.memory_bytes for place in places)
     whole = max(places, key=lambda place: place.memory_bytes)
     share = whole.memory_bytes * min(1, processors / whole.processors) / 1e9
-    beside = max(LEAST_IMAGES_GB, share - work.block_bytes / 1e9)
+    beside = max(LEAST_IMAGES_GB, share - work.piece_bytes / 1e9)
     images = work.image_gb or min(IMAGES_SHARE * share, beside)
-    wanted = round(1e9 * asked.memory_gb) or work.block_bytes + round(1e9 * images)
+    wanted = round(1e9 * asked.memory_gb) or work.piece_bytes + round(1e9 * images)
     memory = wanted if asked.memory_gb or not most else min(wanted, most)
     return Share(at_once, Needs(processors, memory if most else 0, asked.gpus), images)
 
 
 def by_queue(work: Work, asked: ExecutorOptions) -> Share:
     """Of machines that nobody knows before jobs start."""
-    at_once = min(work.blocks, work.jobs or work.blocks)
+    at_once = min(work.pieces, work.jobs or work.pieces)
     images = work.image_gb or IMAGES_GB
-    memory = round(1e9 * asked.memory_gb) or work.block_bytes + round(1e9 * images)
+    memory = round(1e9 * asked.memory_gb) or work.piece_bytes + round(1e9 * images)
     return Share(at_once, Needs(asked.processors or PROCESSORS, memory, asked.gpus), images)
 
 
 def _processors(at_once: int, places: Sequence[Place]) -> int:
-    """The largest number of processors with which so many blocks find room at once; 1 if none do."""
+    """The largest number of processors with which so many pieces find room at once; 1 if none do."""
     most = max(place.processors for place in places)
     fitting = [each for each in range(1, most + 1) if sum(place.processors // each for place in places) >= at_once]
     return max(fitting, default=1)

@@ -1,4 +1,4 @@
-"""How far blocks are: what their status files say, how fast they are and how long they will take."""
+"""How far pieces of work are: what their status files say, how fast they are and how long they will take."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ def _count(value: Any) -> int | None:
     return None if number is None else int(number)
 
 
-class BlockProgress:
-    """What is known of a block while the others run."""
+class PieceProgress:
+    """What is known of a piece while the others run."""
 
     def __init__(self, index: int):
         self.index = index
@@ -100,7 +100,7 @@ class BlockProgress:
 
     @property
     def seconds_left(self) -> float | None:
-        """What the block says itself, else what follows from its speed; None where neither is known."""
+        """What the piece says itself, else what follows from its speed; None where neither is known."""
         if self.figures.seconds_left is not None:
             return self.figures.seconds_left
         iteration, iterations, speed = self.figures.iteration, self.figures.iterations, self.speed
@@ -109,10 +109,10 @@ class BlockProgress:
         return max(iterations - iteration, 0) / speed
 
 
-def seconds_left_overall(rows: list[BlockProgress], at_once: int) -> float | None:
-    """Estimated time until all blocks are done; None before anything is known (complexity: one pass).
+def seconds_left_overall(rows: list[PieceProgress], at_once: int) -> float | None:
+    """Estimated time until all pieces are done; None before anything is known (complexity: one pass).
 
-    Blocks that wait are taken to be as fast, and where they say nothing as long, as those that ran.
+    Those that wait are taken to be as fast, and where they say nothing as long, as those that ran.
     """
     speeds = [row.speed for row in rows if row.speed]
     lengths = [row.figures.iterations for row in rows if row.figures.iterations]

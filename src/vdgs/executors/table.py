@@ -1,4 +1,4 @@
-"""What a person sees of blocks that run side by side: a live table on a terminal, lines elsewhere."""
+"""What a person sees of pieces of work that run side by side: a live table on a terminal, lines elsewhere."""
 
 from __future__ import annotations
 
@@ -11,20 +11,23 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from vdgs.executors.progress import BlockProgress, State, seconds_left_overall
+from vdgs.executors.kinds import BLOCKS, Kind
+from vdgs.executors.progress import PieceProgress, State, seconds_left_overall
 
 #: Seconds between two summary lines where there is no terminal to redraw.
 PLAIN_SECONDS = 15.0
-#: Lines of the table that are not rows of blocks: head, rules, totals, and one to spare for the prompt.
+#: Lines of the table that are not rows of pieces: head, rules, totals, and one to spare for the prompt.
 FRAME_LINES = 7
+#: Columns of what trains.
+TRAINING = ("PSNR", "anchors")
 STYLES: dict[State, str] = {"queued": "dim", "running": "cyan", "done": "green", "failed": "red", "stopped": "yellow"}
 
 
 class Board:
     """Shows rows until it is closed. Everything printed meanwhile goes through it, above the table."""
 
-    def __init__(self, console: Console, rows: list[BlockProgress], at_once: int):
-        self._console, self._rows, self._at_once = console, rows, at_once
+    def __init__(self, console: Console, rows: list[PieceProgress], at_once: int, kind: Kind = BLOCKS):
+        self._console, self._rows, self._at_once, self._kind = console, rows, at_once, kind
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
         self._last_line = time.monotonic()
 
@@ -50,42 +53,46 @@ class Board:
     def show(self) -> None:
         """Redraw the table, or print the summary line if it is time."""
         if self._live is not None:
-            table = progress_table(self._rows, self._at_once, self._console.height - FRAME_LINES)
+            table = progress_table(self._rows, self._at_once, self._console.height - FRAME_LINES, self._kind)
             self._live.update(table, refresh=True)
         elif self._open and time.monotonic() - self._last_line >= PLAIN_SECONDS:
             self._last_line = time.monotonic()
-            self.say(progress_line(self._rows, self._at_once))
+            self.say(progress_line(self._rows, self._at_once, self._kind))
 
     @property
     def _open(self) -> bool:
         return any(row.state in ("queued", "running") for row in self._rows)
 
 
-def progress_table(rows: list[BlockProgress], at_once: int, most: int) -> Table:
-    """One row for each block and one with totals; of more than `most`, those that wait or are done are counted."""
+def progress_table(rows: list[PieceProgress], at_once: int, most: int, kind: Kind = BLOCKS) -> Table:
+    """One row for each piece and one with totals; of more than `most`, those that wait or are done are counted."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), caption_justify="left")  # 80 columns
-    for column in ("block", "state", "iteration", "PSNR", "anchors", "it/s", "left", "memory", "tries"):
+    columns = (kind.one, "state", kind.steps, *TRAINING, kind.pace, "left", "memory", "tries")
+    chosen = [place for place, column in enumerate(columns) if kind.trains or column not in TRAINING]
+    for column in (columns[place] for place in chosen):
         table.add_column(column, justify="left" if column == "state" else "right", no_wrap=True)
     shown = _chosen(rows, max(most, 1))
     for row in shown:
-        table.add_row(*_cells(row), style=STYLES[row.state])
+        cells = _cells(row)
+        table.add_row(*(cells[place] for place in chosen), style=STYLES[row.state])
     if len(shown) < len(rows):
         hidden = [row for row in rows if row not in shown]
         table.caption = f"and {_states(hidden)}"
     table.add_section()
-    table.add_row(*_totals(rows, at_once), style="bold")
+    totals = _totals(rows, at_once)
+    table.add_row(*(totals[place] for place in chosen), style="bold")
     return table
 
 
-def progress_line(rows: list[BlockProgress], at_once: int) -> str:
-    """The table in one line: counts, the blocks that run, the time left."""
+def progress_line(rows: list[PieceProgress], at_once: int, kind: Kind = BLOCKS) -> str:
+    """The table in one line: counts, the pieces that run, the time left."""
     running = [
         f"{row.index:02d}: {_iteration(row)}" + (f" {row.figures.psnr:.2f} dB" if row.figures.psnr is not None else "")
         for row in rows
         if row.state == "running"
     ]
     left = seconds_left_overall(rows, at_once)
-    parts = [f"blocks: {_states(rows)}", *running] + ([f"about {duration(left)} left"] if left is not None else [])
+    parts = [f"{kind.many}: {_states(rows)}", *running] + ([f"about {duration(left)} left"] if left is not None else [])
     return " · ".join(parts)
 
 
@@ -95,7 +102,7 @@ def duration(seconds: float) -> str:
     return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
-def _chosen(rows: list[BlockProgress], most: int) -> list[BlockProgress]:
+def _chosen(rows: list[PieceProgress], most: int) -> list[PieceProgress]:
     if len(rows) <= most:
         return rows
     urgency = {"running": 0, "failed": 1, "stopped": 2, "queued": 3, "done": 4}
@@ -103,19 +110,19 @@ def _chosen(rows: list[BlockProgress], most: int) -> list[BlockProgress]:
     return [row for row in rows if row in urgent]
 
 
-def _states(rows: Sequence[BlockProgress]) -> str:
+def _states(rows: Sequence[PieceProgress]) -> str:
     count = Counter(row.state for row in rows)
     return ", ".join(f"{count[state]} {state}" for state in STYLES if count[state])
 
 
-def _iteration(row: BlockProgress) -> str:
+def _iteration(row: PieceProgress) -> str:
     figures = row.figures
     if figures.iteration is None:
         return "starting" if row.state == "running" else "–"
     return f"{figures.iteration:,}" + (f"/{figures.iterations:,}" if figures.iterations is not None else "")
 
 
-def _cells(row: BlockProgress) -> list[str]:
+def _cells(row: PieceProgress) -> list[str]:
     figures, running = row.figures, row.state == "running"
     return [
         f"{row.index:02d}",
@@ -130,7 +137,7 @@ def _cells(row: BlockProgress) -> list[str]:
     ]
 
 
-def _totals(rows: list[BlockProgress], at_once: int) -> list[str]:
+def _totals(rows: list[PieceProgress], at_once: int) -> list[str]:
     running = [row for row in rows if row.state == "running"]
     done = sum(row.state == "done" for row in rows)
     speeds = [row.speed for row in running if row.speed is not None]
@@ -149,8 +156,8 @@ def _totals(rows: list[BlockProgress], at_once: int) -> list[str]:
     ]
 
 
-def _percent(rows: list[BlockProgress]) -> str:
-    """Share of the work done, a block that says nothing counting as one that has not begun."""
+def _percent(rows: list[PieceProgress]) -> str:
+    """Share of the work done, a piece that says nothing counting as one that has not begun."""
     shares = []
     for row in rows:
         iteration, iterations = row.figures.iteration, row.figures.iterations

@@ -16,6 +16,9 @@ PROGRAM_BYTES = 350_000_000
 BYTES_PER_PIXEL = 150
 #: What a step makes of an anchor in view, for each of its Gaussians (measured with ten: 1.55 kB an anchor).
 STEP_BYTES_PER_OFFSET = 155
+#: A picture that is measured: maps of errors and of V, each in double precision; the features of both pictures that
+#: LPIPS compares, its widest layer (choice: not measured).
+MEASURED_BYTES_PER_PIXEL, LPIPS_BYTES_PER_PIXEL = 400, 2000
 #: Anchors may grow to so many times their number where nothing limits them (choice; real captures: 1.2 to 3).
 GROWTH = 3.0
 #: Numbers of an anchor apart from its offsets: place, feature, log-scales.
@@ -113,6 +116,13 @@ def estimate(need: Need) -> Estimate:
         PROGRAM_BYTES, need.images_bytes, BYTES_PER_PIXEL * need.pixels,
         round(start + frozen), round(_per_grown_anchor(need) * need.grown + frozen),
     )  # fmt: skip
+
+
+def drawing_bytes(models: int, held: int, pixels: int, lpips: bool = False) -> int:
+    """What measuring pictures of `pixels` takes at most; `models` have so many bytes on the disk. They are held as
+    they are there, and what drawing makes of their anchors is about as much again. `held`: other models beside them."""
+    features = LPIPS_BYTES_PER_PIXEL if lpips else 0
+    return PROGRAM_BYTES + 2 * models + held + (MEASURED_BYTES_PER_PIXEL + features) * pixels
 
 
 def advice(need: Need, kind: Kind, to_save: int) -> list[Advice]:

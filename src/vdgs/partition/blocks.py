@@ -6,7 +6,7 @@ Coordinates are x, y of the ground frame, float64. The owner of a place depends 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -72,12 +72,14 @@ class Blocks:
         return reached
 
 
-def save_blocks(path: Path, blocks: Blocks, facts: Sequence[dict[str, Any]]) -> None:
-    """Write cores and widened boundaries as a FeatureCollection, atomically, with `facts` of each block.
+def save_blocks(
+    path: Path, blocks: Blocks, facts: Sequence[dict[str, Any]], of_all: Mapping[str, Any] | None = None
+) -> None:
+    """Write cores and widened boundaries as a FeatureCollection, atomically, with `facts` of each block and `of_all`.
 
     Coordinates keep all digits: what is read owns exactly what was written.
     """
-    write_json(path, _collection(blocks, facts))
+    write_json(path, _collection(blocks, facts) | dict(of_all or {}))
 
 
 def save_blocks_wgs84(path: Path, blocks: Blocks, facts: Sequence[dict[str, Any]], ground: GroundFrame) -> None:

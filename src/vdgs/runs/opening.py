@@ -14,7 +14,7 @@ from vdgs.captures.facts import refuse_another_capture
 from vdgs.captures.loading import load_capture
 from vdgs.errors import CaptureError, RunError
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.runs.folder import RunFolder
+from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.standing import standing_of
 from vdgs.runs.status import Status
 from vdgs.runs.vouching import load_vouched
@@ -42,8 +42,7 @@ class OpenedModel:
     @property
     def line(self) -> str:
         """Which model it is, in a few words."""
-        size = self.model_path.stat().st_size / 1e6
-        return f"{self.name} model ({len(self.model.anchors):,} anchors, {size:,.1f} MB)"
+        return _model_line(self.name, len(self.model.anchors), self.model_path)
 
     @property
     def device(self) -> torch.device:
@@ -72,15 +71,39 @@ def open_run(path: Path, which: ModelName = "best", device: torch.device | str =
 
 def open_model(folder: RunFolder, which: ModelName = "best", device: torch.device | str = "cpu") -> OpenedModel:
     """Open a model of a run on a device, without the capture. Raises RunError if it is not trained."""
+    found = find_model(folder, which)
+    model = load_vouched(found.stage, found.key).to(torch.device(device))
+    return OpenedModel(folder, model, found.stage.model, found.name, found.stage.status(), found.key, found.caution)
+
+
+@dataclass(frozen=True)
+class FoundModel:
+    """One of the models of a run, not read yet; as `OpenedModel`."""
+
+    stage: StageFolder
+    name: str
+    key: str
+    caution: str
+
+    @property
+    def line(self) -> str:
+        """Which model it is, in a few words."""
+        return _model_line(self.name, self.stage.status().anchors or 0, self.stage.model)
+
+
+def _model_line(name: str, anchors: int, file: Path) -> str:
+    return f"{name} model ({anchors:,} anchors, {file.stat().st_size / 1e6:,.1f} MB)"
+
+
+def find_model(folder: RunFolder, which: ModelName = "best") -> FoundModel:
+    """Which model of a run is meant. Raises RunError if it is not trained."""
     keys, name = folder.keys(), which
     if which == "best":
         name = "merged" if folder.merged.is_done(keys.merge) else "coarse"
     stage, key = (folder.merged, keys.merge) if name == "merged" else (folder.coarse, keys.coarse)
     if not stage.is_done(key):
         raise RunError(_not_there(folder, name))
-    model = load_vouched(stage, key).to(torch.device(device))
-    caution = _caution(folder, name) if which != "coarse" else ""
-    return OpenedModel(folder, model, stage.model, name, stage.status(), key, caution)
+    return FoundModel(stage, name, key, _caution(folder, name) if which != "coarse" else "")
 
 
 def _not_there(folder: RunFolder, name: str) -> str:

@@ -1,4 +1,7 @@
-"""Where blocks are trained: on this machine, on a Ray cluster or by SLURM. Never changes the result."""
+"""Where blocks are trained and pieces of other stages done: on this machine, a Ray cluster or by SLURM.
+
+Never changes the result.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from typing import Annotated, Literal
 
 from vdgs.settings.ranges import LARGE, WORKERS, Range, refuse
 
-#: What can run blocks.
+#: What can run them.
 ExecutorName = Literal["local", "ray", "slurm"]
 
 
@@ -34,20 +37,21 @@ class SlurmOptions:
 
 @dataclass(frozen=True)
 class ExecutorOptions:
-    """Where blocks are trained, and what each asks of the place."""
+    """Where blocks are trained and pieces of other stages done, and what each asks of the place."""
 
     executor: ExecutorName = "local"
-    """What runs the blocks: processes of this machine, a Ray cluster, or SLURM (docs/clusters.md)."""
+    """What runs blocks and pieces of other stages: processes of this machine, a Ray cluster, or SLURM
+    (docs/clusters.md)."""
     address: str | None = None
     """Ray: where the cluster is (`auto`, or `head:6379`); without it what RAY_ADDRESS says, else a Ray of this machine
     alone that ends with the command."""
     processors: Annotated[int, WORKERS] = 0
-    """Ray and SLURM: processors of a block; 0 shares out those of the cluster (SLURM: 4)."""
+    """Ray and SLURM: processors of a block or piece; 0 shares out those of the cluster (SLURM: 4)."""
     memory_gb: Annotated[float, Range(0, LARGE)] = 0.0
-    """Ray and SLURM: memory of a block; 0 takes what it needs by estimate. After an out-of-memory kill half as much
-    more is asked for."""
+    """Ray and SLURM: memory of a block or piece; 0 takes what it needs by estimate. After an out-of-memory kill half as
+    much more is asked for."""
     gpus: Annotated[float, Range(0, 64)] = 0.0
-    """Ray and SLURM: GPUs of a block. Ray also knows shares (0.5: two blocks on one)."""
+    """Ray and SLURM: GPUs of a block or piece. Ray also knows shares (0.5: two blocks on one)."""
     slurm: SlurmOptions = field(default_factory=SlurmOptions)
 
     def check(self) -> None:

@@ -6,6 +6,8 @@ RUN/partition/   blocks.geojson (ground frame), blocks_wgs84.geojson (if georefe
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,23 +22,37 @@ from rich.table import Table
 
 from vdgs.cameras import Camera
 from vdgs.errors import RunError
+from vdgs.executors.errand import Errand, Wish
+from vdgs.executors.fitness import Question, photographs_of
+from vdgs.executors.kinds import Kind
+from vdgs.executors.placement import Share
+from vdgs.executors.work import PieceWork, at_work, clear, remove, spans_of
+from vdgs.memory.estimate import drawing_bytes
 from vdgs.memory.process import forget_peak, peak_memory_bytes
 from vdgs.partition.assignment.assign import Assignment, assign
-from vdgs.partition.assignment.saving import load_scores, save_scores
-from vdgs.partition.assignment.scores import Scores, score_matrix
-from vdgs.partition.assignment.tables import assignment_rows, assignment_table, explain
-from vdgs.partition.blocks import Blocks, load_blocks, places_of, save_blocks, save_blocks_wgs84
+from vdgs.partition.assignment.saving import load_part, load_scores, save_part, save_scores
+from vdgs.partition.assignment.scores import Scorer, Scores, joined, score_matrix
+from vdgs.partition.assignment.tables import assignment_rows, assignment_table, cut_rows, explain
+from vdgs.partition.blocks import Blocks, load_blocks, save_blocks, save_blocks_wgs84
 from vdgs.partition.cut import choose_block_count, cut_scene
 from vdgs.partition.figures import maps as figures
-from vdgs.partition.records import AssignedBlock, CutBlock, PartitionRecord
+from vdgs.partition.records import AssignedBlock, PartitionRecord
 from vdgs.partition.strategies import STRATEGIES
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.runs.visibility import keep_visibility
-from vdgs.settings.method import AssignmentConfig, PartitionConfig
-from vdgs.storage.files import write_json
+from vdgs.settings.method import AssignmentConfig, MethodConfig, PartitionConfig
+from vdgs.storage.files import read_json, write_json
 from vdgs.storage.records import plain
 from vdgs.watching.interrupts import stop_if_asked
+
+#: Cameras that are scored and saved together; how many such groups a piece has, least and most, and how many pieces
+#: there are in between (choice).
+CAMERAS_OF_ITEM = 8
+ITEMS_OF_PIECE = 1, 8, 16
+CAMERAS = Kind("piece", "pieces", "score cameras", "at work", "cameras", "cameras/s")
+#: The blocks that pieces score cameras for, in the folder of the pieces.
+CUT = "blocks.geojson"
 
 
 @dataclass(frozen=True)
@@ -56,10 +72,11 @@ class _Scene:
         return _Scene(opened, positions, keep_visibility(opened).numpy(), cameras)
 
 
-def partition_run(run: RunFolder, console: Console, device: str = "cpu") -> None:
+def partition_run(run: RunFolder, console: Console, device: str = "cpu", wish: Wish | None = None) -> None:
     """Cut the scene of a run and assign its cameras, drawing on a device; what is there for the same settings is kept.
 
-    Raises RunError without a coarse model.
+    Cameras are scored in this process, or in pieces where a `wish` sends them: the scores are the same. Raises RunError
+    without a coarse model, and what `Errand.run` raises.
     """
     keys, before = run.keys(), _record_before(run)
     kept = _kept_blocks(run) if before.key == keys.partition else None
@@ -69,14 +86,22 @@ def partition_run(run: RunFolder, console: Console, device: str = "cpu") -> None
     with run.locked():
         forget_peak()
         began, method, scene = time.monotonic(), run.method(), _Scene.of(run, device)
-        if kept is not None:
+        work, config = _work(run, len(scene.cameras)), _assignment(method)
+        begun = _begun_cut(work)
+        if begun is not None:
+            blocks, warnings = begun
+        elif kept is not None:
             blocks, warnings = kept, list(before.warnings)
         else:
             blocks, warnings = _cut(scene, method.partition, method.training.seed)
-        config = method.assignment
+        sends = wish is not None and wish.sends
+        clear(run.partition, work.key if sends else None)
+        if wish is not None and sends:
+            scores = _score_in_pieces(run, scene, work, (blocks, warnings), wish, console)
+        else:
+            scores = _score(scene, blocks, config, console)
         if method.partition.strategy != "visibility":
-            config = STRATEGIES[method.partition.strategy].assignment(config)
-        scores = _score(scene, blocks, config, method.partition, console)
+            scores = STRATEGIES[method.partition.strategy].rescored(scores, scene.positions, blocks, scene.cameras)
         assignment = assign(scores, config)
         for note in warnings + assignment.complaints:
             console.print(f"[yellow]note[/] {note}", highlight=False)
@@ -88,10 +113,12 @@ def partition_run(run: RunFolder, console: Console, device: str = "cpu") -> None
             keys.partition, keys.assignment, method.partition.strategy,
             lambda_vis=method.partition.lambda_vis if method.partition.strategy == "visibility" else None,
             warnings=tuple(warnings), complaints=tuple(assignment.complaints), blocks=tuple(rows),
-            spatial=_cut_blocks(scene, spatial),
+            spatial=cut_rows(spatial, scene.positions, scene.visibility),
             seconds=time.monotonic() - began, peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
         write_json(run.partition / "partition.json", plain(record))  # last: where it stands, the rest is complete
+        if sends:
+            remove(work)
     console.print(assignment_table(rows))
     console.print(f"figures: {run.partition / 'blocks.png'} and beside it", highlight=False)
 
@@ -149,9 +176,13 @@ def _scores_are_whole(run: RunFolder) -> bool:
     return True
 
 
-def _score(
-    scene: _Scene, blocks: Blocks, config: AssignmentConfig, partition: PartitionConfig, console: Console
-) -> Scores:
+def _assignment(method: MethodConfig) -> AssignmentConfig:
+    """The settings of the assignment, as the strategy that cuts wants them."""
+    strategy = method.partition.strategy
+    return method.assignment if strategy == "visibility" else STRATEGIES[strategy].assignment(method.assignment)
+
+
+def _score(scene: _Scene, blocks: Blocks, config: AssignmentConfig, console: Console) -> Scores:
     with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
         task = bar.add_task("assigning cameras")
 
@@ -159,23 +190,71 @@ def _score(
             stop_if_asked()
             bar.update(task, completed=done, total=total)
 
-        scores = score_matrix(scene.opened.model, blocks, scene.cameras, config, show)
-    if partition.strategy == "visibility":
-        return scores
-    return STRATEGIES[partition.strategy].rescored(scores, scene.positions, blocks, scene.cameras)
+        return score_matrix(scene.opened.model, blocks, scene.cameras, config, show)
 
 
-def _cut_blocks(scene: _Scene, blocks: Blocks) -> tuple[CutBlock, ...]:
-    """Anchors, area and visibility of each block of a cut."""
-    owner = blocks.owner(places_of(scene.positions))
-    return tuple(
-        CutBlock(
-            index, int((owner == index).sum()), float(block.core.area),
-            mean_v=float(scene.visibility[owner == index].mean()) if (owner == index).any() else None,
-            std_v=float(scene.visibility[owner == index].std()) if (owner == index).any() else None,
-        )
-        for index, block in enumerate(blocks.items)
-    )  # fmt: skip
+def _work(run: RunFolder, cameras: int) -> PieceWork:
+    """Groups of training cameras in pieces; what their scores depend on."""
+    groups = -(-cameras // CAMERAS_OF_ITEM)
+    depends_on = [run.keys().assignment, run.coarse_identity(), cameras]
+    return PieceWork.of(run.partition, depends_on, spans_of(groups, *ITEMS_OF_PIECE))
+
+
+def _begun_cut(work: PieceWork) -> tuple[Blocks, list[str]] | None:
+    """The blocks for which pieces of an earlier command score cameras, and the warnings of their cut, if there are."""
+    file = work.folder / CUT
+    if not file.exists():
+        return None
+    return load_blocks(file), list(read_json(file)["warnings"])
+
+
+def _score_in_pieces(
+    run: RunFolder, scene: _Scene, work: PieceWork, cut: tuple[Blocks, list[str]], wish: Wish, console: Console
+) -> Scores:
+    """Let pieces of the cameras be scored elsewhere, and join their rows."""
+    blocks, warnings = cut
+    save_blocks(work.folder / CUT, blocks, [{} for _ in blocks.items], {"warnings": warnings})
+    if left := work.left:
+        views = scene.opened.capture.train_views
+        pixels = max(camera.width * camera.height for camera in scene.cameras)
+        model = run.coarse.model.stat().st_size
+        errand = Errand(
+            CAMERAS, work.folder, len(work.spans), left, work.piece, lambda *given: _command(run, *given),
+            drawing_bytes(model, len(scene.positions) * len(blocks), pixels),
+            lambda: Question(work.folder, [run.config_file, run.coarse.model, *photographs_of(views)]),
+        )  # fmt: skip
+        errand.run(wish, console, work.mark_queued)
+    return joined([load_part(work.file(item)) for item in range(work.spans[-1].stop)])
+
+
+def _command(run: RunFolder, index: int, share: Share, device: str) -> list[str]:
+    return [
+        sys.executable, "-m", "vdgs.cli", "partition", os.path.abspath(run.path), "--piece", str(index),
+        "--threads", str(share.needs.processors), "--device", device,
+    ]  # fmt: skip
+
+
+def score_piece(run: RunFolder, index: int, console: Console, device: str = "cpu") -> None:
+    """Score one piece of the cameras for the blocks that a command has cut, continue it, or do nothing if it is done.
+    Its scores stay beside its status until all pieces are joined. RunError where no command has cut them."""
+    opened = open_run(run.path, "coarse", device)
+    cameras = [view.camera for view in opened.capture.train_views]
+    work = _work(run, len(cameras))
+    span, cut = work.span(index), _begun_cut(work)
+    if cut is None:
+        raise RunError(f"{work.folder}: has no blocks to score cameras for. vdgs partition {run.path} cuts them.")
+    if work.is_done(index):
+        console.print(f"{work.piece(index).path}: already scored; nothing to do", highlight=False)
+        return
+    groups = {item: cameras[item * CAMERAS_OF_ITEM : (item + 1) * CAMERAS_OF_ITEM] for item in span}
+    done = sum(len(group) for item, group in groups.items() if work.file(item).exists())
+    with at_work(work.piece(index), done, sum(map(len, groups.values()))) as tell:
+        scorer = Scorer(opened.model, cut[0], _assignment(run.method()))
+        for item in (item for item in span if not work.file(item).exists()):
+            stop_if_asked()
+            save_part(work.file(item), scorer.scores(groups[item]))
+            done += len(groups[item])
+            tell(done)
 
 
 def _save(

@@ -6,21 +6,17 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from rich.console import Console
 
-from vdgs.errors import RunError, Stopped, VdgsError
-from vdgs.executors.blocks import BlockCommand, run_blocks
-from vdgs.executors.choosing import Chosen, Machine, choose
-from vdgs.executors.executor import Outcome
-from vdgs.executors.fitness import Question
-from vdgs.executors.placement import Share, Work
-from vdgs.kernels import threads as threads_available
+from vdgs.errors import RunError, VdgsError
+from vdgs.executors.errand import Errand, Wish
+from vdgs.executors.fitness import Question, photographs_of
+from vdgs.executors.kinds import BLOCKS
+from vdgs.executors.placement import Share
 from vdgs.memory.estimate import Need, estimate
-from vdgs.memory.process import available_bytes
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder, StageFolder
 from vdgs.runs.opening import open_capture
@@ -59,50 +55,28 @@ def train_blocks(
         if not left:
             console.print(f"{path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
             return
-        work = Work(len(left), _block_bytes(run), jobs, options.image_memory_gb)
-        machine = Machine(threads_available(), available_bytes())
-        with choose(where or ExecutorOptions(), work, machine, lambda: _question(run)) as chosen:
-            console.print(f"{len(left)} of {len(blocks)} blocks to train, {chosen.line}", highlight=False)
-            for note in chosen.notes:
-                console.print(note, highlight=False)
+        errand = Errand(
+            BLOCKS, run.path / "blocks", len(blocks), left, run.block,
+            lambda index, share, device: _command(run, index, share, options, device), _block_bytes(run),
+            lambda: _question(run),
+        )  # fmt: skip
+
+        def ready() -> None:
             _note_discarded(run, left, key, console)
             for index in left:
                 _mark_queued(run.block(index), key)
-            outcomes = _run(run, left, chosen, options, device, console)
-    _raise_unless_done(path, len(blocks), outcomes)
+
+        wish = Wish(where or ExecutorOptions(), jobs, options.image_memory_gb, device)
+        errand.run(wish, console, ready)
     console.print(f"blocks trained in {(time.monotonic() - began) / 60:.1f} min", highlight=False)
-
-
-def _run(
-    run: RunFolder, left: Sequence[int], chosen: Chosen, options: WatchOptions, device: str, console: Console
-) -> list[Outcome]:
-    # A GPU that a block is given is not this machine's.
-    device = "auto" if chosen.share.needs.gpus and device == "cpu" else device
-    commands = [_command(run, index, chosen.share, options, device) for index in left]
-    return run_blocks(commands, chosen.executor, console)
-
-
-def _raise_unless_done(path: Path, blocks: int, outcomes: Sequence[Outcome]) -> None:
-    if any(outcome.state == "stopped" for outcome in outcomes):
-        raise Stopped("Stopped; every block that was training is saved. The same command continues.")
-    failed = [outcome for outcome in outcomes if outcome.state != "done"]
-    if failed:
-        raise RunError(
-            f"{path}: {len(failed)} of {blocks} blocks failed:\n  "
-            + "\n  ".join(f"{outcome.name}: {outcome.why}" for outcome in failed)
-            + f"\nTheir output is in {path}/blocks/NN/output.log. The same command tries them again."
-        )
 
 
 def _question(run: RunFolder) -> Question:
     """What a machine must see: the run, its coarse model and its photographs."""
-    files = [run.config_file, run.coarse.model]
-    for view in open_capture(run).train_views:
-        files += [view.image_path] if view.mask_path is None else [view.image_path, view.mask_path]
-    return Question(run.path, files)
+    return Question(run.path, [run.config_file, run.coarse.model, *photographs_of(open_capture(run).train_views)])
 
 
-def _command(run: RunFolder, index: int, share: Share, options: WatchOptions, device: str) -> BlockCommand:
+def _command(run: RunFolder, index: int, share: Share, options: WatchOptions, device: str) -> list[str]:
     command = [
         sys.executable, "-m", "vdgs.cli", "train", str(run.path), "--block", str(index),
         "--threads", str(share.needs.processors), "--image-memory-gb", f"{share.image_gb:.3f}",
@@ -110,7 +84,7 @@ def _command(run: RunFolder, index: int, share: Share, options: WatchOptions, de
     ]  # fmt: skip
     if options.tensorboard:
         command.append("--tensorboard")
-    return BlockCommand(index, run.block(index), command, share.needs)
+    return command
 
 
 def _note_discarded(run: RunFolder, left: list[int], key: str, console: Console) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
-from vdgs.settings.ranges import WORKERS
+from vdgs.settings.executors import ExecutorOptions
+from vdgs.settings.ranges import WORKERS, Range
 from vdgs.settings.requests import BINS, ModelName, RenderRequest
 from vdgs.verbs.shared import find_capture, open_console, parse, use_device, use_threads
 
@@ -60,25 +61,39 @@ class EvalArguments:
     """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
     bins: Annotated[int, BINS] = 4
     """Number of visibility quantiles by which metrics are reported."""
+    jobs: Annotated[int, WORKERS] = 0
+    """Pieces of the views measured at once, each in a process of its own; 0: on this machine one process measures all,
+    a cluster as many as it has room for."""
+    piece: Annotated[int | None, Range(0, 10_000)] = None
+    """Only this piece of the views, in this process: what is sent out."""
     threads: Annotated[int, WORKERS] = 0
-    """Threads of the kernels; 0 for all cores."""
+    """Threads of the kernels, of one process or of --piece; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
+    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def eval(arguments: list[str]) -> None:
     asked = parse(EvalArguments, arguments, "vdgs eval")
     from vdgs.runs.folder import RunFolder
-    from vdgs.stages.evaluate import evaluate_stage
+    from vdgs.stages.evaluate import Measuring, evaluate_piece, evaluate_stage
 
-    device = use_device(asked.device)
-    find_capture(RunFolder(asked.run), asked.capture)
+    device, console = use_device(asked.device), open_console(asked.quiet)
+    measuring = Measuring(asked.run, asked.model, asked.lpips_weights, asked.bins, asked.views, device)
     use_threads(asked.threads)
-    evaluate_stage(
-        asked.run, asked.model, asked.lpips_weights, asked.bins, open_console(asked.quiet), asked.views, device
-    )
+    if asked.piece is not None:
+        from vdgs.executors.parent import stop_when_parent_dies
+
+        stop_when_parent_dies()
+        evaluate_piece(measuring, asked.piece, console)
+    else:
+        from vdgs.executors.errand import Wish
+
+        find_capture(RunFolder(asked.run), asked.capture)
+        asked.where.check()
+        evaluate_stage(measuring, console, Wish(asked.where, asked.jobs, device=device))
 
 
 @dataclass(frozen=True)

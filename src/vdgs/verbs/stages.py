@@ -61,10 +61,19 @@ class PartitionArguments:
     """Where the capture lies now, if it was moved; the run remembers it."""
     why: str | None = None
     """Name of a training photograph: also say how well it shows each block and why it was assigned or not."""
+    jobs: Annotated[int, WORKERS] = 0
+    """Pieces of the cameras scored at once, each in a process of its own; 0: on this machine one process scores all, a
+    cluster as many as it has room for."""
+    piece: Annotated[int | None, Range(0, 10_000)] = None
+    """Only score this piece of the cameras, in this process: what is sent out."""
     threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
+    device: str = "auto"
+    """Where to draw what cameras see: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on
+    it."""
     partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
+    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def partition(arguments: list[str]) -> None:
@@ -72,14 +81,24 @@ def partition(arguments: list[str]) -> None:
     default = PartitionArguments(tyro.MISSING, partition=method.partition, assignment=method.assignment)
     asked = parse(PartitionArguments, arguments, "vdgs partition", default)
     refuse_idle_blocks(arguments, asked.partition)
-    from vdgs.stages.partition import explain_view, partition_run
+    from vdgs.stages.partition import explain_view, partition_run, score_piece
 
+    device = use_device(asked.device)
     use_threads(asked.threads)
+    if asked.piece is not None:
+        from vdgs.executors.parent import stop_when_parent_dies
+
+        stop_when_parent_dies()
+        score_piece(run, asked.piece, open_console(asked.quiet), device)
+        return
+    from vdgs.executors.errand import Wish
+
+    asked.where.check()
     find_capture(run, asked.capture)
     change_settings(
         run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.redo, asked.quiet
     )
-    partition_run(run, open_console(asked.quiet))
+    partition_run(run, open_console(asked.quiet), device, Wish(asked.where, asked.jobs, device=device))
     if asked.why is not None:
         explain_view(run, asked.why, open_console(asked.quiet))
 

@@ -35,8 +35,9 @@ from vdgs.comparators.gaussians.model import GaussiansModel
 from vdgs.comparators.gaussians.training import GaussiansConfig, GaussiansStage, scene_extent
 from vdgs.comparators.gaussians.watching import continue_or_start, finish, train_watched
 from vdgs.errors import RunError, VdgsError
-from vdgs.evaluation.evaluate import EvaluationSettings, MeasuredModel, ModelFacts, evaluate
+from vdgs.evaluation.evaluate import evaluate
 from vdgs.evaluation.lpips import load_lpips
+from vdgs.evaluation.measured_model import EvaluationSettings, MeasuredModel, ModelFacts
 from vdgs.evaluation.of_run import cached_photographs, true_depth
 from vdgs.evaluation.seen import seen_map
 from vdgs.inspection.starting import refuse_unworkable

@@ -21,6 +21,12 @@ FORMAT = "vdgs-scores-1"
 #: The arrays of the file over cameras and blocks, with their types.
 MATRICES = {"scores": np.float32, "held": np.int32, "covered": np.float32, "why": np.int8}
 
+#: What zipfile and numpy raise on damaged bytes has no common base.
+DAMAGED = (
+    OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError, NotImplementedError,
+    RuntimeError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error, struct.error,
+)  # fmt: skip
+
 
 class SavedScores(NamedTuple):
     """What a scores file holds. `names` are those of the training views, in the order of the rows."""
@@ -44,6 +50,25 @@ def save_scores(path: Path, names: Sequence[str], scores: Scores, assignment: As
     write_bytes(path, buffer.getvalue())
 
 
+def save_part(path: Path, scores: Scores) -> None:
+    """Write the rows of some cameras, to be joined later (.npz without pickle), atomically."""
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **{name: np.array(value) for name, value in vars(scores).items()})
+    write_bytes(path, buffer.getvalue())
+
+
+def load_part(path: Path) -> Scores:
+    """The inverse of `save_part`. Raises RunError if the file is missing or damaged."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        return Scores(str(arrays.pop("mode")), **arrays)
+    except DAMAGED as error:
+        raise RunError(
+            f"{path}: is missing or damaged ({error}). Delete {path.parent} and run the same command again."
+        ) from error
+
+
 def load_scores(path: Path) -> SavedScores:
     """The inverse of `save_scores`. Raises RunError if the file is missing or damaged."""
     try:
@@ -52,11 +77,7 @@ def load_scores(path: Path) -> SavedScores:
         _check(arrays)
     except FileNotFoundError as error:
         raise RunError(f"{path}: is not there. Assign the cameras first: vdgs partition RUN") from error
-    # What zipfile and numpy raise on damaged bytes has no common base.
-    except (
-        OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, EOFError, NotImplementedError,
-        RuntimeError, SyntaxError, MemoryError, zipfile.BadZipFile, zlib.error, struct.error,
-    ) as error:  # fmt: skip
+    except DAMAGED as error:
         raise RunError(f"{path}: is damaged ({error}). Assign the cameras again: vdgs partition RUN") from error
     scores = Scores(
         str(arrays["mode"]),

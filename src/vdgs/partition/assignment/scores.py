@@ -69,22 +69,40 @@ def score_matrix(
     Pictures are at most `config.longest_side_px` wide and high. The scores of a camera depend on no other camera and on
     no number of threads. Memory: O(n b) bytes, and one view for each thread.
     """
-    members = _Members.of(model, blocks)
-    shape = (len(cameras), len(blocks))
-    scores, covered = np.zeros(shape, np.float32), np.full(shape, np.nan, np.float32)
-    held = np.zeros(shape, np.int32)
-    # Small pictures keep the threads of one kernel waiting for each other; those of several cameras do not.
-    workers = ThreadPoolExecutor(threads())
-    try:
-        rows = workers.map(lambda camera: _score_camera(model, members, camera, config), cameras)
-        for index, row in enumerate(rows):
-            held[index], scores[index], covered[index] = row
-            if progress is not None:
-                progress(index + 1, len(cameras))
-    finally:
-        workers.shutdown(cancel_futures=True)
-    positions = np.array([camera.position[:2] for camera in cameras], np.float64).reshape(-1, 2)
-    return Scores(config.mode, scores, held, covered, members.counts(), blocks.owner(positions))
+    return Scorer(model, blocks, config).scores(cameras, progress)
+
+
+class Scorer:
+    """Scores cameras, as many at a time as one likes (`score_matrix`)."""
+
+    def __init__(self, model: AnchorModel, blocks: Blocks, config: AssignmentConfig):
+        self._model, self._blocks, self._config = model, blocks, config
+        self._members = _Members.of(model, blocks)
+
+    def scores(self, cameras: Sequence[Camera], progress: Callable[[int, int], None] | None = None) -> Scores:
+        """The rows of some cameras."""
+        shape, members, config = (len(cameras), len(self._blocks)), self._members, self._config
+        scores, covered = np.zeros(shape, np.float32), np.full(shape, np.nan, np.float32)
+        held = np.zeros(shape, np.int32)
+        # Small pictures keep the threads of one kernel waiting for each other; those of several cameras do not.
+        workers = ThreadPoolExecutor(threads())
+        try:
+            rows = workers.map(lambda camera: _score_camera(self._model, members, camera, config), cameras)
+            for index, row in enumerate(rows):
+                held[index], scores[index], covered[index] = row
+                if progress is not None:
+                    progress(index + 1, len(cameras))
+        finally:
+            workers.shutdown(cancel_futures=True)
+        positions = np.array([camera.position[:2] for camera in cameras], np.float64).reshape(-1, 2)
+        return Scores(config.mode, scores, held, covered, members.counts(), self._blocks.owner(positions))
+
+
+def joined(parts: Sequence[Scores]) -> Scores:
+    """The rows of several parts, one below the other; at least one part, all for the same blocks."""
+    over = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("scores", "held", "covered")}
+    beneath = np.concatenate([part.beneath for part in parts])
+    return Scores(parts[0].mode, **over, anchors=parts[0].anchors, beneath=beneath)
 
 
 def difference(block: Raster, full: Raster) -> Float[np.ndarray, "h w"]:

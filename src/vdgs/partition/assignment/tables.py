@@ -14,7 +14,7 @@ from vdgs.errors import RunError
 from vdgs.partition.assignment.assign import ABOVE_THRESHOLD, BEST_BLOCK, TOPPED_UP, WHY, Assignment
 from vdgs.partition.assignment.scores import Scores
 from vdgs.partition.blocks import Blocks, places_of
-from vdgs.partition.records import AssignedBlock
+from vdgs.partition.records import AssignedBlock, CutBlock
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,21 @@ def explain(names: Sequence[str], scores: Scores, assignment: Assignment, view: 
         for b in range(len(scores.anchors))
     ]
     return sorted(rows, key=lambda row: (row.why == WHY[0], -row.score))
+
+
+def cut_rows(
+    blocks: Blocks, positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray, " n"]
+) -> tuple[CutBlock, ...]:
+    """Anchors, area and visibility of each block of a cut."""
+    owner = blocks.owner(places_of(positions))
+    return tuple(
+        CutBlock(
+            index, int((owner == index).sum()), float(block.core.area),
+            mean_v=float(visibility[owner == index].mean()) if (owner == index).any() else None,
+            std_v=float(visibility[owner == index].std()) if (owner == index).any() else None,
+        )
+        for index, block in enumerate(blocks.items)
+    )  # fmt: skip
 
 
 def assignment_rows(

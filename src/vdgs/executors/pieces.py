@@ -1,4 +1,4 @@
-"""Blocks as tasks of an executor: what their status files say while they run, shown live, and how they ended."""
+"""Pieces of work as tasks of an executor: what their status files say while they run, shown live; how they ended."""
 
 from __future__ import annotations
 
@@ -12,25 +12,28 @@ from rich.console import Console
 
 from vdgs.errors import VdgsError
 from vdgs.executors.executor import Executor, Needs, Outcome, Task
+from vdgs.executors.kinds import BLOCKS, Kind
 from vdgs.executors.lines import Lines
-from vdgs.executors.progress import BlockProgress, read_figures
+from vdgs.executors.progress import PieceProgress, read_figures
 from vdgs.executors.table import STYLES, Board, duration
 from vdgs.runs.folder import StageFolder
 
 
 @dataclass(frozen=True)
-class BlockCommand:
-    """A command that trains one block, continues it after an interruption, and does nothing once it is done."""
+class Piece:
+    """A command that does one piece of work, such as training a block: it continues after an interruption, and does
+    nothing once it is done."""
 
     index: int
     folder: StageFolder
     """The command locks it and keeps its status file; its output is appended to `output.log` there."""
     command: list[str]
     needs: Needs = field(default_factory=Needs)
+    kind: Kind = BLOCKS
 
     @property
     def name(self) -> str:
-        return f"block {self.index:02d}"
+        return f"{self.kind.one} {self.index:02d}"
 
     @property
     def output(self) -> Path:
@@ -40,35 +43,36 @@ class BlockCommand:
         return Task(self.name, self.command, self.output, folder=self.folder.path, needs=self.needs)
 
 
-def default_jobs(blocks: int, cores: int, memory_available: int, memory_per_block: int) -> tuple[int, int]:
-    """How many blocks to train at once on the CPU, and with how many threads each (choice).
+def default_jobs(pieces: int, cores: int, memory_available: int, memory_each: int) -> tuple[int, int]:
+    """How many pieces to do at once on the CPU, and with how many threads each (choice).
 
-    As many blocks as there are cores and memory (bytes) for, at least one: separate blocks use cores better than the
-    threads of one block. The cores left over are shared out.
+    As many as there are cores and memory (bytes) for, at least one: separate ones use cores better than the threads of
+    one. The cores left over are shared out.
     """
-    fit = memory_available // memory_per_block if memory_per_block > 0 else blocks
-    jobs = max(1, min(blocks, cores, fit))
+    fit = memory_available // memory_each if memory_each > 0 else pieces
+    jobs = max(1, min(pieces, cores, fit))
     return jobs, max(1, cores // jobs)
 
 
-def run_blocks(blocks: Sequence[BlockCommand], executor: Executor, console: Console) -> list[Outcome]:
-    """Run the command of every block, with a live table; the outcomes in their order. One that fails stops no other."""
-    rows = [BlockProgress(block.index) for block in blocks]
-    for block, row in zip(blocks, rows, strict=True):
-        row.observe(read_figures(block.folder.status_file), time.monotonic())
-    with Board(console, rows, executor.at_once) as board:
-        outcomes = executor.run([block.task() for block in blocks], _Watcher(blocks, rows, board))
-    _summarise(blocks, outcomes, console)
+def run_pieces(pieces: Sequence[Piece], executor: Executor, console: Console) -> list[Outcome]:
+    """Run the command of every piece, with a live table; the outcomes in their order. One that fails stops no other."""
+    rows = [PieceProgress(piece.index) for piece in pieces]
+    for piece, row in zip(pieces, rows, strict=True):
+        row.observe(read_figures(piece.folder.status_file), time.monotonic())
+    kind = pieces[0].kind if pieces else BLOCKS
+    with Board(console, rows, executor.at_once, kind) as board:
+        outcomes = executor.run([piece.task() for piece in pieces], _Watcher(pieces, rows, board))
+    _summarise(pieces, kind, outcomes, console)
     return outcomes
 
 
 class _Watcher(Lines):
     """Keeps the rows of the table as status files say."""
 
-    def __init__(self, blocks: Sequence[BlockCommand], rows: Sequence[BlockProgress], board: Board):
+    def __init__(self, pieces: Sequence[Piece], rows: Sequence[PieceProgress], board: Board):
         super().__init__(board.say)
         self._board = board
-        self._pairs = {block.name: (block, row) for block, row in zip(blocks, rows, strict=True)}
+        self._pairs = {piece.name: (piece, row) for piece, row in zip(pieces, rows, strict=True)}
         #: On which machine, in words, where it is not this one.
         self._where = dict[str, str]()
 
@@ -92,7 +96,7 @@ class _Watcher(Lines):
         self._pairs[task.name][1].state = "queued"
 
     def ended(self, task: Task, outcome: Outcome) -> None:
-        block, row = self._pairs[task.name]
+        piece, row = self._pairs[task.name]
         self._observe(task.name)
         row.state, row.attempts = outcome.state, outcome.attempts
         if outcome.state == "failed":
@@ -102,7 +106,7 @@ class _Watcher(Lines):
             took = f"{duration(outcome.seconds)}{_attempt(outcome.attempts)}"
             self._board.note(f"{task.name}: {outcome.state} after {took}")
         if outcome.attempts and outcome.state != "done":
-            _note_end(block.folder, outcome)
+            _note_end(piece.folder, outcome)
 
     def tick(self) -> None:
         for name in self._pairs:
@@ -110,9 +114,9 @@ class _Watcher(Lines):
         self._board.show()
 
     def _observe(self, name: str) -> None:
-        block, row = self._pairs[name]
+        piece, row = self._pairs[name]
         if row.state == "running":
-            row.observe(read_figures(block.folder.status_file), time.monotonic())
+            row.observe(read_figures(piece.folder.status_file), time.monotonic())
 
 
 def _attempt(number: int) -> str:
@@ -120,7 +124,7 @@ def _attempt(number: int) -> str:
 
 
 def _note_end(folder: StageFolder, outcome: Outcome) -> None:
-    """Let no status file say "running" of a block that is not: a process that was killed could not write it itself."""
+    """Let no status file say "running" of a piece that is not: a process that was killed could not write it itself."""
     # Not if another process has taken over, nor if the file is damaged.
     with suppress(VdgsError, OSError, ValueError), folder.locked():
         status = folder.status()
@@ -128,18 +132,18 @@ def _note_end(folder: StageFolder, outcome: Outcome) -> None:
             folder.set_status(replace(status, state=outcome.state, why=outcome.why))
 
 
-def _summarise(blocks: Sequence[BlockCommand], outcomes: list[Outcome], console: Console) -> None:
+def _summarise(pieces: Sequence[Piece], kind: Kind, outcomes: list[Outcome], console: Console) -> None:
     def say(text: str, style: str = "") -> None:
         console.print(text, style=style, highlight=False, markup=False)
 
-    unfinished = [(block, outcome) for block, outcome in zip(blocks, outcomes, strict=True) if outcome.state != "done"]
-    say(f"{len(blocks) - len(unfinished)} of {len(blocks)} blocks done")
-    for block, outcome in unfinished:
+    unfinished = [(piece, outcome) for piece, outcome in zip(pieces, outcomes, strict=True) if outcome.state != "done"]
+    say(f"{len(pieces) - len(unfinished)} of {len(pieces)} {kind.many} done")
+    for piece, outcome in unfinished:
         if outcome.attempts:
-            say(f"{block.name} {outcome.state}" + (f": {outcome.why}" if outcome.why else ""), STYLES[outcome.state])
-        if outcome.state == "failed" and block.output.is_file():
-            say(f"  all of its output: {block.output}")
-    if waited := [block.name for block, outcome in unfinished if not outcome.attempts]:
+            say(f"{piece.name} {outcome.state}" + (f": {outcome.why}" if outcome.why else ""), STYLES[outcome.state])
+        if outcome.state == "failed" and piece.output.is_file():
+            say(f"  all of its output: {piece.output}")
+    if waited := [piece.name for piece, outcome in unfinished if not outcome.attempts]:
         say(f"not started: {', '.join(waited)}", STYLES["stopped"])
     if unfinished:
-        say("The same command continues these blocks and leaves those that are done.")
+        say(f"The same command continues these {kind.many} and leaves those that are done.")

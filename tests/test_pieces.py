@@ -1,0 +1,252 @@
+"""Stages whose work goes out in pieces: whatever is lost on the way, the files are those of one process."""
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from captures_support import tiny_scene, write_colmap
+from cli_support import begun, vdgs, wait_until
+from cluster_support import COARSE, alive, copy_run, evaluated, merge_run, train_here
+from vdgs.errors import RunError, Stopped, VdgsError
+from vdgs.evaluation.by_block import BlockMetrics, SeamMetrics
+from vdgs.evaluation.by_visibility import VisibilityHistogram
+from vdgs.evaluation.depth_errors import DepthErrors
+from vdgs.evaluation.pictures import Thumbnail
+from vdgs.evaluation.records import load_view, save_view
+from vdgs.evaluation.seams import BlockFigures
+from vdgs.evaluation.view import ViewFigures
+from vdgs.executors.work import PieceWork, alone, at_work, spans_of
+from vdgs.runs.folder import StageFolder
+from vdgs.watching.interrupts import stop_if_asked, stop_requests
+
+
+@given(st.integers(1, 5000), st.integers(1, 5), st.integers(5, 40), st.integers(1, 30))
+def test_spans_hold_every_item_once_and_are_about_equal(items, least, most, pieces):
+    spans = spans_of(items, least, most, pieces)
+    assert [item for span in spans for item in span] == list(range(items))
+    lengths = [len(span) for span in spans]
+    assert max(lengths) <= most
+    assert max(lengths) - min(lengths) <= 1
+    assert len(spans) <= max(pieces, -(-items // most))
+
+
+def random_view(rng: np.random.Generator) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    visibility = rng.integers(0, 40, (6, 7)).astype(np.float32)
+    visibility[rng.random((6, 7)) < 0.2] = np.nan
+    return visibility, {name: rng.random((6, 7)) for name in ("squared_error", "ssim")}
+
+
+def test_what_views_come_to_merges_to_the_bits_of_one_count_and_is_read_back_to_the_last(tmp_path):
+    rng = np.random.default_rng(3)
+    whole, parts = VisibilityHistogram(["squared_error", "ssim"]), VisibilityHistogram(["squared_error", "ssim"])
+    blocks, blocks_parts, seams, seams_parts = (
+        BlockMetrics(3, ["a"]),
+        BlockMetrics(3, ["a"]),
+        SeamMetrics(),
+        SeamMetrics(),
+    )
+    errors, errors_parts = DepthErrors(), DepthErrors()
+    for place in range(12):
+        visibility, values = random_view(rng)
+        own, of_blocks, of_seams, depth = (
+            VisibilityHistogram([*values]),
+            BlockMetrics(3, ["a"]),
+            SeamMetrics(),
+            DepthErrors(),
+        )
+        labels = rng.integers(-1, 3, (6, 7)).astype(np.int16)
+        per_block = {"a": np.where(labels == 1, np.nan, values["ssim"])}
+        per_seam = {name: rng.random((6, 7)) for name in seams._sums}
+        found = rng.random(9)
+        for histogram in (whole, own):
+            histogram.add(visibility, values)
+        for metrics in (blocks, of_blocks):
+            metrics.add(labels, per_block)
+        for each in (seams, of_seams):
+            each.add(labels, per_seam)
+        for each in (errors, depth):
+            each.add(found)
+        row = {
+            "psnr": float(rng.normal()),
+            "inf": float("inf"),
+            "nothing": None,
+            "name": "ü/1.jpg",
+            "nan": float("nan"),
+        }
+        pixels = rng.integers(0, 255, (3, 4, 3), np.uint8)
+        cell = Thumbnail("ü", "1 dB", pixels, pixels[::-1].copy()) if place % 2 else None
+        save_view(
+            tmp_path / "1.npz", ViewFigures(row, own, {"median": depth}, cell), BlockFigures(row, of_blocks, of_seams)
+        )
+        read, read_blocks = load_view(tmp_path / "1.npz")
+        assert repr(read.row) == repr(row) == repr(read_blocks.row)
+        assert (read.cell is None) == (cell is None)
+        if cell is not None:
+            assert (read.cell.name, read.cell.caption) == (cell.name, cell.caption)
+            assert (read.cell.render == cell.render).all()
+            assert (read.cell.photograph == cell.photograph).all()
+        parts.merge(read.by_visibility)
+        blocks_parts.merge(read_blocks.by_block)
+        seams_parts.merge(read_blocks.seams)
+        errors_parts.merge(read.depth_errors["median"])
+    assert parts.bins(5) == whole.bins(5)
+    for one, other in ((whole, parts), (blocks, blocks_parts), (seams, seams_parts), (errors, errors_parts)):
+        ours, theirs = one.arrays(), other.arrays()
+        assert {name: each.tobytes() for name, each in ours.items()} == {
+            n: each.tobytes() for n, each in theirs.items()
+        }
+
+
+def test_a_file_of_a_view_that_is_damaged_is_named(tmp_path):
+    file = tmp_path / "03/1.npz"
+    with pytest.raises(RunError, match=r"1\.npz: is missing or damaged .* Delete .*03 and run"):
+        load_view(file)
+    save_view(file, ViewFigures({}))
+    file.write_bytes(file.read_bytes()[:-40])
+    with pytest.raises(RunError, match="is missing or damaged"):
+        load_view(file)
+
+
+def test_a_piece_says_how_far_it_is_and_how_it_ended(tmp_path):
+    folder = StageFolder(tmp_path / "00")
+    with at_work(folder, 1, 3) as tell:
+        assert folder.is_held()
+        assert (folder.status().state, folder.status().iteration, folder.status().iterations) == ("running", 1, 3)
+        tell(3)
+    assert (folder.status().state, folder.status().iteration) == ("done", 3)
+    with pytest.raises(VdgsError, match="gone"), at_work(folder, 1, 3):
+        raise VdgsError("a.jpg: gone")
+    assert (folder.status().state, folder.status().why) == ("failed", "a.jpg: gone")
+    with pytest.raises(Stopped, match="Stopped after 2 of 3"), stop_requests():
+        _stopped_at_two(folder)
+    assert (folder.status().state, folder.status().iteration) == ("stopped", 2)
+
+
+def _stopped_at_two(folder: StageFolder) -> None:
+    with at_work(folder, 1, 3) as tell:
+        tell(2)
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.01)
+        stop_if_asked()
+
+
+def test_pieces_of_other_work_go_unless_they_are_at_work(tmp_path):
+    wanted, other = (PieceWork.of(tmp_path, name, [range(2)]) for name in ("this", "that"))
+    assert wanted.key != other.key
+    for work in (wanted, other):
+        work.mark_queued()
+    with alone(tmp_path, wanted.key), pytest.raises(RunError, match="another vdgs process"), alone(tmp_path):
+        pass
+    assert wanted.folder.exists()
+    assert not other.folder.exists()
+    with wanted.piece(0).locked(), pytest.raises(RunError, match="that an earlier command sent out"), alone(tmp_path):
+        pass
+    with pytest.raises(RunError, match="--piece 1: there are 1 pieces"):
+        wanted.span(1)
+
+
+@pytest.fixture(scope="module")
+def uncut(tmp_path_factory) -> Path:
+    """A run with a coarse model of ten photographs, and ten others to test with."""
+    folder = tmp_path_factory.mktemp("pieces")
+    write_colmap(folder / "capture", tiny_scene(columns=5, rows=4))
+    done = vdgs("coarse", folder / "capture", "--output", folder / "coarse", *COARSE, "--test-every", "2")
+    assert done.returncode == 0, done.stderr + done.stdout
+    return folder / "coarse"
+
+
+@pytest.fixture(scope="module")
+def merged(uncut) -> Path:
+    """Cut into two blocks, trained and merged."""
+    run = copy_run(uncut, uncut.parent / "cut")
+    done = vdgs("partition", run, "--blocks", "2", "--assignment.min-cameras", "3")
+    assert done.returncode == 0, done.stderr + done.stdout
+    return merge_run(train_here(run, run.parent / "local"), run.parent / "merged")
+
+
+@pytest.fixture(scope="module")
+def measured(merged) -> dict[str, object]:
+    """What one process makes of it."""
+    run = copy_run(merged, merged.parent / "measured")
+    done = vdgs("eval", run)
+    assert done.returncode == 0, done.stderr + done.stdout
+    figures = evaluated(run / "evaluation")
+    assert {"metrics.json", "by_block.json", "contact_sheet.png"} <= figures.keys()
+    assert any(name.startswith("seams/") for name in figures)
+    return figures
+
+
+def test_views_measured_in_pieces_are_those_of_one_process(merged, measured, tmp_path):
+    run = copy_run(merged, tmp_path / "run")
+    done = vdgs("eval", run, "--jobs", "2")
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "4 of 4 pieces done" in done.stdout
+    assert evaluated(run / "evaluation") == measured
+    assert json.loads((run / "evaluation/metrics.json").read_text())["fps"] is None
+    assert not (run / "evaluation/pieces").exists()
+    assert vdgs("status", run).stdout.count("evaluation") == vdgs("status", merged).stdout.count("evaluation")
+
+
+def test_whatever_is_stopped_or_killed_views_that_were_measured_are_not_measured_again(merged, measured, tmp_path):
+    run = copy_run(merged, tmp_path / "run")
+    with begun("eval", run, "--jobs", "2", pause_at=("*/pieces/*/00000[13].npz", 1)) as first:
+        first.wait_until_paused(2)
+        first.send_signal(signal.SIGINT)
+        done = first.finished()
+    assert done.returncode == 130, done.stderr + done.stdout
+    assert "every piece that was at work is saved. The same command continues" in done.stderr
+    (work,) = (run / "evaluation/pieces").iterdir()
+    kept = {file: file.stat().st_mtime_ns for file in work.glob("*/*.npz")}
+    assert {file.stem for file in kept} == {"000000", "000002"}
+    assert {json.loads(file.read_text())["state"] for file in work.glob("0[01]/status.json")} == {"stopped"}
+    with begun("eval", run, "--jobs", "2", pause_at=("*/pieces/*/000001.npz", 1)) as second:
+        second.wait_until_paused(1)
+        second.kill_paused()  # the piece alone: it is started again
+        wait_until(lambda: "crashed by SIGKILL" in second.printed())
+        assert {file: file.stat().st_mtime_ns for file in kept} == kept
+        done = second.finished()
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "piece 00: crashed by SIGKILL; continues from its last checkpoint, attempts left: 2" in done.stdout
+    assert evaluated(run / "evaluation") == measured
+
+
+def test_cameras_scored_in_pieces_are_assigned_as_by_one_process(tmp_path, uncut):
+    """Also where the driver was killed after it had cut, and then the piece that was left."""
+    one, run = copy_run(uncut, tmp_path / "one"), copy_run(uncut, tmp_path / "run")
+    cut = ("--blocks", "3", "--assignment.min-cameras", "3")
+    assert vdgs("partition", one, *cut).returncode == 0
+    with begun("partition", run, *cut, "--jobs", "2", pause_at=("*/pieces/*/000001.npz", 1)) as first:
+        first.wait_until_paused(1)
+        first.send_signal(signal.SIGKILL)
+        first.finished()
+        (piece,) = first.paused()
+        wait_until(lambda: not alive(piece))
+    with begun("partition", run, *cut, "--jobs", "2", pause_at=("*/pieces/*/000001.npz", 1)) as second:
+        second.wait_until_paused(1)
+        second.kill_paused()
+        done = second.finished()
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "1 of 2 pieces to score cameras" in done.stdout
+    assert "piece 01: crashed by SIGKILL" in done.stdout
+    assert evaluated(run / "partition") == evaluated(one / "partition")
+    assert vdgs("partition", run, "--piece", "0").returncode == 1
+
+
+def test_what_a_piece_cannot_do_is_said_in_its_words(merged, tmp_path):
+    run = copy_run(merged, tmp_path / "run")
+    weights = tmp_path / "none.pth"
+    done = vdgs("eval", run, "--jobs", "2", "--lpips-weights", weights)
+    assert done.returncode == 1
+    assert "4 of 4 pieces failed:" in done.stderr
+    assert done.stderr.count("none.pth") >= 4
+    assert "NN/output.log. The same command tries them again" in done.stderr
+    done = vdgs("eval", run, "--piece", "7")
+    assert done.returncode == 1
+    assert "--piece 7: there are 4 pieces, numbered from 0" in done.stderr
