@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from captures_support import tiny_scene, write_colmap
 from vdgs.errors import VdgsError
 from vdgs.executors import fitness
 from vdgs.executors.crew import Policy, run_crew
@@ -18,6 +19,7 @@ from vdgs.executors.placement import Work, by_queue, on_cluster, on_this_machine
 from vdgs.runs.folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.executors import ExecutorOptions, SlurmOptions
+from vdgs.verbs import starting
 
 GB = 10**9
 SAVED = End(130, out_of_time=True)
@@ -169,6 +171,22 @@ def test_what_a_person_asks_for_is_asked_of_the_cluster():
 def test_options_that_do_not_fit_together_are_refused(asked, said):
     with pytest.raises(VdgsError, match=said):
         asked.check()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [(("--executor", "slurm"), "There is no sbatch"), (("--executor", "ray"), "Ray is not installed: pip install")],
+)
+def test_where_blocks_could_not_be_trained_no_coarse_model_is_trained_before_that_is_said(
+    options, said, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    write_colmap(tmp_path / "capture", tiny_scene())
+    with pytest.raises(VdgsError, match=said):
+        starting.run([str(tmp_path / "capture"), "--output", str(tmp_path / "run"), *options])
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.fixture

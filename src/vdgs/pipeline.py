@@ -13,6 +13,7 @@ from vdgs.captures.capture import Capture
 from vdgs.errors import RunError, VdgsError
 from vdgs.evaluation.lpips import refuse_missing
 from vdgs.evaluation.of_run import evaluation_folder
+from vdgs.executors.choosing import refuse_unreachable
 from vdgs.executors.errand import Wish
 from vdgs.maps.mapping import can_map, is_mapped, map_run
 from vdgs.report import write_report
@@ -41,7 +42,7 @@ def run_all(asked: RunRequest, console: Console, command: str | None = None) -> 
 
     Raises what the stages raise; all that was finished before stays, and the same command continues.
     """
-    asked.where.check()
+    refuse_unreachable(asked.where)
     refuse(asked)
     refuse_missing(asked.lpips_weights)
     asked = with_capture(asked, console)

@@ -57,6 +57,20 @@ def choose(asked: ExecutorOptions, work: Work, machine: Machine, question: Calla
         yield _local(work, machine)
 
 
+def refuse_unreachable(asked: ExecutorOptions) -> None:
+    """Say before long work what would otherwise come out after it. Raises VdgsError where what was asked for is not
+    there: Ray, a cluster at its address, the commands of SLURM."""
+    asked.check()
+    if asked.executor == "ray":
+        from vdgs.executors import on_ray
+
+        on_ray.refuse_unreachable(asked.address)
+    elif asked.executor == "slurm":
+        from vdgs.executors.on_slurm import refuse_without_slurm
+
+        refuse_without_slurm()
+
+
 def _local(work: Work, machine: Machine) -> Chosen:
     share = on_this_machine(work, machine.cores, machine.free_bytes)
     line = (

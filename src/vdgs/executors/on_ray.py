@@ -7,6 +7,7 @@ attempts are counted and worded as everywhere.
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import os
 import secrets
 import signal
@@ -51,7 +52,7 @@ def connected(address: str | None) -> Iterator[None]:
 
     Raises VdgsError where there is no Ray, or none that answers.
     """
-    where = address or os.environ.get("RAY_ADDRESS") or "local"
+    where = _place(address)
     variables, own = {"RAY_USAGE_STATS_ENABLED": "0"}, dict[str, Any]()
     if where == "local":
         own = {"include_dashboard": False, "object_store_memory": OBJECT_BYTES}
@@ -71,12 +72,29 @@ def connected(address: str | None) -> Iterator[None]:
                 os.environ[name] = value
 
 
+def refuse_unreachable(address: str | None) -> None:
+    """Raises VdgsError where there is no Ray, or none that answers at that address. None is started for it."""
+    if _place(address) == "local":
+        _refuse_without_ray()
+    else:
+        with connected(address):
+            pass
+
+
+def _place(address: str | None) -> str:
+    return address or os.environ.get("RAY_ADDRESS") or "local"
+
+
+def _refuse_without_ray() -> None:
+    if importlib.util.find_spec("ray") is None:
+        raise VdgsError('Ray is not installed: pip install "vdgs[ray]"')
+
+
 @contextmanager
 def _driver(where: str, own: Mapping[str, Any]) -> Iterator[None]:
-    try:
-        import ray
-    except ImportError as error:
-        raise VdgsError('Ray is not installed: pip install "vdgs[ray]"') from error
+    _refuse_without_ray()
+    import ray
+
     with _handlers_kept():
         try:
             ray.init(address=where, namespace=NAMESPACE, log_to_driver=False, logging_level="error", **own)

@@ -91,7 +91,7 @@ def fate(element: Element) -> Fate | None:
         if facts.get("JobState"):
             return Fate(facts["JobState"], _none(facts.get("NodeList", "")))
     except SlurmError:
-        pass
+        pass  # the controller forgets ended jobs after some minutes; accounting may remember them
     if shutil.which("sacct") is None:
         return None
     try:
