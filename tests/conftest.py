@@ -45,6 +45,20 @@ def module_name(file: Path) -> str:
 install_import_hook([module_name(file) for file in files_with_shapes()], "typecheck.checked")
 
 
+@pytest.fixture(scope="module")
+def compiled_code(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("code")
+
+
+@pytest.fixture
+def compiled_once(compiled_code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """CUDA kernels that a module's tests compile are kept for it, so that NVRTC runs once (that what is kept is never
+    wrong: test_cuda_compiling.py)."""
+    from vdgs.kernels.cuda import cache
+
+    monkeypatch.setenv(cache.VARIABLE, str(compiled_code))
+
+
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """What `-n auto` means: no workers (0) where only some files were asked for, for they take seconds to start."""
     if any(argument.partition("::")[0].endswith(".py") for argument in config.args):

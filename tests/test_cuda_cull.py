@@ -12,31 +12,19 @@ from decode_scenes import looking_down
 from test_cuda_compiling import needs_nvrtc
 from test_cull import CAMERAS, anchors, ellipse_touches_image
 from vdgs.cameras import Camera
-from vdgs.kernels.cuda import cache
 from vdgs.kernels.cuda.cull import PROGRAM, cull
 from vdgs.kernels.cuda.driver import cuda_driver
 from vdgs.kernels.cuda.launching import Program, read_source
 from vdgs.kernels.native.cull import cull as native
 from vdgs.kernels.reference.cull import cull as reference
 
-pytestmark = [needs_nvrtc, pytest.mark.xdist_group("cuda_cull")]
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_cull")]
 needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
 
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
     return build_on_host(PROGRAM.name, tmp_path_factory.mktemp("host"))
-
-
-@pytest.fixture(scope="module")
-def code(tmp_path_factory):
-    """Where compiled code is kept, so that NVRTC runs once (that it is never wrong: test_cuda_compiling.py)."""
-    return tmp_path_factory.mktemp("code")
-
-
-@pytest.fixture(autouse=True)
-def _compiled_once(code, monkeypatch):
-    monkeypatch.setenv(cache.VARIABLE, str(code))
 
 
 def kept(

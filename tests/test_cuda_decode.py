@@ -14,7 +14,7 @@ from decode_scenes import Scene, looking_down, turned
 from test_cuda_compiling import needs_nvrtc
 from vdgs.cameras import Camera
 from vdgs.kernels import native
-from vdgs.kernels.cuda import cache, decode_adam
+from vdgs.kernels.cuda import decode_adam
 from vdgs.kernels.cuda.camera import PackedCamera
 from vdgs.kernels.cuda.decode import PROGRAM, decode
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
@@ -24,7 +24,7 @@ from vdgs.kernels.reference.decode import decode as reference
 from vdgs.kernels.reference.decode_adam import decode_backward_adam as by_reference
 from vdgs.kernels.types import AdamState, AnchorSplats, SplatGradients
 
-pytestmark = [needs_nvrtc, pytest.mark.xdist_group("cuda_decode")]
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_decode")]
 needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
 CAMERAS = {
     "down": looking_down(),
@@ -37,17 +37,6 @@ CAMERAS = {
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
     return build_on_host(PROGRAM.name, tmp_path_factory.mktemp("host"))
-
-
-@pytest.fixture(scope="module")
-def code(tmp_path_factory):
-    """Where compiled code is kept, so that NVRTC runs once (that it is never wrong: test_cuda_compiling.py)."""
-    return tmp_path_factory.mktemp("code")
-
-
-@pytest.fixture(autouse=True)
-def _compiled_once(code, monkeypatch):
-    monkeypatch.setenv(cache.VARIABLE, str(code))
 
 
 def decoded(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order: int = 0) -> AnchorSplats:

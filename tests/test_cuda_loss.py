@@ -11,13 +11,12 @@ import torch
 from cuda_on_host import HostDriver, build_on_host, host_compiler
 from test_cuda_compiling import needs_nvrtc
 from test_loss import scene, with_gradient
-from vdgs.kernels.cuda import cache
 from vdgs.kernels.cuda import loss as cuda
 from vdgs.kernels.cuda.driver import CudaUnavailable, cuda_driver
 from vdgs.kernels.cuda.launching import Program, read_source
 from vdgs.kernels.reference import loss as reference
 
-pytestmark = [needs_nvrtc, pytest.mark.xdist_group("cuda_loss")]
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_loss")]
 needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
 #: How many the kernels have.
 BARRIERS = 7
@@ -37,17 +36,6 @@ def numbered(tmp_path_factory):
     parts = [f"if (left_out != {number}) __syncthreads();{part}" for number, part in enumerate(after)]
     text = 'extern "C" int left_out;\nint left_out = -1;\n' + before + "".join(parts)
     return build_on_host("loss.cu", tmp_path_factory.mktemp("numbered"), text)
-
-
-@pytest.fixture(scope="module")
-def code(tmp_path_factory):
-    """Where compiled code is kept, so that NVRTC runs once (that it is never wrong: test_cuda_compiling.py)."""
-    return tmp_path_factory.mktemp("code")
-
-
-@pytest.fixture(autouse=True)
-def _compiled_once(code, monkeypatch):
-    monkeypatch.setenv(cache.VARIABLE, str(code))
 
 
 @pytest.fixture

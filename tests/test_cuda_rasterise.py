@@ -12,14 +12,13 @@ from cuda_on_host import ORDERS, HostDriver, Stuck, build_on_host, host_compiler
 from rasterise_scenes import Scene, make_scene, splats_of
 from test_cuda_compiling import needs_nvrtc
 from test_rasterise import assert_close, assert_same_picture, loss_of
-from vdgs.kernels.cuda import cache
 from vdgs.kernels.cuda.driver import cuda_driver
 from vdgs.kernels.cuda.launching import Program, read_source
 from vdgs.kernels.cuda.rasterise import PROGRAM, rasterise, rasterise_vjp
 from vdgs.kernels.reference.rasterise import rasterise as reference
 from vdgs.kernels.types import Raster
 
-pytestmark = [needs_nvrtc, pytest.mark.xdist_group("cuda_rasterise")]
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_rasterise")]
 needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
 #: Whatever makes the threads of a block wait for each other.
 BARRIER = re.compile(r"__syncthreads(?:_and|_or)?\(")
@@ -57,17 +56,6 @@ int maybe_syncthreads_and(int number, int mine) { return number == left_out ? mi
 int maybe_syncthreads_or(int number, int mine) { return number == left_out ? mine : __syncthreads_or(mine); }
 """
     return build_on_host("rasterise.cu", tmp_path_factory.mktemp("numbered"), before + text)
-
-
-@pytest.fixture(scope="module")
-def code(tmp_path_factory):
-    """Where compiled code is kept, so that NVRTC runs once (that it is never wrong: test_cuda_compiling.py)."""
-    return tmp_path_factory.mktemp("code")
-
-
-@pytest.fixture(autouse=True)
-def _compiled_once(code, monkeypatch):
-    monkeypatch.setenv(cache.VARIABLE, str(code))
 
 
 def drawn(scene: Scene, library: ctypes.CDLL, order: int = 0, depth: bool = True) -> Raster:

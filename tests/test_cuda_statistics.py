@@ -12,31 +12,19 @@ import torch
 from cuda_on_host import ORDERS, HostDriver, build_on_host, host_compiler
 from test_cuda_compiling import needs_nvrtc
 from test_statistics import view
-from vdgs.kernels.cuda import cache
 from vdgs.kernels.cuda.driver import cuda_driver
 from vdgs.kernels.cuda.launching import Program, read_source
 from vdgs.kernels.cuda.statistics import PROGRAM, add_view_statistics
 from vdgs.kernels.reference.statistics import add_view_statistics as by_reference
 from vdgs.kernels.types import Statistics
 
-pytestmark = [needs_nvrtc, pytest.mark.xdist_group("cuda_statistics")]
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_statistics")]
 needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
 
 
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
     return build_on_host(PROGRAM.name, tmp_path_factory.mktemp("host"))
-
-
-@pytest.fixture(scope="module")
-def code(tmp_path_factory):
-    """Where compiled code is kept, so that NVRTC runs once (that it is never wrong: test_cuda_compiling.py)."""
-    return tmp_path_factory.mktemp("code")
-
-
-@pytest.fixture(autouse=True)
-def _compiled_once(code, monkeypatch):
-    monkeypatch.setenv(cache.VARIABLE, str(code))
 
 
 def on_host(library: ctypes.CDLL, order: int = 0):

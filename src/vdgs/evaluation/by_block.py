@@ -9,7 +9,7 @@ pass, memory bounded whatever the number of test views.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -83,12 +83,45 @@ def blocks_shown(labels: Int16[np.ndarray, "h w"], blocks: int) -> list[int]:
     return np.flatnonzero(counts >= max(1.0, LEAST_SHARE * labels.size)).tolist()
 
 
-class BlockMetrics:
+_AnyPooled = TypeVar("_AnyPooled", bound="_Pooled")
+
+
+class _Pooled:
+    """Pixels by group (blocks, or places), and sums of errors over them by name, one view after the other."""
+
+    def __init__(self, groups: int, names: Sequence[str]) -> None:
+        self._pixels = np.zeros(groups, np.int64)
+        self._sums = {name: np.zeros(groups) for name in names}
+
+    def merge(self: _AnyPooled, other: _AnyPooled) -> None:
+        """Count what another one counted; view by view, in their order, with the bits of one that counted all."""
+        self._pixels += other._pixels
+        for name, total in self._sums.items():
+            total += other._sums[name]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What was counted: for files."""
+        return {
+            "pixels": self._pixels, "names": np.array([*self._sums], np.str_), "sums": np.stack([*self._sums.values()]),
+        }  # fmt: skip
+
+    @classmethod
+    def of(cls: type[_AnyPooled], arrays: Mapping[str, np.ndarray]) -> _AnyPooled:
+        """The inverse of `arrays`."""
+        found = cls.__new__(cls)
+        names = [str(name) for name in arrays["names"]]
+        _Pooled.__init__(found, len(arrays["pixels"]), names)
+        found._pixels += arrays["pixels"]
+        for name, sums in zip(names, arrays["sums"], strict=True):
+            found._sums[name] += sums
+        return found
+
+
+class BlockMetrics(_Pooled):
     """Squared errors of named renders, pooled by block; `add` each test view, then read `rows`."""
 
     def __init__(self, blocks: int, names: Sequence[str]) -> None:
-        self._pixels = np.zeros(blocks, np.int64)
-        self._sums = {name: np.zeros(blocks) for name in names}
+        super().__init__(blocks, names)
 
     def add(
         self,
@@ -106,27 +139,6 @@ class BlockMetrics:
         for name, total in self._sums.items():
             total += np.bincount(keys, weights=squared_errors[name][counted], minlength=len(total))
 
-    def merge(self, other: BlockMetrics) -> None:
-        """Count what another one counted; view by view, in their order, with the bits of one that counted all."""
-        self._pixels += other._pixels
-        for name, total in self._sums.items():
-            total += other._sums[name]
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What was counted: for files."""
-        return {
-            "pixels": self._pixels, "names": np.array([*self._sums], np.str_), "sums": np.stack([*self._sums.values()]),
-        }  # fmt: skip
-
-    @classmethod
-    def of(cls, arrays: Mapping[str, np.ndarray]) -> BlockMetrics:
-        """The inverse of `arrays`."""
-        found = cls(len(arrays["pixels"]), [str(name) for name in arrays["names"]])
-        found._pixels += arrays["pixels"]
-        for name, sums in zip(arrays["names"], arrays["sums"], strict=True):
-            found._sums[str(name)] += sums
-        return found
-
     def rows(self) -> list[dict[str, Any]]:
         """For each block: block, pixels, and `psnr_NAME` in dB of each render, NaN where it has none."""
         return [{"block": index, **self._figures([index])} for index in range(len(self._pixels))]
@@ -141,15 +153,14 @@ class BlockMetrics:
         return {"pixels": pixels, **{f"psnr_{name}": psnr_of(mean) for name, mean in means.items()}}
 
 
-class SeamMetrics:
+class SeamMetrics(_Pooled):
     """Errors at the borders of blocks against errors elsewhere; `add` each test view, then read `figures`."""
 
     #: The renders that are compared. The coarse one has no seams: it says how hard the places at the borders are.
     NAMES = ("coarse", "merged")
 
     def __init__(self) -> None:
-        self._pixels = np.zeros(2, np.int64)
-        self._sums = {f"{kind}_{name}": np.zeros(2) for kind in ("mae", "mse") for name in self.NAMES}
+        super().__init__(2, [f"{kind}_{name}" for kind in ("mae", "mse") for name in self.NAMES])
 
     def add(
         self,
@@ -164,27 +175,6 @@ class SeamMetrics:
             self._pixels[place] += np.count_nonzero(where)
             for name, sums in self._sums.items():
                 sums[place] += errors[name][where].sum()
-
-    def merge(self, other: SeamMetrics) -> None:
-        """Count what another one counted; view by view, in their order, with the bits of one that counted all."""
-        self._pixels += other._pixels
-        for name, total in self._sums.items():
-            total += other._sums[name]
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What was counted: for files."""
-        return {
-            "pixels": self._pixels, "names": np.array([*self._sums], np.str_), "sums": np.stack([*self._sums.values()]),
-        }  # fmt: skip
-
-    @classmethod
-    def of(cls, arrays: Mapping[str, np.ndarray]) -> SeamMetrics:
-        """The inverse of `arrays`."""
-        found = cls()
-        found._pixels += arrays["pixels"]
-        for name, sums in zip(arrays["names"], arrays["sums"], strict=True):
-            found._sums[str(name)] += sums
-        return found
 
     def figures(self) -> dict[str, Any]:
         """Means at the border and elsewhere, their ratio for each render, and `seam_mae`, `seam_mse`: the ratio of the

@@ -116,6 +116,11 @@ class Splats:
     colours: Float[Tensor, "m 3"]
     opacities: Float[Tensor, "m"]
 
+    @property
+    def tensors(self) -> tuple[Tensor, ...]:
+        """All that a rasteriser draws, in the order in which it takes them."""
+        return self.means_px, self.conics, self.colours, self.opacities, self.depths
+
 
 @dataclass(frozen=True, eq=False)
 class AnchorSplats(Splats):

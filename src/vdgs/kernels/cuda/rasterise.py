@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from vdgs.kernels.checking import check_splats
 from vdgs.kernels.cuda.launching import Argument, Program
-from vdgs.kernels.reference.rasterise import check_splats
+from vdgs.kernels.differentiable import differentiable
 from vdgs.kernels.types import Raster, RasterGradients, RasterPullback, Splats
 
 #: Side of a tile, threads of a block and sums of an entry: kTile, kThreads and kSums of the source.
@@ -35,7 +34,7 @@ def rasterise(
     Backward takes 52 bytes an entry. Raises TypeError or ValueError for unsuitable tensors, CudaUnavailable where the
     kernels cannot be run.
     """
-    return Raster(*_Rasterise.apply(width, height, depth, program, *_tensors(splats), background))
+    return differentiable(lambda tensors: _draw(tensors, width, height, depth, program), splats, background)
 
 
 def rasterise_vjp(
@@ -48,7 +47,7 @@ def rasterise_vjp(
     program: Program = PROGRAM,
 ) -> tuple[Raster, RasterPullback]:
     """`rasterise` without autograd: the picture, and the way back from it, which reads the splats again."""
-    return _draw((*_tensors(splats), background), width, height, depth, program)
+    return _draw((*splats.tensors, background), width, height, depth, program)
 
 
 @dataclass(frozen=True)
@@ -137,26 +136,6 @@ class _Pullback:
         else:
             by_background = (self.transmittance[..., None] * wanted[0]).sum((0, 1))
         return RasterGradients(by_means, by_conics, by_colours, by_opacities, by_depths, by_background)
-
-
-class _Rasterise(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, width: int, height: int, with_depth: bool, program: Program, *tensors: Tensor) -> Raster:
-        raster, ctx.pullback = _draw(tensors, width, height, with_depth, program)
-        if raster.median_depth is not None:
-            ctx.mark_non_differentiable(raster.median_depth)
-        ctx.set_materialize_grads(False)
-        return raster
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *picture_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        image, alpha, depth, _ = picture_gradients
-        return None, None, None, None, *ctx.pullback(image, alpha, depth)
-
-
-def _tensors(splats: Splats) -> tuple[Tensor, ...]:
-    return splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths
 
 
 def _over(count: int) -> tuple[int]:

@@ -18,8 +18,9 @@ from jaxtyping import Float, Int32
 from torch import Tensor
 
 from vdgs.errors import VdgsError
+from vdgs.kernels.checking import check_splats
 from vdgs.kernels.constants import ALPHA_MIN
-from vdgs.kernels.reference.rasterise import check_splats, pulled_back
+from vdgs.kernels.differentiable import pulled_back
 from vdgs.kernels.types import Raster, RasterPullback, Splats
 
 #: Side of gsplat's tiles, in pixels (its default).
@@ -46,12 +47,8 @@ def rasterise(
     Raises GsplatUnavailable without gsplat, TypeError or ValueError for unsuitable tensors.
     """
     engine = engine or load()
-    check_splats(
-        (splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths, background), width, height
-    )
-    means_px, conics, colours, opacities, depths = (
-        splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths,
-    )  # fmt: skip
+    check_splats((*splats.tensors, background), width, height)
+    means_px, conics, colours, opacities, depths = splats.tensors
     if not len(means_px):
         return _empty(background, width, height, depth)
     reach = reach_px(splats)

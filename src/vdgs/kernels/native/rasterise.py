@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from vdgs.kernels.checking import check_splats
+from vdgs.kernels.differentiable import differentiable
 from vdgs.kernels.native import module as native_module
-from vdgs.kernels.reference.rasterise import check_splats
 from vdgs.kernels.types import Raster, RasterGradients, RasterPullback, Splats
 
 
@@ -37,7 +37,7 @@ def rasterise(
     Raises TypeError or ValueError for tensors of another type, device or shape, or a picture side
     outside 1 .. 524272. The second derivative is not defined: asking for it raises RuntimeError.
     """
-    return Raster(*_Rasterise.apply(width, height, depth, module, *_tensors(splats), background))
+    return differentiable(lambda tensors: _draw(tensors, width, height, depth, module), splats, background)
 
 
 def rasterise_vjp(
@@ -53,7 +53,7 @@ def rasterise_vjp(
 
     Of the arguments nothing is kept: their memory may be used again before the way back.
     """
-    return _draw((*_tensors(splats), background), width, height, depth, module)
+    return _draw((*splats.tensors, background), width, height, depth, module)
 
 
 def _draw(
@@ -100,26 +100,6 @@ class _Pullback:
             *(None if t is None else t.numpy() for t in found),
         )  # fmt: skip
         return found
-
-
-class _Rasterise(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, width: int, height: int, with_depth: bool, module: Any, *tensors: Tensor) -> Raster:
-        raster, ctx.pullback = _draw(tensors, width, height, with_depth, module)
-        if raster.median_depth is not None:
-            ctx.mark_non_differentiable(raster.median_depth)
-        ctx.set_materialize_grads(False)
-        return raster
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *picture_gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        image, alpha, depth, _ = picture_gradients
-        return None, None, None, None, *ctx.pullback(image, alpha, depth)
-
-
-def _tensors(splats: Splats) -> tuple[Tensor, ...]:
-    return splats.means_px, splats.conics, splats.colours, splats.opacities, splats.depths
 
 
 def _check(tensors: tuple[Tensor, ...], width: int, height: int) -> None:
