@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import re
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -94,11 +95,18 @@ def without_aliasing(capture: Path, views: list[View]) -> list[np.ndarray]:
     seed, extent = (float(re.search(rf"^- {name}: (.*)$", note, re.M).group(1)) for name in ("seed", "extent_m"))
     with np.load(capture / "truth" / "cameras.npz", allow_pickle=False) as stored:
         gains = dict(zip(stored["names"].tolist(), stored["gains"], strict=True))
+        # The capture has its own ground frame; the town stands where it was built.
+        poses = dict(zip(stored["names"].tolist(), stored["camera_from_world"], strict=True))
     town = build_town(int(seed), extent)
     tracer = Tracer(town.mesh)
     with ThreadPoolExecutor(2) as pool:
         sky = sky_map(tracer, town.terrain, town.zones, extent / 2 + 40, pool)
-        return list(pool.map(lambda view: photograph(town, tracer, sky, view.camera, SAMPLES, gains[view.name]), views))
+
+        def take(view: View) -> np.ndarray:
+            camera = replace(view.camera, camera_from_world=poses[view.name])
+            return photograph(town, tracer, sky, camera, SAMPLES, gains[view.name])
+
+        return list(pool.map(take, views))
 
 
 def squares(of: list[np.ndarray], to: list[np.ndarray]) -> np.ndarray:
