@@ -166,7 +166,7 @@ class ExportRequest:
     """How colours change with the direction: spherical harmonics up to this degree. 0: not at all, and a fifth of the
     size."""
     html_mb: Annotated[float, Range(1, 2000)] = 30.0
-    """A .html file has at most so many MB: the scene is thinned by halves until it fits."""
+    """A .html file has at most so many MB: the scene is thinned until it fits."""
     refine: Annotated[float, SECONDS] = 0.0
     """Seconds for which all that is baked is moved towards the model's own pictures, after what is fitted in closed
     form; 0: not at all. Needs 0.7 kB of memory for each Gaussian of degree 3."""

@@ -2,7 +2,7 @@
 
 The client comes from the installed package viser, with a recording of one message that carries the Gaussians: 32 bytes
 each (mean in float32, covariance in float16, colour and opacity in bytes), compressed, as base64. Colours do not change
-with the direction. A scene that would be too large for the file is thinned by halves until it fits (`levels`).
+with the direction. A scene that would be too large for the file is thinned until it fits (`levels`).
 """
 
 from __future__ import annotations
@@ -117,18 +117,16 @@ def _of_fixed_colour(scene: Scene) -> Gaussians:
 
 
 def _fitting(whole: Gaussians, tried: int, factor: float, page: Page) -> Gaussians:
-    """The scene halved as often as it takes to fit, at least once more than what was tried. Raises VdgsError."""
+    """The scene thinned to what there is room for, and by a tenth more than what was tried. Raises VdgsError."""
     some = whole.select(torch.linspace(0, len(whole) - 1, min(SAMPLE, len(whole))).long())
     frame = len(_client()) + 4096
     each = SLACK * len(_recorded(_packed(some, factor), factor, page)) / len(some)
-    count = len(whole)
-    while count >= tried or frame + each * count > page.most_bytes:
-        count //= 2
-        if count < FEWEST:
-            raise VdgsError(
-                f"A page of {page.most_bytes / 1e6:g} MB has no room for the scene: the client alone takes "
-                f"{frame / 1e6:.1f} MB. Allow more: --html-mb."
-            )
+    count = int(min((page.most_bytes - frame) / each, 0.9 * tried))
+    if count < FEWEST:
+        raise VdgsError(
+            f"A page of {page.most_bytes / 1e6:g} MB has no room for the scene: the client alone takes "
+            f"{frame / 1e6:.1f} MB. Allow more: --html-mb."
+        )
     return thinned(whole, count)[0]
 
 
