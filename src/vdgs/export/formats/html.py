@@ -210,7 +210,7 @@ def _recorded(rows: UInt32[np.ndarray, "n 8"], factor: float, page: Page) -> str
         """Of no server: it only holds the list of recordings."""
 
         def get_message_buffer(self) -> Any:
-            raise NotImplementedError
+            raise AssertionError("nothing is sent: a page is only recorded")
 
     recording: StateSerializer = Nowhere().get_message_serializer(lambda message: True)
     said: list[Any] = [
