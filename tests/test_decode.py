@@ -169,8 +169,11 @@ def test_nothing_visible_and_nothing_opaque(decode, v, opaque):
         assert tensor.grad is None or not tensor.grad.any()
 
 
-@BOTH
-def test_what_is_not_a_number_is_dropped_and_spoils_nothing(decode):
+@pytest.mark.parametrize("isa", ["twin", *module.supported()])
+def test_what_is_not_a_number_is_dropped_and_spoils_nothing(isa, monkeypatch):
+    decode = twin_decode if isa == "twin" else native_decode
+    if isa != "twin":
+        monkeypatch.setattr(module, "native", lambda: module.load(isa))
     camera, nan = CAMERAS[0], float("nan")
     scene = Scene.random(60, spread=1.0)
     spoilt, offset = divmod(int(decode(*scene.arguments, camera).source[60]), 10)

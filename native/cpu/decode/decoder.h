@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <limits>
 #include <memory>
 
 #include "gaussian.h"
@@ -134,12 +135,13 @@ inline void load_batch(const AnchorArrays& anchors, const Camera& camera, int64_
   store(viewing, direction.x), store(viewing + kLanes, direction.y), store(viewing + 2 * kLanes, direction.z);
   store(viewing + 3 * kLanes, distance), store(viewing + 4 * kLanes, splat(1.0f));
 
-  // Zero times a number is zero, but times infinity or NaN it is NaN, which compares with nothing.
+  // Not by zero times a number: where signs of zero do not count, GCC takes that for zero, of a NaN too.
   const Anchor<F16>& a = batch.anchor;
-  F16 zero[2] = {splat(0.0f), splat(0.0f)};
-  for (int i = 0; i < kInputs; ++i) zero[i % 2] = fma(splat(0.0f), load(batch.inputs + i * kLanes), zero[i % 2]);
-  for (const Vec3<F16>& v : {a.position, a.extent, a.size}) zero[0] = fma(splat(0.0f), v.x + v.y + v.z, zero[0]);
-  batch.usable = first_lanes(count) & le(zero[0] + zero[1], splat(0.0f));
+  const F16 infinity = splat(std::numeric_limits<float>::infinity());
+  M16 usable = first_lanes(count);
+  for (int i = 0; i < kInputs; ++i) usable = usable & lt(abs(load(batch.inputs + i * kLanes)), infinity);
+  for (const Vec3<F16>& v : {a.position, a.extent, a.size}) usable = usable & lt(abs(v.x + v.y + v.z), infinity);
+  batch.usable = usable;
   if (bits(batch.usable) != 0xffff)
     for (int i = 0; i < kInputs; ++i) {
       float* input = batch.inputs + i * kLanes;
