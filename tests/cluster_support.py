@@ -8,6 +8,7 @@ import secrets
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,10 +41,9 @@ def tell(**facts):
 tell(address=cluster.address)
 own.pop("include_dashboard")
 for line in sys.stdin:
-    verb, name, *path = line.split()
+    verb, name, options = json.loads(line)
     if verb == "add":
-        where = {"env_vars": {"PYTHONPATH": path[0]}} if path else {}
-        nodes[name] = cluster.add_node(num_cpus=1, **own, **where)
+        nodes[name] = cluster.add_node(num_cpus=1, **own | options)
         tell(raylet=nodes[name].all_processes["raylet"][0].process.pid)
     elif verb == "remove":
         cluster.remove_node(nodes.pop(name), allow_graceful=False)
@@ -76,9 +76,10 @@ class Cluster:
         self._raylets, self.names = dict[int, str](), list[str]()
         self.address = str(self._answer()["address"])
 
-    def add(self, name: str, *path: Path) -> None:
-        """Start a node, which finds its modules at another path if one is given."""
-        self._raylets[int(self._ask("add", name, *map(str, path))["raylet"])] = name
+    def add(self, name: str, variables: Mapping[str, str] | None = None, **options: Any) -> None:
+        """Start a node with environment variables and options of its own."""
+        where = {"env_vars": dict(variables)} if variables else {}
+        self._raylets[int(self._ask("add", name, **options, **where)["raylet"])] = name
         self.names.append(name)
 
     def remove(self, name: str) -> None:
@@ -90,6 +91,13 @@ class Cluster:
         """On which node a command of a block runs: its keeper is a child of the node's own process."""
         return self._raylets[parent_of(parent_of(process))]
 
+    def has(self, process: int, name: str) -> bool:
+        """Whether a process of a block lives on a node; no if it is just being killed."""
+        try:
+            return alive(process) and self.node_of(process) == name
+        except (OSError, KeyError):  # it, or its keeper, has ended since
+            return False
+
     def close(self) -> None:
         assert self._server.stdin is not None
         self._server.stdin.close()
@@ -97,9 +105,9 @@ class Cluster:
         assert self._server.stdout is not None
         self._server.stdout.close()
 
-    def _ask(self, *words: str) -> dict[str, Any]:
+    def _ask(self, verb: str, name: str, **options: Any) -> dict[str, Any]:
         assert self._server.stdin is not None
-        self._server.stdin.write(" ".join(words) + "\n")
+        self._server.stdin.write(json.dumps([verb, name, options]) + "\n")
         self._server.stdin.flush()
         return self._answer()
 

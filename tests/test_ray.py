@@ -160,7 +160,7 @@ def test_a_node_that_joins_late_and_cannot_work_on_the_run_is_named_and_avoided(
         cluster.remove(name)
     with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
         driver.wait_until_paused(1)
-        cluster.add("stranger", stranger)
+        cluster.add("stranger", {"PYTHONPATH": str(stranger)})
         wait_until(lambda: "cannot work on the run" in driver.printed())
         driver.go_on()
         done = driver.finished()
@@ -168,3 +168,29 @@ def test_a_node_that_joins_late_and_cannot_work_on_the_run_is_named_and_avoided(
     assert models(run) == models(local)
     assert done.stdout.count("crashed by a node that cannot work on the run") == 1
     assert "not the same code" in done.stdout
+
+
+def test_a_block_for_which_a_node_has_no_memory_goes_to_a_larger_one_and_a_slow_node_is_waited_for(
+    cut, local, cluster, tmp_path
+):
+    """Ray itself ends the block on a node whose memory it takes for full; the other block stands still meanwhile."""
+    run = copy_run(cut, tmp_path / "run")
+    for name in list(cluster.names):
+        cluster.remove(name)
+    cluster.add("slow")
+    with begun(*on_ray(run, cluster), "--memory-gb", "1", pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
+        driver.wait_until_paused(1)
+        (slow,) = driver.paused()
+        full = {"RAY_memory_monitor_refresh_ms": "100", "RAY_memory_usage_threshold": "0.001"}
+        cluster.add("small", full, memory=1 << 30)
+        wait_until(lambda: "crashed by Ray, to free memory" in driver.printed())
+        cluster.add("large")
+        wait_until(lambda: any(cluster.has(process, "large") for process in driver.paused()))
+        os.kill(slow, signal.SIGSTOP)
+        driver.go_on()
+        wait_until((run / f"blocks/{1 - block_of(slow):02d}/model.safetensors").exists)
+        os.kill(slow, signal.SIGCONT)
+        done = driver.finished()
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert models(run) == models(local)
+    assert "(out of memory; it asks for 1.50 GB now)" in done.stdout
