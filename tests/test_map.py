@@ -168,7 +168,7 @@ def test_walls_do_not_smear(house, samples):
 def test_tiles_show_what_one_picture_shows(house):
     capture, model = house
     surveyor = Surveyor.of(model, capture, Placement.of(capture.ground))
-    x0, y0, x1, y1 = extent_of(capture, surveyor.placement)
+    x0, y0, x1, y1 = extent_of(capture, surveyor.overhead.placement)
     grid = grid_over((x0, y0, x1, y1), 0.2)
     whole = surveyor.tile(grid)
     for column, row, part in grid.tiles(40):

@@ -147,6 +147,17 @@ def test_views_are_measured_on_nodes_for_whatever_driver_lives(local, cluster, t
     assert evaluated(run / "evaluation") == evaluated(here / "evaluation")
 
 
+def test_a_map_is_put_together_from_the_pieces_of_several_nodes(cut, cluster, tmp_path):
+    pytest.importorskip("rasterio")
+    run, here = copy_run(cut, tmp_path / "run"), copy_run(cut, tmp_path / "here/run")  # previews name the run
+    asked = ("--gsd", "0.002", "--bbox", "-1.5", "-1.0", "1.5", "1.0", "--crs", "local")
+    assert vdgs("map", here, *asked).returncode == 0
+    done = vdgs("map", run, *asked, "--executor", "ray", "--address", cluster.address, environment=cluster.token)
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "2 of 2 pieces done" in done.stdout
+    assert evaluated(run / "maps") == evaluated(here / "maps")
+
+
 def test_a_node_that_joins_late_and_cannot_work_on_the_run_is_named_and_avoided(cut, local, cluster, tmp_path):
     run, stranger = copy_run(cut, tmp_path / "run"), tmp_path / "stranger"
     source = Path(cli.__file__).parent

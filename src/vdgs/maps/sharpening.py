@@ -21,7 +21,7 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import render
 
 #: Photographs looked up for one tile; bytes of photographs, and depth maps, that are kept between tiles.
-_MOST_VIEWS, _BUDGET_BYTES, _KEPT_DEPTHS = 12, 512_000_000, 24
+_MOST_VIEWS, SHARPENING_BYTES, _KEPT_DEPTHS = 12, 512_000_000, 24
 #: How far behind the surface that a photograph shows a place may lie, in parts of its depth.
 _BEHIND = 0.01
 #: How much a view straight from above is preferred: the power of the cosine. High, so that pixels are not means.
@@ -39,7 +39,7 @@ class Sharpener:
     def __init__(self, model: AnchorModel, capture: Capture) -> None:
         self._model = model
         self._views = capture.train_views
-        self._pictures = ImageCache(self._views, _BUDGET_BYTES)
+        self._pictures = ImageCache(self._views, SHARPENING_BYTES)
         self._depths: OrderedDict[int, Float[np.ndarray, "h w"]] = OrderedDict()
 
     def close(self) -> None:
