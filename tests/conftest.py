@@ -45,6 +45,18 @@ def module_name(file: Path) -> str:
 install_import_hook([module_name(file) for file in files_with_shapes()], "typecheck.checked")
 
 
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Refuse workers that do not keep groups together: each would make the expensive fixtures anew."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return
+    for item in session.items:
+        for mark in item.iter_markers("xdist_group"):
+            if not item.nodeid.endswith(f"@{mark.args[0]}"):
+                raise pytest.UsageError(
+                    f"{item.nodeid}: this pytest-xdist keeps no groups with pytest {pytest.__version__}"
+                )
+
+
 @pytest.fixture(scope="module")
 def compiled_code(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("code")
