@@ -325,8 +325,9 @@ def table(found: list[Measured]) -> str:
         of_stage = sorted((e for e in found if e.stage == stage), key=lambda e: (e.photographs, e.anchors))
         before: Measured | None = None
         for each in of_stage:
+            anchors = f"{each.anchors:,}" if each.anchors else ""
             rows.append(
-                f"| {stage} | {each.anchors or '':,} | {each.photographs:,} | {each.seconds:.2f} | "
+                f"| {stage} | {anchors} | {each.photographs:,} | {each.seconds:.2f} | "
                 f"{each.processor_seconds:.2f} | {each.peak_bytes / 1e9:.2f} | {each.input_bytes / 1e9:.2f} | "
                 f"{_exponent(before, each)} |"
             )

@@ -26,6 +26,8 @@ from vdgs.executors.work import PieceWork, alone, at_work, spans_of
 from vdgs.runs.folder import StageFolder
 from vdgs.watching.interrupts import stop_if_asked, stop_requests
 
+pytestmark = pytest.mark.xdist_group("pieces")
+
 
 @given(st.integers(1, 5000), st.integers(1, 5), st.integers(5, 40), st.integers(1, 30))
 def test_spans_hold_every_item_once_and_are_about_equal(items, least, most, pieces):
@@ -243,7 +245,7 @@ def test_a_map_drawn_in_pieces_is_that_of_one_process(tmp_path, uncut):
     """Also where the driver was killed, and then a piece; tiles that were drawn are not drawn again."""
     pytest.importorskip("rasterio")
     here, run = copy_run(uncut, tmp_path / "here/run"), copy_run(uncut, tmp_path / "run")  # previews name the run
-    asked = ("--gsd", "0.002", "--bbox", "-1.5", "-1.0", "1.5", "1.0", "--crs", "local")
+    asked = ("--gsd", "0.001", "--bbox", "-1.5", "0", "1.5", "0.05", "--crs", "local")  # six small tiles
     done = vdgs("map", here, *asked)
     assert done.returncode == 0, done.stderr + done.stdout
     with begun("map", run, *asked, "--jobs", "2", pause_at=("*/pieces/*/000001.npz", 1)) as first:

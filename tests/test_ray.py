@@ -150,7 +150,7 @@ def test_views_are_measured_on_nodes_for_whatever_driver_lives(local, cluster, t
 def test_a_map_is_put_together_from_the_pieces_of_several_nodes(cut, cluster, tmp_path):
     pytest.importorskip("rasterio")
     run, here = copy_run(cut, tmp_path / "run"), copy_run(cut, tmp_path / "here/run")  # previews name the run
-    asked = ("--gsd", "0.002", "--bbox", "-1.5", "-1.0", "1.5", "1.0", "--crs", "local")
+    asked = ("--gsd", "0.001", "--bbox", "-1.5", "0", "1.5", "0.05", "--crs", "local")  # six small tiles
     assert vdgs("map", here, *asked).returncode == 0
     done = vdgs("map", run, *asked, "--executor", "ray", "--address", cluster.address, environment=cluster.token)
     assert done.returncode == 0, done.stderr + done.stdout
