@@ -56,7 +56,7 @@ def trained_on(device: torch.device, steps: int, **changes: Any) -> TrainingStat
 #: the loss is a number, and whether the gradients were.
 WAITS = {
     "kernels/cuda/cull.py: cull: _local_scalar_dense": 1,
-    "kernels/cuda/decode.py: decode: _local_scalar_dense": 1,
+    "kernels/cuda/decode.py: _decoded: _local_scalar_dense": 1,
     "training/loop.py: train_step: tolist": 1,
     "training/loop.py: _move: _local_scalar_dense": 1,
 }
@@ -100,7 +100,7 @@ def test_a_step_waits_for_the_card_only_where_it_must(rasteriser):
         tiles = {"kernels/cuda/rasterise.py: _entries: _local_scalar_dense": 1} if rasteriser == "cuda" else {}
         surroundings = {
             "kernels/cuda/cull.py: cull: _local_scalar_dense": 2,
-            "kernels/cuda/decode.py: decode: _local_scalar_dense": 2,
+            "kernels/cuda/decode.py: _decoded: _local_scalar_dense": 2,
         }
         assert dict(waits) == WAITS | tiles | surroundings
 

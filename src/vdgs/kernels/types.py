@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
+from vdgs.kernels.runs import Runs, Shown
+
 #: Whether all was finite: a bool, or on a card, which nobody has asked yet, a tensor that holds one.
 Finite = bool | Bool[Tensor, ""]
 
@@ -135,6 +137,32 @@ class AnchorSplats(Splats):
 
 
 @dataclass(frozen=True, eq=False)
+class OrderedSplats(Splats):
+    """Splats that need not stand in the order in which equal depths are blended."""
+
+    #: That order; None: the order of the rows. gsplat does not look at it.
+    runs: Runs | None
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingSplats(OrderedSplats):
+    """What a training step needs to know of an anchor model as one camera sees it: no more than that."""
+
+    #: As in `AnchorSplats`; a card may only know which offsets show.
+    source: Int32[Tensor, "m"] | Shown
+    #: Mean volume of the splats; NaN if there are none.
+    volume: Float[Tensor, ""]
+
+    @staticmethod
+    def of(splats: AnchorSplats) -> TrainingSplats:
+        """The same splats."""
+        s = splats
+        return TrainingSplats(
+            s.means_px, s.conics, s.depths, s.colours, s.opacities, None, s.source, s.volumes.mean()
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
 class SplatGradients:
     """Derivatives of a loss by the splats of a view, and what decoding needs to know of these."""
 
@@ -144,8 +172,8 @@ class SplatGradients:
     opacities: Float[Tensor, "m"]
     #: By the volume of each: the same number for all.
     volume: float
-    #: The splats themselves: see `AnchorSplats`.
-    source: Int32[Tensor, "m"]
+    #: The splats themselves: see `TrainingSplats`. A card computes the values again.
+    source: Int32[Tensor, "m"] | Shown
     colour_values: Float[Tensor, "m 3"]
     opacity_values: Float[Tensor, "m"]
     #: By the depth of each; None is zero.

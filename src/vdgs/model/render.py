@@ -11,7 +11,8 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels import choose
-from vdgs.kernels.types import AnchorSplats, DecoderWeights, Raster, Splats
+from vdgs.kernels.runs import Runs
+from vdgs.kernels.types import AnchorSplats, DecoderWeights, OrderedSplats, Raster, Splats, TrainingSplats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 
@@ -19,6 +20,15 @@ from vdgs.model.anchors import Anchors
 def decode_rows(anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera) -> AnchorSplats:
     """Splats of the anchors of the given rows, as this camera sees them."""
     return choose(anchors.positions.device).decode(
+        anchors.positions, anchors.features, anchors.offsets, anchors.log_scales, weights, camera, rows
+    )
+
+
+def decode_rows_to_train(
+    anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera
+) -> TrainingSplats:
+    """As much of `decode_rows` as a training step asks for; on a card, not in the order of the rows."""
+    return choose(anchors.positions.device).decode_to_train(
         anchors.positions, anchors.features, anchors.offsets, anchors.log_scales, weights, camera, rows
     )
 
@@ -61,10 +71,14 @@ def _joined(pieces: list[tuple[int, AnchorSplats]], k: int) -> AnchorSplats:
     return AnchorSplats(**named, source=torch.cat([splats.source + first * k for first, splats in pieces]))
 
 
-def joined(first: Splats, second: Splats) -> Splats:
-    """Splats followed by others."""
-    return Splats(
-        **{field.name: torch.cat([getattr(first, field.name), getattr(second, field.name)]) for field in fields(Splats)}
+def joined(first: OrderedSplats, second: OrderedSplats) -> OrderedSplats:
+    """Splats followed by others, in the order of each."""
+    device, m, n = first.means_px.device, len(first.means_px), len(second.means_px)
+    return OrderedSplats(
+        **{
+            field.name: torch.cat([getattr(first, field.name), getattr(second, field.name)]) for field in fields(Splats)
+        },
+        runs=Runs.joined(first.runs, m, second.runs, n, device),
     )
 
 

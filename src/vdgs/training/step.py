@@ -16,7 +16,16 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels import choose
-from vdgs.kernels.types import AdamState, AnchorSplats, DecoderWeights, Finite, RasterPullback, SplatGradients, Splats
+from vdgs.kernels.runs import Shown
+from vdgs.kernels.types import (
+    AdamState,
+    DecoderWeights,
+    Finite,
+    OrderedSplats,
+    RasterPullback,
+    SplatGradients,
+    TrainingSplats,
+)
 from vdgs.model.anchors import TRAINED, Anchors
 from vdgs.model.render import joined
 
@@ -30,7 +39,7 @@ class TrainingView:
     alpha: Float[Tensor, "h w"]
     #: Expected depth, not divided by alpha; None if it was not asked for.
     depth: Float[Tensor, "h w"] | None
-    source: Int32[Tensor, " m"]
+    source: Int32[Tensor, " m"] | Shown
     colours: Float[Tensor, "m 3"]
     opacities: Float[Tensor, " m"]
     #: Mean volume of the splats; NaN if there are none.
@@ -61,10 +70,10 @@ class TrainingView:
 
 @torch.no_grad()
 def draw_view(
-    splats: AnchorSplats,
+    splats: TrainingSplats,
     camera: Camera,
     background: Float[Tensor, "3"],
-    around: Splats | None = None,
+    around: OrderedSplats | None = None,
     depth: bool = False,
 ) -> TrainingView:
     """Draw the splats of trained anchors with those `around` them, on request with depth. The tensors of `splats` are
@@ -74,7 +83,7 @@ def draw_view(
     raster, pullback = kernels.rasterise_vjp(drawn, background, camera.width, camera.height, depth=depth)
     return TrainingView(
         raster.image, raster.alpha, raster.depth, splats.source, splats.colours, splats.opacities,
-        splats.volumes.mean(), pullback, (drawn.means_px, drawn.conics),
+        splats.volume, pullback, (drawn.means_px, drawn.conics),
     )  # fmt: skip
 
 

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels.cuda.camera import PackedCamera
 from vdgs.kernels.cuda.launching import Argument, Program
+from vdgs.kernels.cuda.room import Room
 from vdgs.kernels.reference.decode import decode as by_torch
-from vdgs.kernels.types import FEATURE_SIZE, HIDDEN_SIZE, AnchorSplats, DecoderWeights, HeadWeights
+from vdgs.kernels.runs import ANCHORS_OF_A_RUN, Runs, Shown
+from vdgs.kernels.types import FEATURE_SIZE, HIDDEN_SIZE, AnchorSplats, DecoderWeights, HeadWeights, TrainingSplats
 
 #: Warps of a block, each with an anchor: kWarps of the source. A lane an offset.
-ANCHORS_OF_A_BLOCK, MOST_OFFSETS = 8, 32
+ANCHORS_OF_A_BLOCK, MOST_OFFSETS = ANCHORS_OF_A_RUN, 32
 PROGRAM = Program("decode.cu", headers=("gaussian_math.h", "image_formation.h"))
+ROOM = Room()
 
 
 def decode(
@@ -30,39 +34,135 @@ def decode(
     rows: Int64[Tensor, "v"] | None = None,
     *,
     program: Program = PROGRAM,
+    room: Room = ROOM,
 ) -> AnchorSplats:
     """As `reference.decode.decode`, for float32 tensors on a CUDA device. Same bits every time.
 
     Where autograd follows it is the reference that decodes: this has no derivative. Waits for the device once: for how
-    many splats room must be made. Nothing is kept between anchors and splats. Raises ValueError for more than 32
-    offsets, TypeError for other types of elements, CudaUnavailable where the kernel cannot be run.
+    many splats there are. They are put into order afterwards (`decode_to_train` does without). Raises ValueError for
+    more than 32 offsets, TypeError for other types of elements, CudaUnavailable where the kernel cannot be run.
     """
     anchors = (positions, features, offsets, log_scales)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (*anchors, *weights.tensors())):
         return by_torch(*anchors, weights, camera, rows)
+    made, shown, _ = _decoded(anchors, weights, camera, rows, True, program, room)
+    assert made.volumes is not None
+    assert made.source is not None
+    order = shown.runs.order(len(shown))
+    named = {"volumes": made.volumes, "source": made.source} | dict(zip(_DRAWN, made.drawn(), strict=True))
+    return AnchorSplats(**{name: tensor.index_select(0, order) for name, tensor in named.items()})
+
+
+@torch.no_grad()
+def decode_to_train(
+    positions: Float[Tensor, "n 3"],
+    features: Float[Tensor, "n 32"],
+    offsets: Float[Tensor, "n k 3"],
+    log_scales: Float[Tensor, "n 6"],
+    weights: DecoderWeights,
+    camera: Camera,
+    rows: Int64[Tensor, "v"] | None = None,
+    *,
+    program: Program = PROGRAM,
+    room: Room = ROOM,
+) -> TrainingSplats:
+    """As `reference.decode.decode_to_train`, as `decode` in what it asks, waits for and raises.
+
+    Splats are those of `decode` to the bit, but where each block's stand is left to the card: `runs` tells. Sources are
+    not written, nor volumes, which are added up in a fixed order. Nothing is kept between anchors and splats.
+    """
+    anchors = (positions, features, offsets, log_scales)
+    made, shown, sums = _decoded(anchors, weights, camera, rows, False, program, room)
+    return TrainingSplats(*made.drawn(), shown.runs, shown, sums.sum() / len(shown))
+
+
+@dataclass(frozen=True)
+class _Splats:
+    """Room for m splats, as the kernel takes it."""
+
+    means_px: Float[Tensor, "m 2"]
+    conics: Float[Tensor, "m 3"]
+    depths: Float[Tensor, " m"]
+    colours: Float[Tensor, "m 3"]
+    opacities: Float[Tensor, " m"]
+    volumes: Float[Tensor, " m"] | None
+    source: Int32[Tensor, " m"] | None
+
+    @staticmethod
+    def empty(m: int, whole: bool, like: Tensor) -> _Splats:
+        """`whole`: with volumes and sources."""
+        new = like.new_empty
+        rest = (new(m), new(m, dtype=torch.int32)) if whole else (None, None)
+        return _Splats(new(m, 2), new(m, 3), new(m), new(m, 3), new(m), *rest)
+
+    def tensors(self) -> list[Tensor | None]:
+        """All of them, in the order of the kernel's arguments."""
+        return [getattr(self, each.name) for each in fields(self)]
+
+    def drawn(self) -> tuple[Tensor, ...]:
+        """The fields of `Splats`."""
+        return self.means_px, self.conics, self.depths, self.colours, self.opacities
+
+    def first(self, m: int) -> _Splats:
+        """The first m."""
+        return _Splats(*(None if each is None else each[:m] for each in self.tensors()))
+
+
+_DRAWN = ("means_px", "conics", "depths", "colours", "opacities")
+
+
+def _decoded(
+    anchors: tuple[Tensor, ...],
+    weights: DecoderWeights,
+    camera: Camera,
+    rows: Tensor | None,
+    whole: bool,
+    program: Program,
+    room: Room,
+) -> tuple[_Splats, Shown, Float[Tensor, " r"]]:
+    """Splats as the card happens to place them, where they are, and the sums of the volumes of each run."""
+    positions, _, offsets, _ = anchors
     k, inputs = offsets.shape[1], weights.opacity.w1.shape[1]
     check_decoder(k, weights, anchors)
     heads = [tensor for head in (weights.opacity, weights.covariance, weights.colour) for tensor in by_lanes(head, k)]
     count = len(positions) if rows is None else len(rows)
+    blocks = -(-count // ANCHORS_OF_A_BLOCK)
+    bits, begins, lengths = (positions.new_empty(n, dtype=torch.int32) for n in (count, blocks, blocks))
+    sums = positions.new_empty(blocks)
     given: list[Argument] = [
         *(t.detach().contiguous() for t in anchors), *heads, PackedCamera.of(camera),
         None if rows is None else rows.contiguous(), ctypes.c_longlong(count), ctypes.c_int(k),
         ctypes.c_int(inputs == FEATURE_SIZE + 4),
     ]  # fmt: skip
-    grid, block = (-(-count // ANCHORS_OF_A_BLOCK),), (32 * ANCHORS_OF_A_BLOCK,)
-    shown, counts = (positions.new_empty(count, dtype=torch.int32) for _ in range(2))
-    program.launch("decode_anchors", grid, block, *given, shown, counts, *[None] * 8)
-    ends = counts.cumsum(0, dtype=torch.int32)
-    m = int(ends[-1]) if count else 0
-    empty = positions.new_empty
-    splats = AnchorSplats(
-        empty(m, 2), empty(m, 3), empty(m), empty(m, 3), empty(m), empty(m), empty(m, dtype=torch.int32)
-    )
+
+    def write(capacity: int) -> tuple[_Splats, Tensor]:
+        made, total = _Splats.empty(capacity, whole, positions), positions.new_zeros(1, dtype=torch.int32)
+        program.launch(
+            "decode_anchors", (blocks,), (32 * ANCHORS_OF_A_BLOCK,), *given, ctypes.c_int(capacity), total, bits,
+            begins, lengths, None if whole else sums, *made.tensors(),
+        )  # fmt: skip
+        return made, total
+
+    capacity = room.for_anchors(count, k, positions.device)
+    made, total = write(capacity)
+    m = int(total) if count else 0
+    room.learn(count, k, positions.device, m)
+    if m > capacity:  # what there was no room for was not written
+        made, _ = write(m)
+    return made.first(m), Shown(bits, Runs(begins, lengths), m, k), sums
+
+
+def sources_of(source: Tensor | Shown, *, program: Program = PROGRAM) -> Int32[Tensor, " m"]:
+    """What each splat is of, written out if only what shows is known."""
+    if isinstance(source, Tensor):
+        return source
+    made = source.bits.new_empty(len(source))
+    count = len(source.bits)
     program.launch(
-        "decode_anchors", grid, block, *given, shown, None, ends, splats.means_px, splats.conics, splats.depths,
-        splats.colours, splats.opacities, splats.volumes, splats.source,
+        "name_splats", (-(-count // ANCHORS_OF_A_BLOCK),), (32 * ANCHORS_OF_A_BLOCK,), source.bits,
+        source.runs.begins, ctypes.c_longlong(count), ctypes.c_int(source.offsets), made,
     )  # fmt: skip
-    return splats
+    return made
 
 
 def by_lanes(head: HeadWeights, k: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
