@@ -26,8 +26,8 @@ from test_statistics import view
 from vdgs.kernels.cuda import cache
 from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.cull import cull
-from vdgs.kernels.cuda.decode import PROGRAM as DECODE
 from vdgs.kernels.cuda.decode import ANCHORS_OF_A_BLOCK, decode_to_train, sources_of
+from vdgs.kernels.cuda.decode import PROGRAM as DECODE
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.loss import PROGRAM as LOSS
 from vdgs.kernels.cuda.loss import photometric_loss
@@ -163,7 +163,7 @@ def test_the_table(counted):
 
 
 def test_of_anchors_is_read_what_they_are_made_of_and_no_more(counted):
-    """Rows (8), position (12), feature (128), log-scales (24), offsets that are opaque (12 each). Written are 40 bytes a
+    """Rows (8), position (12), feature (128), log-scales (24), opaque offsets (12 each). Written are 40 bytes a
     splat, 4 an anchor and 12 for eight; and the counter is counted up."""
     read, written = counted.of("decode_anchors", but=WEIGHTS)
     assert 0 < counted.showing < V

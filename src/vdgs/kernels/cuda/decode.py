@@ -16,7 +16,15 @@ from vdgs.kernels.cuda.launching import Argument, Program
 from vdgs.kernels.cuda.room import Room
 from vdgs.kernels.reference.decode import decode as by_torch
 from vdgs.kernels.runs import ANCHORS_OF_A_RUN, Runs, Shown
-from vdgs.kernels.types import FEATURE_SIZE, HIDDEN_SIZE, AnchorSplats, DecoderWeights, HeadWeights, TrainingSplats
+from vdgs.kernels.types import (
+    FEATURE_SIZE,
+    HIDDEN_SIZE,
+    AnchorSplats,
+    DecoderWeights,
+    HeadWeights,
+    Splats,
+    TrainingSplats,
+)
 
 #: Warps of a block, each with an anchor: kWarps of the source. A lane an offset.
 ANCHORS_OF_A_BLOCK, MOST_OFFSETS = ANCHORS_OF_A_RUN, 32
@@ -45,11 +53,8 @@ def decode(
     anchors = (positions, features, offsets, log_scales)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (*anchors, *weights.tensors())):
         return by_torch(*anchors, weights, camera, rows)
-    made, shown, _ = _decoded(anchors, weights, camera, rows, True, program, room)
-    assert made.volumes is not None
-    assert made.source is not None
+    named, shown, _ = _decoded(anchors, weights, camera, rows, True, program, room)
     order = shown.runs.order(len(shown))
-    named = {"volumes": made.volumes, "source": made.source} | dict(zip(_DRAWN, made.drawn(), strict=True))
     return AnchorSplats(**{name: tensor.index_select(0, order) for name, tensor in named.items()})
 
 
@@ -72,43 +77,33 @@ def decode_to_train(
     not written, nor volumes, which are added up in a fixed order. Nothing is kept between anchors and splats.
     """
     anchors = (positions, features, offsets, log_scales)
-    made, shown, sums = _decoded(anchors, weights, camera, rows, False, program, room)
-    return TrainingSplats(*made.drawn(), shown.runs, shown, sums.sum() / len(shown))
+    named, shown, sums = _decoded(anchors, weights, camera, rows, False, program, room)
+    return TrainingSplats(**named, runs=shown.runs, source=shown, volume=sums.sum() / len(shown))
 
 
 @dataclass(frozen=True)
-class _Splats:
-    """Room for m splats, as the kernel takes it."""
+class _Made:
+    """Room for m splats, as the kernel takes it; volumes and sources where they are asked for."""
 
-    means_px: Float[Tensor, "m 2"]
-    conics: Float[Tensor, "m 3"]
-    depths: Float[Tensor, " m"]
-    colours: Float[Tensor, "m 3"]
-    opacities: Float[Tensor, " m"]
+    drawn: Splats
     volumes: Float[Tensor, " m"] | None
     source: Int32[Tensor, " m"] | None
 
     @staticmethod
-    def empty(m: int, whole: bool, like: Tensor) -> _Splats:
-        """`whole`: with volumes and sources."""
+    def empty(m: int, whole: bool, like: Tensor) -> _Made:
         new = like.new_empty
         rest = (new(m), new(m, dtype=torch.int32)) if whole else (None, None)
-        return _Splats(new(m, 2), new(m, 3), new(m), new(m, 3), new(m), *rest)
+        return _Made(Splats(new(m, 2), new(m, 3), new(m), new(m, 3), new(m)), *rest)
 
     def tensors(self) -> list[Tensor | None]:
-        """All of them, in the order of the kernel's arguments."""
-        return [getattr(self, each.name) for each in fields(self)]
+        """In the order of the kernel's arguments."""
+        return [*self.named().values(), *([None] * 2 if self.source is None else [])]
 
-    def drawn(self) -> tuple[Tensor, ...]:
-        """The fields of `Splats`."""
-        return self.means_px, self.conics, self.depths, self.colours, self.opacities
-
-    def first(self, m: int) -> _Splats:
-        """The first m."""
-        return _Splats(*(None if each is None else each[:m] for each in self.tensors()))
-
-
-_DRAWN = ("means_px", "conics", "depths", "colours", "opacities")
+    def named(self) -> dict[str, Tensor]:
+        """By the names of `AnchorSplats`, as far as they are there."""
+        drawn = {field.name: getattr(self.drawn, field.name) for field in fields(Splats)}
+        rest = {"volumes": self.volumes, "source": self.source}
+        return drawn | {name: tensor for name, tensor in rest.items() if tensor is not None}
 
 
 def _decoded(
@@ -119,8 +114,9 @@ def _decoded(
     whole: bool,
     program: Program,
     room: Room,
-) -> tuple[_Splats, Shown, Float[Tensor, " r"]]:
-    """Splats as the card happens to place them, where they are, and the sums of the volumes of each run."""
+) -> tuple[dict[str, Tensor], Shown, Float[Tensor, " r"]]:
+    """Splats as the card happens to place them (`whole`: with volumes and sources), where they are, and unless `whole`
+    the volumes of each run added up."""
     positions, _, offsets, _ = anchors
     k, inputs = offsets.shape[1], weights.opacity.w1.shape[1]
     check_decoder(k, weights, anchors)
@@ -135,8 +131,8 @@ def _decoded(
         ctypes.c_int(inputs == FEATURE_SIZE + 4),
     ]  # fmt: skip
 
-    def write(capacity: int) -> tuple[_Splats, Tensor]:
-        made, total = _Splats.empty(capacity, whole, positions), positions.new_zeros(1, dtype=torch.int32)
+    def write(capacity: int) -> tuple[_Made, Tensor]:
+        made, total = _Made.empty(capacity, whole, positions), positions.new_zeros(1, dtype=torch.int32)
         program.launch(
             "decode_anchors", (blocks,), (32 * ANCHORS_OF_A_BLOCK,), *given, ctypes.c_int(capacity), total, bits,
             begins, lengths, None if whole else sums, *made.tensors(),
@@ -149,7 +145,8 @@ def _decoded(
     room.learn(count, k, positions.device, m)
     if m > capacity:  # what there was no room for was not written
         made, _ = write(m)
-    return made.first(m), Shown(bits, Runs(begins, lengths), m, k), sums
+    found = {name: tensor[:m] for name, tensor in made.named().items()}
+    return found, Shown(bits, Runs(begins, lengths), m, k), sums
 
 
 def sources_of(source: Tensor | Shown, *, program: Program = PROGRAM) -> Int32[Tensor, " m"]:
