@@ -254,8 +254,8 @@ CASES: dict[str, Callable[[Operations, Place], Results]] = {
     case.__name__: case
     for case in (
         adam_rows, add_view_statistics, cell_centres, cell_keys, contains, count_visibility, cull, decode,
-        decode_to_train, decode_backward_adam, group_cells, group_max, mark_visible, morton_order, photometric_loss, project,
-        rasterise, rasterise_vjp,
+        decode_to_train, decode_backward_adam, group_cells, group_max, mark_visible, morton_order, photometric_loss,
+        project, rasterise, rasterise_vjp,
     )
 }  # fmt: skip
 
