@@ -18,7 +18,6 @@ from vdgs.kernels.cuda.launching import Program, read_source
 from vdgs.kernels.cuda.rasterise import PROGRAM, rasterise, rasterise_vjp
 from vdgs.kernels.reference.rasterise import rasterise as reference
 from vdgs.kernels.types import Raster, Splats
-from vdgs.model.render import joined
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_rasterise")]
 needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
@@ -125,14 +124,14 @@ def test_wherever_splats_stand_picture_and_gradients_have_the_same_bits(seed, li
 def test_splats_joined_with_others_keep_the_order_of_each():
     one, first = in_runs(splats_of(SCENES["ordinary"].tensors)[0], 5)
     other, second = in_runs(splats_of(SCENES["tiny"].tensors)[0], 4, 1)
-    both = joined(one, other)
+    both = one.joined(other)
     expected = torch.cat([first, second + len(first)])
     assert torch.equal(both.runs.order(len(expected)).long(), expected)
-    alone = joined(replace(one, runs=None), other)
+    alone = replace(one, runs=None).joined(other)
     assert torch.equal(
         alone.runs.order(len(expected)).long(), torch.cat([torch.arange(len(first)), expected[len(first) :]])
     )
-    assert joined(replace(one, runs=None), replace(other, runs=None)).runs is None
+    assert replace(one, runs=None).joined(replace(other, runs=None)).runs is None
 
 
 @needs_a_compiler

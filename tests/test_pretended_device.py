@@ -91,9 +91,9 @@ def test_a_step_on_another_device_makes_the_numbers_of_the_processor(monkeypatch
 
 def test_steps_have_the_same_bits_whichever_block_comes_first(monkeypatch, drivers, code):
     """With the own rasteriser: splats stand in another order, among frozen surroundings too."""
-    install(drivers, code, monkeypatch, "cuda", "cuda")
     found = []
     for order in ORDERS[:3]:
+        install(drivers, code, monkeypatch, "cuda", "cuda")  # anew: tables are kept for a card
         for driver in drivers.values():
             monkeypatch.setattr(driver, "order", order)
         with pretended_card():

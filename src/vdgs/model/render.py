@@ -11,8 +11,7 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels import choose
-from vdgs.kernels.runs import Runs
-from vdgs.kernels.types import AnchorSplats, DecoderWeights, OrderedSplats, Raster, Splats, TrainingSplats
+from vdgs.kernels.types import AnchorSplats, DecoderWeights, Raster, Splats, TrainingSplats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 
@@ -69,17 +68,6 @@ def _joined(pieces: list[tuple[int, AnchorSplats]], k: int) -> AnchorSplats:
         for field in fields(AnchorSplats) if field.name != "source"
     }  # fmt: skip
     return AnchorSplats(**named, source=torch.cat([splats.source + first * k for first, splats in pieces]))
-
-
-def joined(first: OrderedSplats, second: OrderedSplats) -> OrderedSplats:
-    """Splats followed by others, in the order of each."""
-    device, m, n = first.means_px.device, len(first.means_px), len(second.means_px)
-    return OrderedSplats(
-        **{
-            field.name: torch.cat([getattr(first, field.name), getattr(second, field.name)]) for field in fields(Splats)
-        },
-        runs=Runs.joined(first.runs, m, second.runs, n, device),
-    )
 
 
 def draw(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:

@@ -16,18 +16,17 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels import choose
-from vdgs.kernels.runs import Shown
 from vdgs.kernels.types import (
     AdamState,
     DecoderWeights,
     Finite,
     OrderedSplats,
     RasterPullback,
+    Sources,
     SplatGradients,
     TrainingSplats,
 )
 from vdgs.model.anchors import TRAINED, Anchors
-from vdgs.model.render import joined
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +38,7 @@ class TrainingView:
     alpha: Float[Tensor, "h w"]
     #: Expected depth, not divided by alpha; None if it was not asked for.
     depth: Float[Tensor, "h w"] | None
-    source: Int32[Tensor, " m"] | Shown
+    source: Sources
     colours: Float[Tensor, "m 3"]
     opacities: Float[Tensor, " m"]
     #: Mean volume of the splats; NaN if there are none.
@@ -78,7 +77,7 @@ def draw_view(
 ) -> TrainingView:
     """Draw the splats of trained anchors with those `around` them, on request with depth. The tensors of `splats` are
     the view's from now on: their memory is used again."""
-    drawn = splats if around is None else joined(splats, around)
+    drawn = splats if around is None else splats.joined(around)
     kernels = choose(drawn.means_px.device)
     raster, pullback = kernels.rasterise_vjp(drawn, background, camera.width, camera.height, depth=depth)
     return TrainingView(
