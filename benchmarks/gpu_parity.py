@@ -105,6 +105,20 @@ def decode(kernels: Operations, place: Place) -> Results:
     return found | {f"gradient {i}": gradient for i, gradient in enumerate(gradients)}
 
 
+def decode_to_train(kernels: Operations, place: Place) -> Results:
+    """Drawn in the order that splats are given with: where each of them stands is left to the card."""
+    a = place.anchors
+    rows = kernels.cull(a.positions, a.log_scales, place.camera)
+    splats = kernels.decode_to_train(
+        a.positions, a.features, a.offsets, a.log_scales, place.weights, place.camera, rows
+    )
+    raster, pullback = kernels.rasterise_vjp(splats, place.background, place.width, place.height)
+    gradients = pullback(place.random(place.height, place.width, 3))
+    count = torch.tensor([float(len(splats.source))])
+    sums = torch.stack([gradients.colours.sum(), gradients.opacities.sum()])
+    return {"image": raster.image, "volume": splats.volume, "splats": count, "gradients added up": sums}
+
+
 def decode_backward_adam(kernels: Operations, place: Place) -> Results:
     """First moments say what the gradients were; how far Adam moves says nothing where a gradient is near zero."""
     rows, splats = place.decoded(kernels)
@@ -240,8 +254,8 @@ CASES: dict[str, Callable[[Operations, Place], Results]] = {
     case.__name__: case
     for case in (
         adam_rows, add_view_statistics, cell_centres, cell_keys, contains, count_visibility, cull, decode,
-        decode_backward_adam, group_cells, group_max, mark_visible, morton_order, photometric_loss, project, rasterise,
-        rasterise_vjp,
+        decode_to_train, decode_backward_adam, group_cells, group_max, mark_visible, morton_order, photometric_loss,
+        project, rasterise, rasterise_vjp,
     )
 }  # fmt: skip
 

@@ -33,7 +33,7 @@ from vdgs.kernels import choose, set_threads
 from vdgs.memory.process import forget_peak, peak_memory_bytes
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.render import decode_rows, visible_rows
+from vdgs.model.render import decode_rows_to_train, visible_rows
 from vdgs.settings.method import TrainConfig
 from vdgs.storage.checkpoints import save_state
 from vdgs.training import Stage, start_state, to_saved
@@ -93,7 +93,7 @@ def one_step(
     weights = state.decoder.for_image(0)
     with torch.no_grad():
         rows = timed("cull", lambda: visible_rows(state.anchors, camera))
-        waiting = [timed("decode", lambda: decode_rows(state.anchors, rows, weights, camera))]
+        waiting = [timed("decode", lambda: decode_rows_to_train(state.anchors, rows, weights, camera))]
         view = timed("rasterise", lambda: draw_view(waiting.pop(), camera, torch.zeros(3, device=device)))
     view.image.requires_grad_(True)
 

@@ -2,8 +2,8 @@
 //
 // The threads of a block are fibers that take turns: each runs until it ends, or waits at a barrier of the block or in an
 // operation of its warp. Warps take turns too, and a warp goes on as long as it can: to the next barrier of the block.
-// Threads and warps take turns forwards, backwards or shuffled: a kernel that lacks a barrier gives different results.
-// One block runs at a time, so that `static` is what `__shared__` means.
+// Threads, warps and blocks take turns forwards, backwards or shuffled: a kernel that lacks a barrier, or in which blocks
+// lean on each other's order, gives different results. One block runs at a time, so that `static` is what `__shared__` means.
 #pragma once
 
 #include <cmath>
@@ -216,6 +216,12 @@ inline unsigned __ballot_sync(unsigned, int mine) {
   for (unsigned lane = 0; lane < host::kWarp; ++lane) all |= unsigned{host::lane_of_my_warp(lane).vote[place]} << lane;
   return all;
 }
+// Threads take turns, so that nobody comes in between.
+inline int atomicAdd(int* at, int more) {
+  const int before = *at;
+  *at = before + more;
+  return before;
+}
 inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
 inline int __any_sync(unsigned, int mine) {
   const unsigned place = host::exchange(0.0f, mine);
@@ -243,11 +249,10 @@ extern "C" int host_launch(host::Kernel kernel, const unsigned* grid, const unsi
   const size_t threads = block[0] * block[1] * block[2];
   if (threads % host::kWarp) return 0;
   if (host::fibers.size() != threads) host::fibers = std::vector<host::Fiber>(threads);
-  for (unsigned z = 0; z < grid[2]; ++z)
-    for (unsigned y = 0; y < grid[1]; ++y)
-      for (unsigned x = 0; x < grid[0]; ++x) {
-        blockIdx = {x, y, z};
-        if (!host::run_block(turns)) return 0;
-      }
+  for (size_t b : host::order_of(size_t{grid[0]} * grid[1] * grid[2], turns)) {
+    const unsigned i = static_cast<unsigned>(b);
+    blockIdx = {i % grid[0], i / grid[0] % grid[1], i / (grid[0] * grid[1])};
+    if (!host::run_block(turns)) return 0;
+  }
   return 1;
 }

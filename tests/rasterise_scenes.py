@@ -2,19 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from vdgs.kernels.types import Splats
+from vdgs.kernels.runs import Runs
+from vdgs.kernels.types import OrderedSplats, Splats
 
 
 def splats_of(tensors: tuple[Tensor, ...]) -> tuple[Splats, Tensor]:
     """Splats and background from means, conics, colours, opacities, depths and background."""
     means, conics, colours, opacities, depths, background = tensors
     return Splats(means, conics, depths, colours, opacities), background
+
+
+def in_runs(splats: Splats, runs: int, seed: int = 0) -> tuple[OrderedSplats, Tensor]:
+    """The same splats in so many runs (one of them empty), which stand in any order, and where each splat went."""
+    g, m = torch.Generator().manual_seed(seed), len(splats.means_px)
+    cuts = torch.randint(0, m + 1, (runs - 2,), generator=g).sort()[0]
+    ends = torch.cat([cuts, cuts[-1:], torch.tensor([m])])
+    lengths = ends.diff(prepend=torch.zeros(1, dtype=ends.dtype))
+    stand = torch.randperm(runs, generator=g)
+    begins = torch.empty_like(lengths)
+    begins[stand] = lengths[stand].cumsum(0) - lengths[stand]
+    order = torch.cat([torch.arange(int(b), int(b + n)) for b, n in zip(begins, lengths, strict=True)])
+    moved = {field.name: torch.empty_like(getattr(splats, field.name)) for field in fields(Splats)}
+    for name, tensor in moved.items():
+        tensor[order] = getattr(splats, name).detach()
+    return OrderedSplats(**moved, runs=Runs(begins.to(torch.int32), lengths.to(torch.int32))), order
 
 
 @dataclass(frozen=True)

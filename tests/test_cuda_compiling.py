@@ -50,11 +50,18 @@ class StandIn:
 #: By source: its shared headers and its kernels.
 SOURCES = {
     "cull.cu": (("gaussian_math.h", "image_formation.h"), {"mark_anchors", "write_rows"}),
-    "decode.cu": (("gaussian_math.h", "image_formation.h"), {"decode_anchors", "move_anchors"}),
+    "decode.cu": (("gaussian_math.h", "image_formation.h"), {"decode_anchors", "name_splats", "move_anchors"}),
     "loss.cu": ((), {"photometric_forward", "photometric_backward", "photometric_total"}),
     "rasterise.cu": (
         ("image_formation.h",),
-        {"splat_tiles", "splat_entries", "rasterise_forward", "rasterise_backward", "gather_gradients"},
+        {
+            "order_splats",
+            "splat_tiles",
+            "splat_entries",
+            "rasterise_forward",
+            "rasterise_backward",
+            "gather_gradients",
+        },
     ),
     "statistics.cu": ((), {"add_view"}),
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 
 import pytest
@@ -16,13 +16,15 @@ from vdgs.cameras import Camera
 from vdgs.kernels import native
 from vdgs.kernels.cuda import decode_adam
 from vdgs.kernels.cuda.camera import PackedCamera
-from vdgs.kernels.cuda.decode import PROGRAM, decode
+from vdgs.kernels.cuda.decode import PROGRAM, decode, decode_to_train, sources_of
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.driver import cuda_driver
 from vdgs.kernels.cuda.launching import Program, read_header, read_source
+from vdgs.kernels.cuda.room import Room
 from vdgs.kernels.reference.decode import decode as reference
 from vdgs.kernels.reference.decode_adam import decode_backward_adam as by_reference
-from vdgs.kernels.types import AdamState, AnchorSplats, SplatGradients
+from vdgs.kernels.runs import Shown
+from vdgs.kernels.types import AdamState, AnchorSplats, SplatGradients, Splats, TrainingSplats
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_decode")]
 needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
@@ -44,6 +46,21 @@ def decoded(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order
     anchors = scene.positions, scene.features, scene.offsets, scene.log_scales
     with torch.no_grad():
         return decode(*anchors, scene.weights, camera, rows, program=program)
+
+
+def scattered(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order: int = 0) -> TrainingSplats:
+    """As a training step is given them."""
+    program = Program(PROGRAM.name, HostDriver(library, order), PROGRAM.headers)
+    return decode_to_train(*scene.arguments, camera, rows, program=program)
+
+
+def put_in_order(splats: TrainingSplats, library: ctypes.CDLL) -> dict[str, torch.Tensor]:
+    """All that is known of each splat, in the order of the anchors."""
+    order = splats.runs.order(len(splats.source))
+    program = Program(PROGRAM.name, HostDriver(library), PROGRAM.headers)
+    named = {field.name: getattr(splats, field.name) for field in fields(Splats)}
+    named["source"] = sources_of(splats.source, program=program)
+    return {name: tensor[order] for name, tensor in named.items()}
 
 
 def exactly(scene: Scene, camera: Camera, rows=None) -> AnchorSplats:
@@ -104,6 +121,92 @@ def test_the_order_in_which_threads_take_turns_changes_no_bit(order, library):
 
 
 @needs_a_compiler
+@pytest.mark.parametrize("order", ORDERS)
+def test_for_training_splats_are_the_same_in_another_order(order, library):
+    """To the bit; and so is the mean of their volumes, whatever comes first."""
+    scene, rows = Scene.random(141, 10), torch.arange(0, 141, 2)
+    splats, expected = scattered(scene, turned(), library, rows, order), decoded(scene, turned(), library, rows)
+    found = put_in_order(splats, library)
+    assert all(torch.equal(tensor, getattr(expected, name)) for name, tensor in found.items())
+    in_rows = sources_of(splats.source, program=Program(PROGRAM.name, HostDriver(library), PROGRAM.headers))
+    assert torch.equal(in_rows, expected.source) is (order == 0)  # other orders of blocks do give another one
+    torch.testing.assert_close(splats.volume, expected.volumes.mean())
+    assert torch.equal(splats.volume, scattered(scene, turned(), library, rows).volume)
+    again = Shown.of(expected.source, len(rows), 10)
+    assert torch.equal(again.bits, splats.source.bits)
+    assert torch.equal(again.runs.lengths, splats.runs.lengths)
+
+
+@needs_a_compiler
+def test_nothing_to_show_has_no_mean_volume(library):
+    nothing = scattered(Scene.random(9, 4, spread=0.1, log_scale=-9.0), CAMERAS["part"].cropped(0, 0, 1, 1), library)
+    assert len(nothing.source) == len(nothing.depths) == 0
+    assert nothing.volume.isnan()
+    assert len(scattered(Scene.random(9, 4), turned(), library, torch.arange(0)).source) == 0
+
+
+class Narrow(Room):
+    """As if a view had needed less than the next one."""
+
+    def for_anchors(self, count, offsets, device):
+        return 11
+
+
+class Watched(Program):
+    """Looks behind the room that a kernel is told of."""
+
+    spare = 500
+
+    def launch(self, kernel, grid, block, *arguments):
+        tensors = [each for each in arguments[-7:] if each is not None]
+        wider = [torch.full((len(t) + self.spare, *t.shape[1:]), 77, dtype=t.dtype) for t in tensors]
+        given = iter(wider)
+        super().launch(
+            kernel, grid, block, *arguments[:-7], *(None if each is None else next(given) for each in arguments[-7:])
+        )
+        for tensor, room in zip(tensors, wider, strict=True):
+            tensor.copy_(room[: len(tensor)])
+            assert (room[len(tensor) :] == 77).all()
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("order", ORDERS)
+def test_where_there_is_too_little_room_they_are_decoded_once_more(order, library):
+    scene = Scene.random(40, 10)
+    program = Watched(PROGRAM.name, HostDriver(library, order), PROGRAM.headers)
+    with torch.no_grad():
+        found = decode(*scene.arguments, turned(), program=program, room=Narrow())
+    assert [name for name, *_ in program.driver.launched] == ["decode_anchors"] * 2
+    expected = decoded(scene, turned(), library)
+    assert all(torch.equal(getattr(found, field.name), getattr(expected, field.name)) for field in fields(AnchorSplats))
+
+
+def test_room_follows_what_views_need():
+    room, device = Room(), torch.device("cpu")
+    assert 5000 < room.for_anchors(1000, 10, device) < 10_000  # half of the offsets, before any view is known
+    assert room.for_anchors(10, 10, device) == 100  # never more than there are offsets
+    room.learn(1000, 10, device, 2000)
+    once = room.for_anchors(1000, 10, device)
+    assert 2000 < once < 3000
+    room.learn(1000, 10, device, 1000)
+    assert 2000 < room.for_anchors(1000, 10, device) < once  # slowly forgotten
+    room.learn(500, 10, device, 4000)
+    assert 8000 < room.for_anchors(1000, 10, device) <= 10_000
+    assert room.for_anchors(1000, 4, device) < 4000  # other models have other offsets
+
+
+@needs_a_compiler
+def test_barriers_that_are_missing_are_noticed(tmp_path):
+    """Those of blocks: before splats are added up, and before a block's place is read."""
+    first, second, third = read_source(PROGRAM.name).split("__syncthreads();")
+    for number, (one, other) in enumerate((("", "__syncthreads();"), ("__syncthreads();", ""))):
+        (folder := tmp_path / str(number)).mkdir()
+        without = build_on_host(PROGRAM.name, folder, first + one + second + other + third)
+        found = [decoded(Scene.random(61, 10), turned(), without, order=turns) for turns in (0, 1)]
+        assert not all(torch.equal(*(getattr(each, field.name) for each in found)) for field in fields(AnchorSplats))
+
+
+@needs_a_compiler
 def test_where_autograd_follows_the_reference_decodes(library):
     scene = Scene.random(10, 4).to(torch.float32)
     program = Program(PROGRAM.name, HostDriver(library), PROGRAM.headers)
@@ -143,8 +246,12 @@ def test_a_card_gives_what_the_reference_gives(name):
     assert_same(here, exactly(scene, CAMERAS[name]))
 
 
-def moved_by(kernels, scene: Scene, camera: Camera, rows: torch.Tensor, frozen: bool = False, spoil: bool = False):
-    """Whether all was finite, and after a step of Adam: parameters and moments, updates, gradients of the decoder."""
+def moved_by(
+    kernels, scene: Scene, camera: Camera, rows: torch.Tensor, frozen: bool = False, spoil: bool = False,
+    shown: Shown | None = None,
+):  # fmt: skip
+    """Whether all was finite, and after a step of Adam: parameters and moments, updates, gradients of the decoder.
+    `shown`: where splats stand, if not in the order of the anchors."""
     with torch.no_grad():
         splats = native.decode(scene.positions, *scene.trainable[:3], scene.weights, camera, rows)
     g = torch.Generator().manual_seed(8)
@@ -155,6 +262,8 @@ def moved_by(kernels, scene: Scene, camera: Camera, rows: torch.Tensor, frozen: 
     )  # fmt: skip
     if spoil:
         gradients.means_px[0] = torch.nan
+    if shown is not None:
+        gradients = elsewhere(gradients, shown)
     states = [
         AdamState(t.clone(), 0.1 * torch.randn(t.shape, generator=g), torch.rand(t.shape, generator=g), rate, 4.0)
         for t, rate in zip(scene.trainable[:3], (0.01, 0.02, 0.005), strict=True)
@@ -164,6 +273,19 @@ def moved_by(kernels, scene: Scene, camera: Camera, rows: torch.Tensor, frozen: 
     weights = scene.weights.map(lambda t: t.clone().requires_grad_(not frozen))
     finite, found = kernels(scene.positions, states, weights, camera, rows, gradients, updates)
     return bool(finite), [t for state in states for t in state[:3]], updates, found
+
+
+def elsewhere(gradients: SplatGradients, shown: Shown) -> SplatGradients:
+    """Gradients of splats in their order, as those of splats that stand otherwise; what these looked like is lost."""
+    order = shown.runs.order(len(shown))
+    moved = {}
+    for name in ("means_px", "conics", "colours", "opacities"):
+        moved[name] = torch.empty_like(getattr(gradients, name))
+        moved[name][order.long()] = getattr(gradients, name)
+    nothing = {
+        name: torch.full_like(getattr(gradients, name), torch.nan) for name in ("colour_values", "opacity_values")
+    }
+    return replace(gradients, source=shown, **moved, **nothing)
 
 
 @needs_a_compiler
@@ -183,15 +305,44 @@ class TestMoving:
             error = float((found - expected).norm() / expected.norm().clamp(min=1e-6))
             assert error < 1e-4, error
 
+    @pytest.mark.parametrize("order", ORDERS)
+    def test_wherever_splats_stand_anchors_move_to_the_same_bits(self, order, library, moving):
+        scene, rows = Scene.random(141, 10), torch.arange(0, 141, 2)
+        expected = moved_by(moving, scene, turned(), rows)
+        shown = scattered(scene, turned(), library, rows, order).source
+        found = moved_by(moving, scene, turned(), rows, shown=shown)
+        assert found[0] is True
+        assert all(torch.equal(one, other) for one, other in zip(found[1], expected[1], strict=True))
+        assert all(torch.equal(one, other) for one, other in zip(found[3], expected[3], strict=True))
+
+    def test_with_gradients_by_depth_torch_moves_them(self, library, moving):
+        """It asks for the sources, which only now are written."""
+        scene, rows = Scene.random(20, 4), torch.arange(20)
+
+        def with_depths(kernels):
+            def kernel(positions, states, weights, camera, rows, gradients, updates):
+                deep = replace(gradients, depths=gradients.opacities)
+                return kernels(positions, states, weights, camera, rows, deep, updates)
+
+            return kernel
+
+        shown = scattered(scene, turned(), library, rows, 1).source
+        expected = moved_by(with_depths(by_reference), scene, turned(), rows)
+        found = moved_by(with_depths(moving), scene, turned(), rows, shown=shown)
+        for one, other in zip((*found[1], *found[3]), (*expected[1], *expected[3]), strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+        with pytest.raises(TypeError, match="on that card"):
+            moved_by(by_reference, scene, turned(), rows, shown=shown)
+
     def test_piece_by_piece_anchors_move_to_the_same_bits(self, moving, monkeypatch):
         """The decoder's gradients are sums of those of pieces."""
         scene, rows = Scene.random(45, 10), torch.arange(0, 45, 2)
         whole = moved_by(moving, scene, turned(), rows)
-        monkeypatch.setattr(decode_adam, "PIECE", 9)
+        monkeypatch.setattr(decode_adam, "PIECE", 16)
         program = moving.keywords["program"]
         program.driver.launched.clear()
         pieces = moved_by(moving, scene, turned(), rows)
-        assert [grid for _, grid, _ in program.driver.launched] == [(2, 1, 1), (2, 1, 1), (1, 1, 1)]
+        assert [grid for _, grid, _ in program.driver.launched] == [(2, 1, 1), (1, 1, 1)]
         assert all(torch.equal(one, other) for one, other in zip(whole[1], pieces[1], strict=True))
         for one, other in zip(whole[3], pieces[3], strict=True):
             torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6 * float(one.abs().max()))

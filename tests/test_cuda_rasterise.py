@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import ctypes
 import re
+from dataclasses import fields, replace
 
 import pytest
 import torch
 
 from cuda_on_host import ORDERS, HostDriver, Stuck, build_on_host, host_compiler
-from rasterise_scenes import Scene, make_scene, splats_of
+from rasterise_scenes import Scene, in_runs, make_scene, splats_of
 from test_cuda_compiling import needs_nvrtc
 from test_rasterise import assert_close, assert_same_picture, loss_of
 from vdgs.kernels.cuda.driver import cuda_driver
 from vdgs.kernels.cuda.launching import Program, read_source
 from vdgs.kernels.cuda.rasterise import PROGRAM, rasterise, rasterise_vjp
 from vdgs.kernels.reference.rasterise import rasterise as reference
-from vdgs.kernels.types import Raster
+from vdgs.kernels.types import Raster, Splats
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_rasterise")]
 needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
@@ -89,6 +90,48 @@ def test_picture_and_gradients_equal_the_reference(name, library):
 def test_no_barrier_is_missing(order, library):
     """The order in which threads and warps take turns changes no bit."""
     assert bits_of(SCENES["ordinary"], library, order) == bits_of(SCENES["ordinary"], library, 0)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_wherever_splats_stand_picture_and_gradients_have_the_same_bits(seed, library):
+    """Where depths are equal, the order that splats are given with decides."""
+    program = Program("rasterise.cu", HostDriver(library), PROGRAM.headers)
+    scene = SCENES["ordinary"]
+    splats, background = splats_of(scene.tensors)
+    level = replace(splats, depths=(splats.depths / 40).floor() + 1)
+    moved, order = in_runs(level, 7, seed)
+    assert torch.equal(moved.runs.order(len(order)).long(), order)
+    assert not torch.equal(order, order.sort()[0])
+    size, wanted = (scene.width, scene.height), torch.randn(scene.height, scene.width, 3)
+
+    def found(drawn: Splats) -> tuple[torch.Tensor, ...]:
+        raster, pullback = rasterise_vjp(drawn, background, *size, program=program)
+        gradients = pullback(wanted)
+        return raster.image, *gradients[:4], gradients.background
+
+    image, *of_splats, of_background = found(level)
+    other, *of_moved, of_background_then = found(moved)
+    assert torch.equal(image, other)
+    assert torch.equal(of_background, of_background_then)
+    assert all(torch.equal(one, two[order]) for one, two in zip(of_splats, of_moved, strict=True))
+    # It is by the order: as rows alone, they make another picture.
+    rows = Splats(*(getattr(moved, field.name) for field in fields(Splats)))
+    assert not torch.equal(image, found(rows)[0])
+    assert torch.equal(image, rasterise(moved, background, *size, program=program).image)
+
+
+def test_splats_joined_with_others_keep_the_order_of_each():
+    one, first = in_runs(splats_of(SCENES["ordinary"].tensors)[0], 5)
+    other, second = in_runs(splats_of(SCENES["tiny"].tensors)[0], 4, 1)
+    both = one.joined(other)
+    expected = torch.cat([first, second + len(first)])
+    assert torch.equal(both.runs.order(len(expected)).long(), expected)
+    alone = replace(one, runs=None).joined(other)
+    assert torch.equal(
+        alone.runs.order(len(expected)).long(), torch.cat([torch.arange(len(first)), expected[len(first) :]])
+    )
+    assert replace(one, runs=None).joined(replace(other, runs=None)).runs is None
 
 
 @needs_a_compiler

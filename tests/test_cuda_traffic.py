@@ -17,7 +17,7 @@ import torch
 from cuda_on_host import host_compiler
 from cuda_traffic import Bytes, CountedProgram, Traffic, total
 from decode_scenes import Scene, turned
-from rasterise_scenes import make_scene, splats_of
+from rasterise_scenes import in_runs, make_scene, splats_of
 from test_cuda_compiling import needs_nvrtc
 from test_cuda_decode import moved_by
 from test_cull import CAMERAS, anchors
@@ -26,8 +26,8 @@ from test_statistics import view
 from vdgs.kernels.cuda import cache
 from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.cull import cull
+from vdgs.kernels.cuda.decode import ANCHORS_OF_A_BLOCK, decode_to_train, sources_of
 from vdgs.kernels.cuda.decode import PROGRAM as DECODE
-from vdgs.kernels.cuda.decode import decode
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.loss import PROGRAM as LOSS
 from vdgs.kernels.cuda.loss import photometric_loss
@@ -46,6 +46,8 @@ pytestmark = [
 ]  # fmt: skip
 #: Anchors in view and offsets of the scene that is decoded; pixels of the pictures.
 V, K, WIDTH, HEIGHT = 64, 10, 48, 32
+#: Runs in which the splats of the picture stand.
+RUNS = 5
 #: The decoder's weights among the arguments of kernels, and what they are given of pictures.
 WEIGHTS, MOMENTS, PRODUCTS = r"[ocr]_[wb]\d", r".*_(first|second)$", r".*_out$"
 PICTURE = r"(by_)?(image|alpha|depth)$|transmittance|last|background|median"
@@ -81,40 +83,38 @@ def counted(tmp_path_factory) -> Counted:
         counting = CountedProgram(program, own)
         made = work(counting)
         for each in counting.traffic:
-            name = each.kernel if each.kernel != "decode_anchors" else ("counting", "decoding")[each.launch]
-            traffic.setdefault(name, []).append(each)
+            traffic.setdefault(each.kernel, []).append(each)
         return made
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(cache.VARIABLE, str(folder / "code"))
-        splats, opaque = count(DECODE, decoding)
+        source, opaque = count(DECODE, decoding)
         positions, log_scales = anchors(2048, seed=1)
         rows = count(CULL, lambda program: cull(positions, log_scales, CAMERAS[0], program=program))
         inputs, sums = view(0, 300, K)
         count(STATISTICS, lambda program: add_view_statistics(Statistics(*sums), *inputs, program=program))
         drawn, entries = count(RASTERISE, drawing)
         count(LOSS, comparing)
-    showing = len(torch.unique(splats.source // K))
-    return Counted(
-        traffic, len(splats.source), showing, opaque, (len(positions), len(rows)), len(inputs[2]), drawn, entries
-    )
+    showing = len(torch.unique(source // K))
+    return Counted(traffic, len(source), showing, opaque, (len(positions), len(rows)), len(inputs[2]), drawn, entries)
 
 
 def decoding(program: CountedProgram):
     scene, rows = Scene.random(V, K, spread=3.0), torch.arange(V)
+    shown = decode_to_train(*scene.arguments, turned(), rows, program=program).source
+    source = sources_of(shown, program=program)
     with torch.no_grad():
-        splats = decode(*scene.arguments, turned(), rows, program=program)
         viewing = scene.positions - torch.from_numpy(turned().position).float()
         distance = viewing.norm(dim=-1, keepdim=True)
         inputs = torch.cat([scene.features, viewing / distance, distance], -1)
         opaque = int((scene.weights.opacity.outputs(inputs) > 0).sum())
     moved_by(partial(decode_backward_adam, program=program), scene, turned(), rows)
-    return splats, opaque
+    return source, opaque
 
 
 def drawing(program: CountedProgram) -> tuple[int, int]:
     splats, background = splats_of([t.detach().float() for t in make_scene(200, WIDTH, HEIGHT).tensors])
-    _, pullback = rasterise_vjp(splats, background, WIDTH, HEIGHT, program=program)
+    _, pullback = rasterise_vjp(in_runs(splats, RUNS)[0], background, WIDTH, HEIGHT, program=program)
     pullback(torch.randn(HEIGHT, WIDTH, 3), torch.randn(HEIGHT, WIDTH))
     return len(splats.means_px), len(pullback.entries.owners)
 
@@ -131,15 +131,15 @@ def test_the_table(counted):
     rows: list[tuple[str, str, int, tuple[Bytes, Bytes]]] = [
         ("cull: marks", "anchor", n, counted.of("mark_anchors")),
         ("cull: indices", "anchor kept", kept, counted.of("write_rows")),
-        ("decode: count", "anchor", V, counted.of("counting", but=WEIGHTS)),
-        ("decode: write", "anchor", V, counted.of("decoding", but=WEIGHTS)),
+        ("decode", "anchor", V, counted.of("decode_anchors", but=WEIGHTS)),
         ("way back, but moments", "anchor", V, counted.of("move_anchors", but=f"{WEIGHTS}|{MOMENTS}|{PRODUCTS}")),
         ("way back: moments", "anchor", V, counted.of("move_anchors", MOMENTS)),
         ("way back: for the decoder", "anchor", V, counted.of("move_anchors", PRODUCTS)),
-        ("weights: count", "anchor", V, counted.of("counting", WEIGHTS)),
-        ("weights: write", "anchor", V, counted.of("decoding", WEIGHTS)),
+        ("weights: decode", "anchor", V, counted.of("decode_anchors", WEIGHTS)),
         ("weights: way back", "anchor", V, counted.of("move_anchors", WEIGHTS)),
+        ("statistics: sources", "splat", counted.splats, counted.of("name_splats")),
         ("statistics", "splat", counted.added, counted.of("add_view")),
+        ("order of splats", "splat", counted.drawn, counted.of("order_splats")),
         ("tiles of splats", "splat", counted.drawn, counted.of("splat_tiles")),
         ("entries of splats", "splat", counted.drawn, counted.of("splat_entries")),
         ("forward: splats", "entry", counted.entries, counted.of("rasterise_forward", but=PICTURE)),
@@ -163,45 +163,66 @@ def test_the_table(counted):
 
 
 def test_of_anchors_is_read_what_they_are_made_of_and_no_more(counted):
-    """Rows (8), position (12), feature (128), log-scales (24), offsets (12 each): those that are opaque, then those
-    that show. 48 bytes a splat are written."""
-    read, written = counted.of("counting", but=WEIGHTS)
-    assert read.once == V * (8 + 12 + 128 + 24) + 12 * counted.opaque
-    assert written.once == V * (4 + 4)
-    read, written = counted.of("decoding", but=WEIGHTS)
+    """Rows (8), position (12), feature (128), log-scales (24), opaque offsets (12 each). Written are 40 bytes a
+    splat, 4 an anchor and 12 for eight; and the counter is counted up."""
+    read, written = counted.of("decode_anchors", but=WEIGHTS)
     assert 0 < counted.showing < V
-    assert read.once == 4 * V + counted.showing * (8 + 12 + 128 + 24 + 4) + 12 * counted.splats
-    assert written.once == 48 * counted.splats
+    assert counted.splats < counted.opaque
+    assert read.once == V * (8 + 12 + 128 + 24) + 12 * counted.opaque + 4
+    assert written.once == 40 * counted.splats + 4 * V + 12 * V // ANCHORS_OF_A_BLOCK + 4
+    assert len(counted.traffic["decode_anchors"]) == len({each.argument for each in counted.traffic["decode_anchors"]})
 
 
 def test_on_the_way_back_each_number_that_moves_is_read_once_and_written_once(counted):
-    """272 bytes of parameters and twice as much of moments an anchor, 56 bytes a splat; each read by one access."""
+    """272 bytes of parameters and twice as much of moments an anchor, 36 bytes a splat; each read by one access."""
     moved = counted.of("move_anchors", r"(features|offsets|log_scales)(_first|_second)?$")
     assert [each.once for each in moved] == [V * 3 * 272] * 2
     read, written = counted.of("move_anchors", but=f"{WEIGHTS}|{PRODUCTS}|lacking|roots")
-    around = 8 * V + 4 * (V + 1) + 4 * V + 12 * counted.showing  # rows, where splats begin, updates, positions
-    assert read.once == V * 3 * 272 + around + 56 * counted.splats
+    # Rows, what shows, updates; where splats begin, once for eight; positions.
+    around = 8 * V + 4 * V + 4 * V + 4 * V // ANCHORS_OF_A_BLOCK + 12 * counted.showing
+    assert read.once == V * 3 * 272 + around + 36 * counted.splats
     assert written.once == V * (3 * 272 + 4)
     features = counted.of("move_anchors", "features$")[0]
     assert features.lanes == features.once  # 32 lanes, 128 bytes, at once
 
 
-def test_an_anchor_costs_less_than_before_but_more_than_was_aimed_at(counted):
-    """Design: 1.2 kB an anchor for decoding and its way back, without moments; with them 1.6 kB are the least that Adam
-    in float32 moves (816 bytes read and written). The sum here is over anchors that show 4 to 5 splats."""
-    passes = [counted.of("counting", but=WEIGHTS), counted.of("decoding", but=WEIGHTS)]
+def bytes_of(anchors: float, showing: float, opaque: float, splats: float) -> float:
+    """Of decoding and its way back without moments, by the two tests above."""
+    decoding = (172 + 4 + 1.5) * anchors + 12 * opaque + 40 * splats
+    back = (2 * 272 + 8 + 4 + 8 + 0.5) * anchors + 12 * showing + 36 * splats
+    return decoding + back
+
+
+def test_an_anchor_costs_no_more_than_was_aimed_at(counted):
+    """Design: 1.2 kB an anchor with five splats of five opaque offsets, for decoding and its way back, without moments;
+    with them 1.6 kB are the least that Adam in float32 moves (816 bytes read and written)."""
+    passes = [counted.of("decode_anchors", but=WEIGHTS)]
     passes.append(counted.of("move_anchors", but=f"{WEIGHTS}|{PRODUCTS}|lacking|roots"))
-    whole = sum(read.once + written.once for read, written in passes) / V
-    moments = sum(each.once for each in counted.of("move_anchors", MOMENTS)) / V
-    assert moments == 1088
-    assert whole - moments < 1550
-    assert whole < 2640
+    whole = sum(read.once + written.once for read, written in passes)
+    moments = sum(each.once for each in counted.of("move_anchors", MOMENTS))
+    assert moments == 1088 * V
+    counter = 8
+    assert whole - moments - counter == bytes_of(V, counted.showing, counted.opaque, counted.splats)
+    assert bytes_of(1, 1, 5, 5) == 1194
+
+
+def test_what_is_written_for_others_is_written_once(counted):
+    """Sources, for statistics; the order of splats, for equal depths in the own rasteriser."""
+    read, written = counted.of("name_splats")
+    assert written.once == 4 * counted.splats
+    assert read.once == 4 * V + 4 * V // ANCHORS_OF_A_BLOCK
+    read, written = counted.of("order_splats")
+    assert written.once == 4 * counted.drawn
+    assert read.once == 8 * RUNS
+    assert counted.of("splat_tiles", "order")[0].once == 4 * counted.drawn
 
 
 def test_lanes_read_weights_side_by_side(counted):
     """Of ten offsets, a warp reads 40 bytes of a weight at once: at most three sectors, usually two."""
-    for kernel, name in (("counting", "c_w2"), ("decoding", "c_w2"), ("decoding", "r_w2"), ("move_anchors", "c_w2t")):
-        read, outputs = counted.of(kernel, f"{name}$")[0], 7 if name.startswith("c") else 3
+    heads = {"o": 1, "c": 7, "r": 3}
+    kernels = [("decode_anchors", f"{head}_w2") for head in heads] + [("move_anchors", f"{head}_w2t") for head in heads]
+    for kernel, name in kernels:
+        read, outputs = counted.of(kernel, f"{name}$")[0], heads[name[0]]
         assert 0 < read.lanes <= V * 32 * outputs * 3 * 32
         assert read.once == 32 * K * outputs * 4
 

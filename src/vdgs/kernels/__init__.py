@@ -14,6 +14,7 @@ Names and dimensions, fixed once for all files in this folder:
        cull(positions [n,3], log_scales [n,6], camera) -> int64 [v], ascending
     d  decode(positions [n,3], features [n,32], offsets [n,k,3], log_scales [n,6], weights, camera,
               rows [v]) -> Splats
+       decode_to_train(the same) -> Splats, in an order that goes with them, and their mean volume
        decode_backward_adam(positions [n,3], moved, weights, camera, rows [v], gradients, updates [n])
                  -> finite, gradients of the weights; anchors move and their updates are counted, in place
     d  project(means [m,3], scales [m,3], quaternions [m,4], camera) -> Projected

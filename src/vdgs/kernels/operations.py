@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from vdgs.cameras import Camera
+    from vdgs.kernels.runs import Shown
     from vdgs.kernels.types import (
         AdamState,
         AnchorSplats,
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
         SplatGradients,
         Splats,
         Statistics,
+        TrainingSplats,
     )
 
 
@@ -43,6 +45,17 @@ class Operations(Protocol):
         camera: Camera,
         rows: Tensor | None = None,
     ) -> AnchorSplats: ...
+
+    def decode_to_train(
+        self,
+        positions: Tensor,
+        features: Tensor,
+        offsets: Tensor,
+        log_scales: Tensor,
+        weights: DecoderWeights,
+        camera: Camera,
+        rows: Tensor | None = None,
+    ) -> TrainingSplats: ...
 
     def decode_backward_adam(
         self,
@@ -79,7 +92,7 @@ class Operations(Protocol):
         statistics: Statistics,
         visible: Tensor,
         inside: Tensor,
-        source: Tensor,
+        source: Tensor | Shown,
         opacities: Tensor,
         gradient_px: Tensor,
         width: int,
@@ -114,6 +127,7 @@ ON_A_CARD: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATIONS, ("reference",)
     "cull": ("cuda",),
     "decode": ("cuda",),
     "decode_backward_adam": ("cuda",),
+    "decode_to_train": ("cuda",),
     "photometric_loss": ("cuda",),
     "rasterise": ("gsplat", "cuda"),
     "rasterise_vjp": ("gsplat", "cuda"),

@@ -13,8 +13,13 @@ import torch
 from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
+from vdgs.kernels.runs import Runs, Shown
+
 #: Whether all was finite: a bool, or on a card, which nobody has asked yet, a tensor that holds one.
 Finite = bool | Bool[Tensor, ""]
+
+#: What each of m splats is of: see `TrainingSplats`.
+Sources = Int32[Tensor, "m"] | Shown
 
 #: Numbers in an anchor's feature, and units in the hidden layer of every head.
 FEATURE_SIZE = 32
@@ -135,6 +140,40 @@ class AnchorSplats(Splats):
 
 
 @dataclass(frozen=True, eq=False)
+class OrderedSplats(Splats):
+    """Splats that need not stand in the order in which equal depths are blended."""
+
+    #: That order; None: the order of the rows. gsplat does not look at it.
+    runs: Runs | None
+
+    def joined(self, others: OrderedSplats) -> OrderedSplats:
+        """These splats followed by others, in the order of each."""
+        runs = Runs.joined(self.runs, len(self.depths), others.runs, len(others.depths), self.depths.device)
+        both = {
+            field.name: torch.cat([getattr(self, field.name), getattr(others, field.name)]) for field in fields(Splats)
+        }
+        return OrderedSplats(**both, runs=runs)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingSplats(OrderedSplats):
+    """What a training step needs to know of an anchor model as one camera sees it: no more than that."""
+
+    #: As in `AnchorSplats`; a card may only know which offsets show.
+    source: Sources
+    #: Mean volume of the splats; NaN if there are none.
+    volume: Float[Tensor, ""]
+
+    @staticmethod
+    def of(splats: AnchorSplats) -> TrainingSplats:
+        """The same splats."""
+        s = splats
+        return TrainingSplats(
+            s.means_px, s.conics, s.depths, s.colours, s.opacities, None, s.source, s.volumes.mean()
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
 class SplatGradients:
     """Derivatives of a loss by the splats of a view, and what decoding needs to know of these."""
 
@@ -144,8 +183,8 @@ class SplatGradients:
     opacities: Float[Tensor, "m"]
     #: By the volume of each: the same number for all.
     volume: float
-    #: The splats themselves: see `AnchorSplats`.
-    source: Int32[Tensor, "m"]
+    #: The splats themselves: see `TrainingSplats`. A card computes the values again.
+    source: Sources
     colour_values: Float[Tensor, "m 3"]
     opacity_values: Float[Tensor, "m"]
     #: By the depth of each; None is zero.

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels import choose
-from vdgs.kernels.types import AnchorSplats, DecoderWeights, Raster, Splats
+from vdgs.kernels.types import AnchorSplats, DecoderWeights, Raster, Splats, TrainingSplats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 
@@ -19,6 +19,15 @@ from vdgs.model.anchors import Anchors
 def decode_rows(anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera) -> AnchorSplats:
     """Splats of the anchors of the given rows, as this camera sees them."""
     return choose(anchors.positions.device).decode(
+        anchors.positions, anchors.features, anchors.offsets, anchors.log_scales, weights, camera, rows
+    )
+
+
+def decode_rows_to_train(
+    anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera
+) -> TrainingSplats:
+    """As much of `decode_rows` as a training step asks for; on a card, not in the order of the rows."""
+    return choose(anchors.positions.device).decode_to_train(
         anchors.positions, anchors.features, anchors.offsets, anchors.log_scales, weights, camera, rows
     )
 
@@ -59,13 +68,6 @@ def _joined(pieces: list[tuple[int, AnchorSplats]], k: int) -> AnchorSplats:
         for field in fields(AnchorSplats) if field.name != "source"
     }  # fmt: skip
     return AnchorSplats(**named, source=torch.cat([splats.source + first * k for first, splats in pieces]))
-
-
-def joined(first: Splats, second: Splats) -> Splats:
-    """Splats followed by others."""
-    return Splats(
-        **{field.name: torch.cat([getattr(first, field.name), getattr(second, field.name)]) for field in fields(Splats)}
-    )
 
 
 def draw(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:

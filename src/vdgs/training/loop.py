@@ -16,8 +16,8 @@ from torch import Tensor
 from vdgs.cameras import Camera
 from vdgs.errors import TrainingDiverged
 from vdgs.kernels import choose
-from vdgs.kernels.types import AnchorSplats, DecoderWeights, SplatGradients, Splats
-from vdgs.model.render import decode_rows, visible_rows
+from vdgs.kernels.types import DecoderWeights, OrderedSplats, SplatGradients, TrainingSplats
+from vdgs.model.render import decode_rows, decode_rows_to_train, visible_rows
 from vdgs.model.sizes import SPREAD
 from vdgs.training.averaging import Average, counts_in_mean
 from vdgs.training.background import background_at
@@ -57,7 +57,7 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     around = _surroundings(stage, view, camera)
     background = background_at(stage, iteration)
     with torch.no_grad():
-        splats = _thinned(decode_rows(state.anchors, rows, weights, camera), rows, state, stage)
+        splats = _splats(state, stage, rows, weights, camera)
         drawn = draw_view(splats, camera, background, around, stage.draws_depth)
     compared = compare(drawn, target, state.decoder, appearance_at(stage, view), config)
     volume_weight, loss = _volume_weight(stage), compared.loss
@@ -96,24 +96,25 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     return report
 
 
-def _thinned(splats: AnchorSplats, rows: Tensor, state: TrainingState, stage: Stage) -> AnchorSplats:
+def _splats(
+    state: TrainingState, stage: Stage, rows: Tensor, weights: DecoderWeights, camera: Camera
+) -> TrainingSplats:
     """What is drawn of the anchors of the given rows: all, or less where few cameras look."""
     if state.seldom is None:
-        return splats
+        return decode_rows_to_train(state.anchors, rows, weights, camera)
     config, offsets = stage.config, state.anchors.offsets.shape[1]
-    return thinned(
-        splats, config.seldom.drop * state.seldom[rows], offsets, config.seed * 1_000_039 + state.iteration
-    )  # fmt: skip
+    share, seed = config.seldom.drop * state.seldom[rows], config.seed * 1_000_039 + state.iteration
+    return TrainingSplats.of(thinned(decode_rows(state.anchors, rows, weights, camera), share, offsets, seed))
 
 
 @torch.no_grad()
-def _surroundings(stage: Stage, view: int, camera: Camera) -> Splats | None:
+def _surroundings(stage: Stage, view: int, camera: Camera) -> OrderedSplats | None:
     """The splats of the frozen anchors around a block: drawn, but out of autograd's sight."""
     around = stage.surroundings
     if around is None or not len(around.anchors):
         return None
     weights = around.decoder.for_image(appearance_at(stage, view))
-    return decode_rows(around.anchors, visible_rows(around.anchors, camera), weights, camera)
+    return decode_rows_to_train(around.anchors, visible_rows(around.anchors, camera), weights, camera)
 
 
 def appearance_at(stage: Stage, view: int) -> int:

@@ -16,9 +16,17 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels import choose
-from vdgs.kernels.types import AdamState, AnchorSplats, DecoderWeights, Finite, RasterPullback, SplatGradients, Splats
+from vdgs.kernels.types import (
+    AdamState,
+    DecoderWeights,
+    Finite,
+    OrderedSplats,
+    RasterPullback,
+    Sources,
+    SplatGradients,
+    TrainingSplats,
+)
 from vdgs.model.anchors import TRAINED, Anchors
-from vdgs.model.render import joined
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +38,7 @@ class TrainingView:
     alpha: Float[Tensor, "h w"]
     #: Expected depth, not divided by alpha; None if it was not asked for.
     depth: Float[Tensor, "h w"] | None
-    source: Int32[Tensor, " m"]
+    source: Sources
     colours: Float[Tensor, "m 3"]
     opacities: Float[Tensor, " m"]
     #: Mean volume of the splats; NaN if there are none.
@@ -61,20 +69,20 @@ class TrainingView:
 
 @torch.no_grad()
 def draw_view(
-    splats: AnchorSplats,
+    splats: TrainingSplats,
     camera: Camera,
     background: Float[Tensor, "3"],
-    around: Splats | None = None,
+    around: OrderedSplats | None = None,
     depth: bool = False,
 ) -> TrainingView:
     """Draw the splats of trained anchors with those `around` them, on request with depth. The tensors of `splats` are
     the view's from now on: their memory is used again."""
-    drawn = splats if around is None else joined(splats, around)
+    drawn = splats if around is None else splats.joined(around)
     kernels = choose(drawn.means_px.device)
     raster, pullback = kernels.rasterise_vjp(drawn, background, camera.width, camera.height, depth=depth)
     return TrainingView(
         raster.image, raster.alpha, raster.depth, splats.source, splats.colours, splats.opacities,
-        splats.volumes.mean(), pullback, (drawn.means_px, drawn.conics),
+        splats.volume, pullback, (drawn.means_px, drawn.conics),
     )  # fmt: skip
 
 

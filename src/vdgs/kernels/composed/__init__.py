@@ -4,7 +4,14 @@
 """
 
 from vdgs.kernels.composed.rasteriser import rasterise, rasterise_vjp
-from vdgs.kernels.cuda import add_view_statistics, cull, decode, decode_backward_adam, photometric_loss
+from vdgs.kernels.cuda import (
+    add_view_statistics,
+    cull,
+    decode,
+    decode_backward_adam,
+    decode_to_train,
+    photometric_loss,
+)
 from vdgs.kernels.reference import (
     adam_rows,
     cell_centres,
@@ -28,6 +35,7 @@ __all__ = [
     "cull",
     "decode",
     "decode_backward_adam",
+    "decode_to_train",
     "group_cells",
     "group_max",
     "mark_visible",

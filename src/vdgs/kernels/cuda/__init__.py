@@ -4,7 +4,7 @@ Not all operations of `vdgs.kernels` are here: `vdgs.kernels.composed` adds what
 """
 
 from vdgs.kernels.cuda.cull import cull
-from vdgs.kernels.cuda.decode import decode
+from vdgs.kernels.cuda.decode import decode, decode_to_train
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.loss import photometric_loss
 from vdgs.kernels.cuda.rasterise import rasterise, rasterise_vjp
@@ -15,6 +15,7 @@ __all__ = [
     "cull",
     "decode",
     "decode_backward_adam",
+    "decode_to_train",
     "photometric_loss",
     "rasterise",
     "rasterise_vjp",

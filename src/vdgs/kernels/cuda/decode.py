@@ -4,20 +4,32 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels.cuda.camera import PackedCamera
 from vdgs.kernels.cuda.launching import Argument, Program
+from vdgs.kernels.cuda.room import Room
 from vdgs.kernels.reference.decode import decode as by_torch
-from vdgs.kernels.types import FEATURE_SIZE, HIDDEN_SIZE, AnchorSplats, DecoderWeights, HeadWeights
+from vdgs.kernels.runs import ANCHORS_OF_A_RUN, Runs, Shown
+from vdgs.kernels.types import (
+    FEATURE_SIZE,
+    HIDDEN_SIZE,
+    AnchorSplats,
+    DecoderWeights,
+    HeadWeights,
+    Splats,
+    TrainingSplats,
+)
 
 #: Warps of a block, each with an anchor: kWarps of the source. A lane an offset.
-ANCHORS_OF_A_BLOCK, MOST_OFFSETS = 8, 32
+ANCHORS_OF_A_BLOCK, MOST_OFFSETS = ANCHORS_OF_A_RUN, 32
 PROGRAM = Program("decode.cu", headers=("gaussian_math.h", "image_formation.h"))
+ROOM = Room()
 
 
 def decode(
@@ -30,39 +42,124 @@ def decode(
     rows: Int64[Tensor, "v"] | None = None,
     *,
     program: Program = PROGRAM,
+    room: Room = ROOM,
 ) -> AnchorSplats:
     """As `reference.decode.decode`, for float32 tensors on a CUDA device. Same bits every time.
 
     Where autograd follows it is the reference that decodes: this has no derivative. Waits for the device once: for how
-    many splats room must be made. Nothing is kept between anchors and splats. Raises ValueError for more than 32
-    offsets, TypeError for other types of elements, CudaUnavailable where the kernel cannot be run.
+    many splats there are. They are put into order afterwards (`decode_to_train` does without). Raises ValueError for
+    more than 32 offsets, TypeError for other types of elements, CudaUnavailable where the kernel cannot be run.
     """
     anchors = (positions, features, offsets, log_scales)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (*anchors, *weights.tensors())):
         return by_torch(*anchors, weights, camera, rows)
+    named, shown, _ = _decoded(anchors, weights, camera, rows, True, program, room)
+    order = shown.runs.order(len(shown))
+    return AnchorSplats(**{name: tensor.index_select(0, order) for name, tensor in named.items()})
+
+
+@torch.no_grad()
+def decode_to_train(
+    positions: Float[Tensor, "n 3"],
+    features: Float[Tensor, "n 32"],
+    offsets: Float[Tensor, "n k 3"],
+    log_scales: Float[Tensor, "n 6"],
+    weights: DecoderWeights,
+    camera: Camera,
+    rows: Int64[Tensor, "v"] | None = None,
+    *,
+    program: Program = PROGRAM,
+    room: Room = ROOM,
+) -> TrainingSplats:
+    """As `reference.decode.decode_to_train`, as `decode` in what it asks, waits for and raises.
+
+    Splats are those of `decode` to the bit, but where each block's stand is left to the card: `runs` tells. Sources are
+    not written, nor volumes, which are added up in a fixed order. Nothing is kept between anchors and splats.
+    """
+    anchors = (positions, features, offsets, log_scales)
+    named, shown, sums = _decoded(anchors, weights, camera, rows, False, program, room)
+    return TrainingSplats(**named, runs=shown.runs, source=shown, volume=sums.sum() / len(shown))
+
+
+@dataclass(frozen=True)
+class _Made:
+    """Room for m splats, as the kernel takes it; volumes and sources where they are asked for."""
+
+    drawn: Splats
+    volumes: Float[Tensor, " m"] | None
+    source: Int32[Tensor, " m"] | None
+
+    @staticmethod
+    def empty(m: int, whole: bool, like: Tensor) -> _Made:
+        new = like.new_empty
+        rest = (new(m), new(m, dtype=torch.int32)) if whole else (None, None)
+        return _Made(Splats(new(m, 2), new(m, 3), new(m), new(m, 3), new(m)), *rest)
+
+    def tensors(self) -> list[Tensor | None]:
+        """In the order of the kernel's arguments."""
+        return [*self.named().values(), *([None] * 2 if self.source is None else [])]
+
+    def named(self) -> dict[str, Tensor]:
+        """By the names of `AnchorSplats`, as far as they are there."""
+        drawn = {field.name: getattr(self.drawn, field.name) for field in fields(Splats)}
+        rest = {"volumes": self.volumes, "source": self.source}
+        return drawn | {name: tensor for name, tensor in rest.items() if tensor is not None}
+
+
+def _decoded(
+    anchors: tuple[Tensor, ...],
+    weights: DecoderWeights,
+    camera: Camera,
+    rows: Tensor | None,
+    whole: bool,
+    program: Program,
+    room: Room,
+) -> tuple[dict[str, Tensor], Shown, Float[Tensor, " r"]]:
+    """Splats as the card happens to place them (`whole`: with volumes and sources), where they are, and unless `whole`
+    the volumes of each run added up."""
+    positions, _, offsets, _ = anchors
     k, inputs = offsets.shape[1], weights.opacity.w1.shape[1]
     check_decoder(k, weights, anchors)
     heads = [tensor for head in (weights.opacity, weights.covariance, weights.colour) for tensor in by_lanes(head, k)]
     count = len(positions) if rows is None else len(rows)
+    blocks = -(-count // ANCHORS_OF_A_BLOCK)
+    bits, begins, lengths = (positions.new_empty(n, dtype=torch.int32) for n in (count, blocks, blocks))
+    sums = positions.new_empty(blocks)
     given: list[Argument] = [
         *(t.detach().contiguous() for t in anchors), *heads, PackedCamera.of(camera),
         None if rows is None else rows.contiguous(), ctypes.c_longlong(count), ctypes.c_int(k),
         ctypes.c_int(inputs == FEATURE_SIZE + 4),
     ]  # fmt: skip
-    grid, block = (-(-count // ANCHORS_OF_A_BLOCK),), (32 * ANCHORS_OF_A_BLOCK,)
-    shown, counts = (positions.new_empty(count, dtype=torch.int32) for _ in range(2))
-    program.launch("decode_anchors", grid, block, *given, shown, counts, *[None] * 8)
-    ends = counts.cumsum(0, dtype=torch.int32)
-    m = int(ends[-1]) if count else 0
-    empty = positions.new_empty
-    splats = AnchorSplats(
-        empty(m, 2), empty(m, 3), empty(m), empty(m, 3), empty(m), empty(m), empty(m, dtype=torch.int32)
-    )
+
+    def write(capacity: int) -> tuple[_Made, Tensor]:
+        made, total = _Made.empty(capacity, whole, positions), positions.new_zeros(1, dtype=torch.int32)
+        program.launch(
+            "decode_anchors", (blocks,), (32 * ANCHORS_OF_A_BLOCK,), *given, ctypes.c_int(capacity), total, bits,
+            begins, lengths, None if whole else sums, *made.tensors(),
+        )  # fmt: skip
+        return made, total
+
+    capacity = room.for_anchors(count, k, positions.device)
+    made, total = write(capacity)
+    m = int(total) if count else 0
+    room.learn(count, k, positions.device, m)
+    if m > capacity:  # what there was no room for was not written
+        made, _ = write(m)
+    found = {name: tensor[:m] for name, tensor in made.named().items()}
+    return found, Shown(bits, Runs(begins, lengths), m, k), sums
+
+
+def sources_of(source: Tensor | Shown, *, program: Program = PROGRAM) -> Int32[Tensor, " m"]:
+    """What each splat is of, written out if only what shows is known."""
+    if isinstance(source, Tensor):
+        return source
+    made = source.bits.new_empty(len(source))
+    count = len(source.bits)
     program.launch(
-        "decode_anchors", grid, block, *given, shown, None, ends, splats.means_px, splats.conics, splats.depths,
-        splats.colours, splats.opacities, splats.volumes, splats.source,
+        "name_splats", (-(-count // ANCHORS_OF_A_BLOCK),), (32 * ANCHORS_OF_A_BLOCK,), source.bits,
+        source.runs.begins, ctypes.c_longlong(count), ctypes.c_int(source.offsets), made,
     )  # fmt: skip
-    return splats
+    return made
 
 
 def by_lanes(head: HeadWeights, k: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

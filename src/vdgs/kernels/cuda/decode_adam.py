@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int32, Int64
@@ -11,13 +12,14 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels.cuda.camera import PackedCamera
-from vdgs.kernels.cuda.decode import ANCHORS_OF_A_BLOCK, PROGRAM, by_lanes, check_decoder
+from vdgs.kernels.cuda.decode import ANCHORS_OF_A_BLOCK, PROGRAM, by_lanes, check_decoder, sources_of
 from vdgs.kernels.cuda.launching import Argument, Program
 from vdgs.kernels.reference.adam import check_updates, tables_on
 from vdgs.kernels.reference.decode_adam import decode_backward_adam as by_torch
+from vdgs.kernels.runs import Shown
 from vdgs.kernels.types import AdamState, DecoderWeights, Finite, HeadWeights, SplatGradients
 
-#: Anchors whose parts of the decoder's gradients are held at once.
+#: Anchors whose parts of the decoder's gradients are held at once: whole blocks.
 PIECE = 2**14
 
 
@@ -42,7 +44,8 @@ def decode_backward_adam(
     unsuitable tensors, CudaUnavailable where the kernel cannot be run.
     """
     if gradients.depths is not None:
-        return by_torch(positions, moved, weights, camera, rows, gradients, updates)
+        named = replace(gradients, source=sources_of(gradients.source, program=program))
+        return by_torch(positions, moved, weights, camera, rows, named, updates)
     check_updates(updates, len(positions))
     features, offsets, _ = moved
     k, inputs = offsets.parameter.shape[1], weights.opacity.w1.shape[1]
@@ -51,7 +54,7 @@ def decode_backward_adam(
     if len({state.early for state in moved}) > 1:
         raise ValueError("features, offsets and log-scales must be annealed alike")
     v, device, source = len(rows), positions.device, gradients.source
-    begins = torch.searchsorted(source, (torch.arange(v + 1, device=device) * k).to(torch.int32), out_int32=True)
+    shown = source if isinstance(source, Shown) else Shown.of(source, v, k)
     lacking, roots = (table.float() for table in tables_on(0.9, 0.999, device))
     broken = torch.zeros(1, dtype=torch.int32, device=device)
     before: list[Argument] = [
@@ -59,10 +62,9 @@ def decode_backward_adam(
         ctypes.c_float(features.early), *_weights(weights, k), PackedCamera.of(camera), rows.contiguous(),
     ]  # fmt: skip
     after: list[Argument] = [
-        ctypes.c_int(k), ctypes.c_int(inputs), begins,
+        ctypes.c_int(k), ctypes.c_int(inputs), shown.bits, shown.runs.begins,
         *(t.contiguous() for t in (gradients.means_px, gradients.conics, gradients.colours, gradients.opacities)),
-        ctypes.c_float(gradients.volume), source.contiguous(), gradients.colour_values.contiguous(),
-        gradients.opacity_values.contiguous(), updates, lacking, roots, ctypes.c_int(len(roots)), broken,
+        ctypes.c_float(gradients.volume), updates, lacking, roots, ctypes.c_int(len(roots)), broken,
     ]  # fmt: skip
     wanted = any(t.requires_grad for t in weights.tensors())
     of_weights = [torch.zeros_like(t) for t in weights.tensors()] if wanted else None
@@ -85,7 +87,7 @@ def _weights(weights: DecoderWeights, k: int) -> list[Tensor]:
     heads = weights.opacity, weights.covariance, weights.colour
     opacity, covariance, colour = (by_lanes(head, k) for head in heads)
     back = (w.detach().contiguous() for head in heads for w in (head.w1, head.w2))
-    return [*opacity[:2], *covariance, *colour[:2], *back]
+    return [*opacity, *covariance, *colour, *back]
 
 
 class _Made:

@@ -12,7 +12,8 @@ from torch import Tensor
 from vdgs.kernels.checking import check_splats
 from vdgs.kernels.cuda.launching import Argument, Program
 from vdgs.kernels.differentiable import differentiable
-from vdgs.kernels.types import Raster, RasterGradients, RasterPullback, Splats
+from vdgs.kernels.runs import Runs
+from vdgs.kernels.types import OrderedSplats, Raster, RasterGradients, RasterPullback, Splats
 
 #: Side of a tile, threads of a block and sums of an entry: kTile, kThreads and kSums of the source.
 TILE_PX, THREADS, SUMS = 16, 256, 10
@@ -34,7 +35,8 @@ def rasterise(
     Backward takes 52 bytes an entry. Raises TypeError or ValueError for unsuitable tensors, CudaUnavailable where the
     kernels cannot be run.
     """
-    return differentiable(lambda tensors: _draw(tensors, width, height, depth, program), splats, background)
+    runs = _runs_of(splats)
+    return differentiable(lambda tensors: _draw(tensors, runs, width, height, depth, program), splats, background)
 
 
 def rasterise_vjp(
@@ -47,27 +49,33 @@ def rasterise_vjp(
     program: Program = PROGRAM,
 ) -> tuple[Raster, RasterPullback]:
     """`rasterise` without autograd: the picture, and the way back from it, which reads the splats again."""
-    return _draw((*splats.tensors, background), width, height, depth, program)
+    return _draw((*splats.tensors, background), _runs_of(splats), width, height, depth, program)
+
+
+def _runs_of(splats: Splats) -> Runs | None:
+    return splats.runs if isinstance(splats, OrderedSplats) else None
 
 
 @dataclass(frozen=True)
 class _Entries:
-    """What each tile shows, front to back: n entries, one for each splat and tile that it reaches."""
+    """What each tile shows, front to back: n entries, one for each splat and tile that it reaches. Before they are
+    sorted they stand in the order of the splats: that of the rows, or `splats`."""
 
     owners: Int32[Tensor, " n"]  # the splat of each entry, before sorting
     order: Int64[Tensor, " n"]  # where each entry was before sorting
     bounds: Int64[Tensor, " tiles_and_one"]  # where those of each tile begin
     ends: Int64[Tensor, " m"]  # where those of each splat end, before sorting
+    splats: Int32[Tensor, " m"] | None  # the rows of splats in their order; None: as they stand
 
 
 def _draw(
-    tensors: tuple[Tensor, ...], width: int, height: int, depth: bool, program: Program
+    tensors: tuple[Tensor, ...], runs: Runs | None, width: int, height: int, depth: bool, program: Program
 ) -> tuple[Raster, RasterPullback]:
     """The picture of means_px, conics, colours, opacities, depths before a background, and the way back."""
     check_splats(tensors, width, height)
     *splats, background = (t.detach().contiguous() for t in tensors)
     grid = -(-width // TILE_PX), -(-height // TILE_PX)
-    entries = _entries(splats, grid, program)
+    entries = _entries(splats, runs, grid, program)
     image, transmittance = background.new_empty(height, width, 3), background.new_empty(height, width)
     last = torch.empty_like(transmittance, dtype=torch.int32)
     depths = (torch.empty_like(transmittance), torch.empty_like(transmittance)) if depth else (None, None)
@@ -79,10 +87,19 @@ def _draw(
     return raster, _Pullback(program, splats, background, entries, raster, transmittance, last)
 
 
-def _entries(splats: list[Tensor], grid: tuple[int, int], program: Program) -> _Entries:
+def _order(runs: Runs, m: int, program: Program) -> Int32[Tensor, " m"]:
+    """`Runs.order` in one pass: a warp a run."""
+    order, count = runs.begins.new_empty(m), len(runs.begins)
+    ends = runs.lengths.cumsum(0, dtype=torch.int32)
+    program.launch("order_splats", _over(32 * count), (THREADS,), runs.begins, ends, ctypes.c_int(count), order)
+    return order
+
+
+def _entries(splats: list[Tensor], runs: Runs | None, grid: tuple[int, int], program: Program) -> _Entries:
     means = splats[0]
     count, (columns, rows) = len(means), grid
-    sides = ctypes.c_longlong(count), ctypes.c_int(columns), ctypes.c_int(rows)
+    order = None if runs is None else _order(runs, count, program)
+    sides = order, ctypes.c_longlong(count), ctypes.c_int(columns), ctypes.c_int(rows)
     tiles = means.new_empty(count, dtype=torch.int64)
     program.launch("splat_tiles", _over(count), (THREADS,), *splats, *sides, tiles)
     ends = tiles.cumsum(0)
@@ -90,9 +107,9 @@ def _entries(splats: list[Tensor], grid: tuple[int, int], program: Program) -> _
     total = int(ends[-1]) if count else 0
     keys, owners = means.new_empty(total, dtype=torch.int64), means.new_empty(total, dtype=torch.int32)
     program.launch("splat_entries", _over(count), (THREADS,), *splats, *sides, ends, keys, owners)
-    ordered, order = torch.sort(keys, stable=True)
+    ordered, before = torch.sort(keys, stable=True)
     begins = torch.arange(columns * rows + 1, device=means.device) << 32
-    return _Entries(owners, order, torch.searchsorted(ordered, begins), ends)
+    return _Entries(owners, before, torch.searchsorted(ordered, begins), ends, order)
 
 
 @dataclass(frozen=True)
@@ -128,8 +145,8 @@ class _Pullback:
         by_colours, by_opacities = torch.empty_like(colours), torch.empty_like(opacities)
         by_depths = None if self.raster.depth is None else torch.empty_like(depths)
         self.program.launch(
-            "gather_gradients", _over(len(means)), (THREADS,), *self.splats, ctypes.c_longlong(len(means)),
-            entries.ends, sums, by_means, by_conics, by_colours, by_opacities, by_depths,
+            "gather_gradients", _over(len(means)), (THREADS,), *self.splats, entries.splats,
+            ctypes.c_longlong(len(means)), entries.ends, sums, by_means, by_conics, by_colours, by_opacities, by_depths,
         )  # fmt: skip
         if wanted[0] is None:
             by_background = torch.zeros_like(self.background)

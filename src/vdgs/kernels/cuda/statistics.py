@@ -8,8 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
+from vdgs.kernels.cuda.decode import sources_of
 from vdgs.kernels.cuda.launching import Program
 from vdgs.kernels.reference.statistics import check_inside, check_sources
+from vdgs.kernels.runs import Shown
 from vdgs.kernels.types import Statistics
 
 #: Threads of a block: kThreads of the source.
@@ -21,7 +23,7 @@ def add_view_statistics(
     statistics: Statistics,
     visible: Int64[Tensor, "v"],
     inside: Bool[Tensor, "v"],
-    source: Int32[Tensor, "m"],
+    source: Int32[Tensor, "m"] | Shown,
     opacities: Float[Tensor, "m"],
     gradient_px: Float[Tensor, "m 2"],
     width: int,
@@ -33,20 +35,22 @@ def add_view_statistics(
 
     One pass, same bits every time, nothing waits for the device, which does not look whether sources belong to the
     visible anchors. Raises ValueError or TypeError for unsuitable tensors, CudaUnavailable where the kernel cannot be
-    run.
+    run. Anchors may come in any order; splats of one must stand together. Where only what shows is known (`Shown`), the
+    sources are written out first.
     """
     sums, k = statistics.tensors(), statistics.gradient.shape[1]
-    check_sources(source, visible, k)
+    sources = sources_of(source)
+    check_sources(sources, visible, k)
     check_inside(inside, visible)
-    _check_types(sums | {"opacities": opacities, "gradient_px": gradient_px}, source)
-    m, v = len(source), len(visible)
+    _check_types(sums | {"opacities": opacities, "gradient_px": gradient_px}, sources)
+    m, v = len(sources), len(visible)
     if opacities.shape != (m,) or gradient_px.shape != (m, 2):
         raise ValueError(
             f"opacities {list(opacities.shape)} and gradient_px {list(gradient_px.shape)} must be [{m}] and [{m}, 2]"
         )
     program.launch(
         "add_view", (-(-max(m, v) // THREADS),), (THREADS,), visible.contiguous(), inside.contiguous(),
-        ctypes.c_longlong(v), source.contiguous(), opacities.detach().contiguous(), gradient_px.contiguous(),
+        ctypes.c_longlong(v), sources.contiguous(), opacities.detach().contiguous(), gradient_px.contiguous(),
         ctypes.c_longlong(m), ctypes.c_int(k), ctypes.c_float(width / 2), ctypes.c_float(height / 2), *sums.values(),
     )  # fmt: skip
 

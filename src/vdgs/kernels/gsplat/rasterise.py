@@ -1,9 +1,9 @@
 """Splats to a picture by gsplat: `isect_tiles`, `isect_offset_encode`, `rasterize_to_pixels`.
 
 Both sides mean the same by means (the first pixel's centre is (0.5, 0.5)), conics, alpha (from 1/255 to 0.999), the end
-of a pixel (transmittance 1e-4) and equal depths (the order of the rows). gsplat asks in addition how far each splat
-reaches, and knows no depth: here it is a fourth colour over a background of zero. Median depth it cannot tell: that is
-None.
+of a pixel (transmittance 1e-4) and equal depths (the order of the rows: `OrderedSplats.runs` are not looked at). gsplat
+asks in addition how far each splat reaches, and knows no depth: here it is a fourth colour over a background of zero.
+Median depth it cannot tell: that is None.
 """
 
 from __future__ import annotations

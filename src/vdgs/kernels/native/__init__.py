@@ -3,7 +3,7 @@
 from vdgs.kernels.native.adam import adam_rows
 from vdgs.kernels.native.cells import cell_centres, cell_keys, contains, group_cells, group_max, morton_order
 from vdgs.kernels.native.cull import cull
-from vdgs.kernels.native.decode import decode
+from vdgs.kernels.native.decode import decode, decode_to_train
 from vdgs.kernels.native.decode_adam import decode_backward_adam
 from vdgs.kernels.native.loss import photometric_loss
 from vdgs.kernels.native.project import project
@@ -21,6 +21,7 @@ __all__ = [
     "cull",
     "decode",
     "decode_backward_adam",
+    "decode_to_train",
     "group_cells",
     "group_max",
     "mark_visible",

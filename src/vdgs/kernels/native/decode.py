@@ -12,7 +12,7 @@ from vdgs.cameras import Camera
 from vdgs.kernels.native import module
 from vdgs.kernels.native.arguments import contiguous, packed_camera, require_rows
 from vdgs.kernels.reference.adam import check_indices
-from vdgs.kernels.types import FEATURE_SIZE, AnchorSplats, DecoderWeights
+from vdgs.kernels.types import FEATURE_SIZE, AnchorSplats, DecoderWeights, TrainingSplats
 
 
 def decode(
@@ -42,6 +42,20 @@ def decode(
     anchors = (contiguous(t) for t in tensors)
     heads = (contiguous(t) for t in weights.tensors())
     return AnchorSplats(*_Decode.apply(packed_camera(camera), rows, *anchors, *heads))
+
+
+@torch.no_grad()
+def decode_to_train(
+    positions: Float[Tensor, "n 3"],
+    features: Float[Tensor, "n 32"],
+    offsets: Float[Tensor, "n k 3"],
+    log_scales: Float[Tensor, "n 6"],
+    weights: DecoderWeights,
+    camera: Camera,
+    rows: Int64[Tensor, "v"] | None = None,
+) -> TrainingSplats:
+    """As `reference.decode.decode_to_train`, by `decode`."""
+    return TrainingSplats.of(decode(positions, features, offsets, log_scales, weights, camera, rows))
 
 
 def check_anchors(positions: Tensor, features: Tensor, offsets: Tensor, log_scales: Tensor) -> None:

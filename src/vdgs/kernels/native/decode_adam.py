@@ -16,6 +16,7 @@ from vdgs.kernels.native.arguments import contiguous, packed_camera, require_row
 from vdgs.kernels.native.decode import check_anchors
 from vdgs.kernels.reference.adam import check_indices, check_updates, step_factors
 from vdgs.kernels.reference.statistics import check_sources
+from vdgs.kernels.runs import tensor_of
 from vdgs.kernels.types import AdamState, DecoderWeights, SplatGradients
 
 
@@ -42,7 +43,8 @@ def decode_backward_adam(
         raise ValueError("updates must be contiguous")
     for state in moved:
         _check_state(state)
-    check_sources(gradients.source, rows, offsets.shape[1])
+    source = tensor_of(gradients.source)
+    check_sources(source, rows, offsets.shape[1])
     _check_splats(gradients)
     steps = [_step(state) for state in moved]
     heads = [contiguous(t.detach()) for t in weights.tensors()]
@@ -51,7 +53,7 @@ def decode_backward_adam(
     found = [torch.empty_like(t) for t in heads] if wanted else None
     finite: bool = module.native().decode_backward_adam(
         [contiguous(positions.detach()), *(state[0] for state in steps)], rows.contiguous(), heads,
-        packed_camera(camera), gradients.source, contiguous(gradients.colour_values),
+        packed_camera(camera), source, contiguous(gradients.colour_values),
         contiguous(gradients.opacity_values), [contiguous(t) for t in incoming], gradients.volume, steps, updates,
         found, *([] if gradients.depths is None else [contiguous(gradients.depths)]),
     )  # fmt: skip

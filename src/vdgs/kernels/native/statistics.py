@@ -8,6 +8,7 @@ from torch import Tensor
 
 from vdgs.kernels.native import module
 from vdgs.kernels.reference.statistics import check_inside, check_sources
+from vdgs.kernels.runs import Shown, tensor_of
 from vdgs.kernels.types import Statistics
 
 
@@ -15,7 +16,7 @@ def add_view_statistics(
     statistics: Statistics,
     visible: Int64[Tensor, "v"],
     inside: Bool[Tensor, "v"],
-    source: Int32[Tensor, "m"],
+    source: Int32[Tensor, "m"] | Shown,
     opacities: Float[Tensor, "m"],
     gradient_px: Float[Tensor, "m 2"],
     width: int,
@@ -23,12 +24,13 @@ def add_view_statistics(
 ) -> None:
     """As `reference.statistics.add_view_statistics`, for contiguous float32. Same bits for any number of threads."""
     gradient = statistics.gradient
-    check_sources(source, visible, gradient.shape[1])
+    sources = tensor_of(source)
+    check_sources(sources, visible, gradient.shape[1])
     check_inside(inside, visible)
     if len(visible) and not (int(visible.min()) >= 0 and int(visible.max()) < len(gradient)):
         raise IndexError(f"a visible anchor lies outside the {len(gradient)} anchors")
     module.native().add_view_statistics(
-        visible, inside.contiguous().view(torch.uint8), source, opacities.detach().contiguous(),
+        visible, inside.contiguous().view(torch.uint8), sources, opacities.detach().contiguous(),
         gradient_px.contiguous(), width / 2, height / 2, gradient, statistics.drawn, statistics.opacity,
         statistics.seen,
     )  # fmt: skip

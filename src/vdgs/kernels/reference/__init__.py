@@ -3,7 +3,7 @@
 from vdgs.kernels.reference.adam import adam_rows
 from vdgs.kernels.reference.cells import cell_centres, cell_keys, contains, group_cells, group_max, morton_order
 from vdgs.kernels.reference.cull import cull
-from vdgs.kernels.reference.decode import decode
+from vdgs.kernels.reference.decode import decode, decode_to_train
 from vdgs.kernels.reference.decode_adam import decode_backward_adam
 from vdgs.kernels.reference.loss import photometric_loss
 from vdgs.kernels.reference.project import project
@@ -21,6 +21,7 @@ __all__ = [
     "cull",
     "decode",
     "decode_backward_adam",
+    "decode_to_train",
     "group_cells",
     "group_max",
     "mark_visible",

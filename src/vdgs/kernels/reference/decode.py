@@ -12,7 +12,7 @@ from vdgs.cameras import Camera
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.moving import beside
 from vdgs.kernels.reference.project import project_with_variances
-from vdgs.kernels.types import AnchorSplats, DecoderWeights, Projected
+from vdgs.kernels.types import AnchorSplats, DecoderWeights, Projected, TrainingSplats
 
 
 def decode(
@@ -47,6 +47,21 @@ def decode(
         volumes=drawn.volumes[kept],
         source=(anchor * k + offset)[kept].to(torch.int32),
     )
+
+
+@torch.no_grad()
+def decode_to_train(
+    positions: Float[Tensor, "n 3"],
+    features: Float[Tensor, "n 32"],
+    offsets: Float[Tensor, "n k 3"],
+    log_scales: Float[Tensor, "n 6"],
+    weights: DecoderWeights,
+    camera: Camera,
+    rows: Int64[Tensor, "v"] | None = None,
+) -> TrainingSplats:
+    """`decode` without autograd, and only what a training step asks for. Splats of an anchor stand together, in the
+    order of its offsets; anchors stand in the order that `TrainingSplats.runs` tells."""
+    return TrainingSplats.of(decode(positions, features, offsets, log_scales, weights, camera, rows))
 
 
 def decode_chosen(

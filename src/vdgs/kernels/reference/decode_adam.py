@@ -11,6 +11,7 @@ from torch import Tensor
 from vdgs.cameras import Camera
 from vdgs.kernels.reference.adam import adam_rows, check_updates
 from vdgs.kernels.reference.decode import decode_chosen
+from vdgs.kernels.runs import tensor_of
 from vdgs.kernels.types import AdamState, DecoderWeights, Finite, SplatGradients
 
 
@@ -34,7 +35,8 @@ def decode_backward_adam(
     leaves = [state.parameter[rows].detach().requires_grad_(True) for state in moved]
     decoder = weights.map(lambda t: t.detach().requires_grad_(True))
     with torch.enable_grad():
-        again = decode_chosen(positions[rows], leaves[0], leaves[1], leaves[2], decoder, camera, gradients.source)
+        source = tensor_of(gradients.source)
+        again = decode_chosen(positions[rows], leaves[0], leaves[1], leaves[2], decoder, camera, source)
         outputs = [again.means_px, again.conics, again.colours, again.opacities, again.volumes]
     received = [gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
                 torch.full_like(again.volumes, gradients.volume)]  # fmt: skip

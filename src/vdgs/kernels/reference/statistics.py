@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.kernels.moving import may_look
+from vdgs.kernels.runs import Shown, tensor_of
 from vdgs.kernels.types import Statistics
 
 
@@ -14,7 +15,7 @@ def add_view_statistics(
     statistics: Statistics,
     visible: Int64[Tensor, "v"],
     inside: Bool[Tensor, "v"],
-    source: Int32[Tensor, "m"],
+    source: Int32[Tensor, "m"] | Shown,
     opacities: Float[Tensor, "m"],
     gradient_px: Float[Tensor, "m 2"],
     width: int,
@@ -30,9 +31,10 @@ def add_view_statistics(
     of each of them, before any change.
     """
     k = statistics.gradient.shape[1]
-    check_sources(source, visible, k)
+    sources = tensor_of(source)
+    check_sources(sources, visible, k)
     check_inside(inside, visible)
-    row = source.long()
+    row = sources.long()
     slot = visible[row // k] * k + row % k
     norm = torch.hypot(gradient_px[:, 0] * (width / 2), gradient_px[:, 1] * (height / 2))
     statistics.gradient.view(-1)[slot] += norm

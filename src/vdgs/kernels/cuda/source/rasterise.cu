@@ -1,5 +1,6 @@
 // Splats to a picture and back: vdgs.kernels.reference.rasterise on a GPU.
 //
+//   order_splats        which splat comes when among equal depths, where they do not stand in that order
 //   splat_tiles         in how many tiles of 16x16 pixels each splat reaches a pixel
 //   splat_entries       one entry for each of them: a key (tile, depth) to sort by, and the splat that it is of
 //   rasterise_forward   a block of threads a tile, a thread a pixel: the tile's entries front to back
@@ -7,7 +8,7 @@
 //   gather_gradients    adds up the entries of each splat: its gradients
 //
 // Entries are made splat after splat and sorted in between (by torch, stable, so that equal depths keep the order of the
-// rows); the backward pass writes the sums of an entry to where the entry was before sorting, so that those of a splat
+// splats: that of the rows, or the one that they are given with); the backward pass writes the sums of an entry to where the entry was before sorting, so that those of a splat
 // lie side by side. Nothing is added by several threads at once: the same bits every time.
 //
 // A conic is used by its Cholesky factor, u = ux dx + uy dy and v = vy dy with q = u^2 + v^2: for splats seen edge-on
@@ -138,12 +139,23 @@ __device__ float add_over_warp(float (&values)[kRoom]) {
 
 }  // namespace
 
-// A thread a splat. `tiles` [m].
+// A warp a run of splats that stand in order. `begins` [runs]: where in memory; `ends` [runs]: where among all.
+extern "C" __global__ void __launch_bounds__(kThreads)
+order_splats(const int* begins, const int* ends, int runs, int* order) {
+  const long long run = static_cast<long long>(blockIdx.x) * kWarps + threadIdx.x / kWarp;
+  if (run >= runs) return;
+  const int first = run ? ends[run - 1] : 0, length = ends[run] - first, begin = begins[run];
+  for (int i = threadIdx.x % kWarp; i < length; i += kWarp) order[first + i] = begin + i;
+}
+
+// A thread a splat. `order` [m]: the row of the splat that comes first, and so on (null: as the rows are). `tiles` [m], in
+// this order.
 extern "C" __global__ void __launch_bounds__(kThreads)
 splat_tiles(const float* means, const float* conics, const float* colours, const float* opacities, const float* depths,
-            long long count, int columns, int rows, long long* tiles) {
-  const long long i = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= count) return;
+            const int* order, long long count, int columns, int rows, long long* tiles) {
+  const long long place = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
+  if (place >= count) return;
+  const long long i = order ? order[place] : place;
   const Splats splats{means, conics, colours, opacities, depths};
   Shape shape;
   long long found = 0;
@@ -152,22 +164,23 @@ splat_tiles(const float* means, const float* conics, const float* colours, const
     for (int row = box.top; row <= box.bottom; ++row)
       for (int column = box.left; column <= box.right; ++column) found += touches(shape, column, row);
   }
-  tiles[i] = found;
+  tiles[place] = found;
 }
 
-// A thread a splat. `ends` [m]: where the entries of each splat end. `keys` and `owners`: one for each entry.
+// A thread a splat, in their `order`. `ends` [m]: where the entries of each splat end. `keys` and `owners`: one for each entry.
 extern "C" __global__ void __launch_bounds__(kThreads)
 splat_entries(const float* means, const float* conics, const float* colours, const float* opacities,
-              const float* depths, long long count, int columns, int rows, const long long* ends, long long* keys,
-              int* owners) {
-  const long long i = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= count) return;
+              const float* depths, const int* order, long long count, int columns, int rows, const long long* ends,
+              long long* keys, int* owners) {
+  const long long place = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
+  if (place >= count) return;
+  const long long i = order ? order[place] : place;
   const Splats splats{means, conics, colours, opacities, depths};
   Shape shape;
   if (!shape_of(splats, i, shape)) return;
   const Box box = box_of(shape, columns, rows);
   const long long depth = depth_bits(depths[i]);
-  long long at = i ? ends[i - 1] : 0;
+  long long at = place ? ends[place - 1] : 0;
   for (int row = box.top; row <= box.bottom; ++row)
     for (int column = box.left; column <= box.right; ++column) {
       if (!touches(shape, column, row)) continue;
@@ -310,15 +323,16 @@ rasterise_backward(const float* means, const float* conics, const float* colours
   }
 }
 
-// A thread a splat. The gradients may overwrite means and conics; `by_depths` may be null.
+// A thread a splat, in their `order`. The gradients may overwrite means and conics; `by_depths` may be null.
 extern "C" __global__ void __launch_bounds__(kThreads)
 gather_gradients(const float* means, const float* conics, const float* colours, const float* opacities,
-                 const float* depths, long long count, const long long* ends, const float* sums, float* by_means,
-                 float* by_conics, float* by_colours, float* by_opacities, float* by_depths) {
-  const long long i = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= count) return;
+                 const float* depths, const int* order, long long count, const long long* ends, const float* sums,
+                 float* by_means, float* by_conics, float* by_colours, float* by_opacities, float* by_depths) {
+  const long long place = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
+  if (place >= count) return;
+  const long long i = order ? order[place] : place;
   float total[kSums] = {};
-  for (long long entry = i ? ends[i - 1] : 0; entry < ends[i]; ++entry)
+  for (long long entry = place ? ends[place - 1] : 0; entry < ends[place]; ++entry)
     for (int k = 0; k < kSums; ++k) total[k] += sums[entry * kSums + k];
   Shape s{};
   const bool drawn = shape_of({means, conics, colours, opacities, depths}, i, s);

@@ -1,8 +1,8 @@
 // Growth's statistics of one view: vdgs.kernels.reference.statistics on a GPU.
 //
-// A thread a splat, and a visible anchor. Sources ascend without repetition: each splat has an offset of its own, and the
-// first of an anchor adds the opacities of those behind it, in their order. Nobody else writes there: no atomics, the same
-// bits every time.
+// A thread a splat, and a visible anchor. No source comes twice, and those of an anchor stand together, ascending: each
+// splat has an offset of its own, and the first of an anchor adds the opacities of those behind it, in their order. Nobody
+// else writes there: no atomics, the same bits every time.
 
 namespace {
 
