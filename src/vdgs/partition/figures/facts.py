@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
@@ -92,7 +94,10 @@ class BlockFacts(NamedTuple):
 def block_facts(positions: Float[np.ndarray, "n 3"], visibility: Int[np.ndarray, " n"], blocks: Blocks) -> BlockFacts:
     """What a cut gives each block, without cameras; `visibility` are the V of the anchors."""
     owner = blocks.owner(places_of(positions))
-    seen = [visibility[owner == index] for index in range(len(blocks))]
+    # Sorted once: looked up for each block, thousands of blocks would take longer than their cut.
+    order = np.argsort(owner, kind="stable")
+    bounds = np.searchsorted(owner[order], np.arange(len(blocks) + 1))
+    seen = [visibility[order[begin:end]] for begin, end in pairwise(bounds)]
     nothing = (np.nan,) * 4
     of_views = np.array(
         [(v.mean(), *np.quantile(v, (0.05, 0.95)), v.std()) if len(v) else nothing for v in seen], np.float64
@@ -127,7 +132,7 @@ def _panel(
             )
             return 0.0
         right = np.nan_to_num(values.astype(np.float64))
-        axes.barh(rows, right, height=0.72, color=colours)
+        _bars(axes, rows, right, colours)
         text = [_number(float(value), index) for value in values]
     longest = float(np.nanmax(right, initial=0.0))
     if step is None:
@@ -141,13 +146,22 @@ def _panel(
     return longest
 
 
+def _bars(
+    axes: Axes, rows: Float[np.ndarray, " b"], ends: Float[np.ndarray, " b"], colours: list[tuple[float, float, float]]
+) -> None:
+    """Bars from 0 as one collection: thousands of patches take matplotlib minutes."""
+    low, high = rows - 0.36, rows + 0.36
+    corners = [(np.zeros_like(ends), low), (ends, low), (ends, high), (np.zeros_like(ends), high)]
+    polygons = np.stack([np.stack(each, -1) for each in corners], 1)
+    axes.add_collection(PolyCollection(list(polygons), facecolors=colours))
+
+
 def _rows(axes: Axes, rows: list[Float[np.ndarray, " _"]], named: bool, step: float) -> None:
     """Block numbers at the left, and the ink of one panel."""
     plain(axes)
     axes.patch.set_visible(False)  # captions reach into the next panel
-    places = np.concatenate(rows)
     numbers = [f"block {index}" for group in rows for index in range(len(group))]
-    axes.set_yticks(places, numbers if named else [])
+    axes.set_yticks(*((np.concatenate(rows), numbers) if named else ([],)))
     axes.tick_params(axis="y", length=0, labelsize=_font(step))
     axes.spines["left"].set_visible(False)
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,g}"))
