@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from vdgs.captures.capture import Capture
-from vdgs.errors import RunError, VdgsError
+from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.lpips import refuse_missing
 from vdgs.evaluation.of_run import evaluation_folder
 from vdgs.executors.choosing import refuse_unreachable
@@ -103,7 +103,9 @@ def _map(run: RunFolder, asked: RunRequest, console: Console) -> None:
         console.print(f"{run.path / 'maps'}: already drawn; nothing to do", highlight=False)
     else:
         try:
-            map_run(MapRequest(run.path, device=asked.device), console)
+            map_run(MapRequest(run.path, device=asked.device), console, _wish(asked))
+        except Stopped:
+            raise
         except VdgsError as error:
             console.print(f"[yellow]note[/] no maps: {escape(str(error))}", highlight=False)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,16 +16,19 @@ from rich.console import Console
 from rich.progress import track
 
 from vdgs.errors import VdgsError
+from vdgs.executors.errand import Wish
+from vdgs.executors.work import clear
 from vdgs.maps.geotiff import Layer, bounded_cache, cloud_optimised, require_rasterio, write_tile, writing
-from vdgs.maps.grid import Grid, extent_of, grid_over, ground_sampling, middle_of, refuse_elsewhere
 from vdgs.maps.pictures import Sheet, hillshade_png, preview_png
-from vdgs.maps.sharpening import Sharpener
-from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Surveyor, Tile, samples_for
+from vdgs.maps.pieces import drawn_elsewhere
+from vdgs.maps.plan import Plan
+from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Tile
 from vdgs.placing.placement import Placement
 from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import TrainedRun, open_run
+from vdgs.runs.opening import find_model, open_capture, open_run
 from vdgs.settings.requests import MapRequest
 from vdgs.storage.files import jsonable, read_record, write_json
+from vdgs.watching.interrupts import stop_if_asked
 
 ORTHOPHOTO, DSM, VISIBILITY = "orthophoto.tif", "dsm.tif", "visibility.tif"
 HILLSHADE, PREVIEW, FACTS = "hillshade.png", "preview.png", "map.json"
@@ -33,53 +36,68 @@ HILLSHADE, PREVIEW, FACTS = "hillshade.png", "preview.png", "map.json"
 _DISK_SHARE = 2.4
 
 
-def map_run(asked: MapRequest, console: Console) -> Path:
+def map_run(asked: MapRequest, console: Console, wish: Wish | None = None) -> Path:
     """Write the maps of a run, on a device that is chosen already; returns their folder.
 
-    Raises VdgsError, before anything is drawn, for a system, pixel size or extent that makes no map, a disk without
-    room, and where rasterio or pyproj is missing.
+    Tiles are drawn in this process, or in pieces where a `wish` sends them: the files are the same. Raises VdgsError,
+    before anything is drawn, for a system, pixel size or extent that makes no map, a disk without room, and where
+    rasterio or pyproj is missing; and what `Errand.run` raises.
     """
     require_rasterio()
+    began = time.monotonic()
+    if wish is not None and wish.sends:
+        facts, folder = _map_in_pieces(asked, wish, console)
+    else:
+        facts, folder = _map_here(asked, console)
+    console.print(
+        f"maps: {folder} ({facts['mapped_share']:.0%} of the pixels, {time.monotonic() - began:.0f} s)",
+        highlight=False,
+    )
+    return folder
+
+
+def _map_here(asked: MapRequest, console: Console) -> tuple[dict[str, Any], Path]:
+    """Draw in this process; what came out, and where."""
     run = open_run(asked.run, asked.model, asked.device)
-    capture = run.capture
-    placement = Placement.of(capture.ground, asked.crs)
-    scale = placement.similarity_at(middle_of(capture)).scale
-    finest = ground_sampling(capture, scale)
-    shown = extent_of(capture, placement)
-    grid = grid_over(asked.bbox or shown, finest if asked.gsd is None else asked.gsd)
-    refuse_elsewhere(grid, shown, placement)
-    sharpener = Sharpener(run.model, capture) if asked.sharp else None
-    surveyor = Surveyor.of(run.model, capture, placement, samples_for(grid.gsd, finest), sharpener)
-    surveyor.camera(grid.part(0, 0, 1, 1))  # a system that makes no map is refused here
-    folder = asked.output or run.folder.path / "maps"
-    for note in placement.notes:
-        console.print(f"[yellow]note[/] {note}", highlight=False)
-    _announce(grid, placement, folder, console)
-    started = time.monotonic()
-    layers = layers_of(placement)
-    with ExitStack() as ending, _staged(folder) as staging, bounded_cache():
-        if sharpener is not None:
-            ending.callback(sharpener.close)
-        facts = _facts(run, grid, placement, surveyor)
-        facts |= _draw(surveyor, grid, layers, staging, facts, console)
+    plan = Plan.of(asked, run.folder.path, run.name, run.status.model, run.capture)
+    _announce(plan, console)
+    clear(plan.folder)
+    with plan.surveyor(run.model) as surveyor:
+        return _write(plan, (surveyor.tile(part) for _, _, part in plan.grid.tiles()), console), plan.folder
+
+
+def _map_in_pieces(asked: MapRequest, wish: Wish, console: Console) -> tuple[dict[str, Any], Path]:
+    """Let pieces of the tiles be drawn elsewhere, and gather them one at a time. No model is in the memory of this
+    process."""
+    run = RunFolder(Path(os.path.abspath(asked.run)))  # as in `stages.train`: other machines may mount it so
+    found, capture = find_model(run, asked.model), open_capture(run)
+    plan = Plan.of(asked, run.path, found.name, found.stage.status().model, capture)
+    _announce(plan, console, in_pieces=True)
+    with drawn_elsewhere(plan, asked, run, found, wish, console) as tiles:
+        return _write(plan, tiles, console), plan.folder
+
+
+def _write(plan: Plan, tiles: Iterable[Tile], console: Console) -> dict[str, Any]:
+    """Make maps of all tiles, which come in their order: files that come to stand in the folder together. Returns
+    what map.json says."""
+    layers = layers_of(plan.placement)
+    with _staged(plan.folder) as staging, bounded_cache():
+        facts = _facts(plan)
+        facts |= _draw(plan, tiles, layers, staging, facts, console)
         if not facts["mapped_share"]:
             raise VdgsError(
-                f"{folder}: the {run.name} model shows nothing solid there, or no training photograph looks there. "
-                "Give another --bbox or leave it out."
+                f"{plan.folder}: the {plan.model} model shows nothing solid there, or no training photograph looks "
+                "there. Give another --bbox or leave it out."
             )
         for layer in layers:
             rough = staging / f"rough-{layer.name}"
             cloud_optimised(rough, staging / layer.name, layer)
             rough.unlink()
-        sheet = Sheet(run.folder.path.name, grid, placement, facts)
-        hillshade_png(staging / DSM, staging / HILLSHADE, grid)
+        sheet = Sheet(plan.run_name, plan.grid, plan.placement, facts)
+        hillshade_png(staging / DSM, staging / HILLSHADE, plan.grid)
         preview_png(staging / ORTHOPHOTO, staging / DSM, staging / VISIBILITY, staging / PREVIEW, sheet)
         write_json(staging / FACTS, jsonable(facts))
-    console.print(
-        f"maps: {folder} ({facts['mapped_share']:.0%} of the pixels, {time.monotonic() - started:.0f} s)",
-        highlight=False,
-    )
-    return folder
+    return facts
 
 
 def is_mapped(run: RunFolder) -> bool:
@@ -105,10 +123,15 @@ def layers_of(placement: Placement) -> tuple[Layer, Layer, Layer]:
     )  # fmt: skip
 
 
-def _announce(grid: Grid, placement: Placement, folder: Path, console: Console) -> None:
+def _announce(plan: Plan, console: Console, in_pieces: bool = False) -> None:
     """Say how large the map will be; raise VdgsError where the disk has no room for it."""
-    pixels = grid.width * grid.height
-    needed = int(_DISK_SHARE * pixels * sum(layer.bytes_per_pixel for layer in layers_of(placement))) + 5_000_000
+    grid, placement, folder = plan.grid, plan.placement, plan.folder
+    for note in placement.notes:
+        console.print(f"[yellow]note[/] {note}", highlight=False)
+    # What pieces have drawn lies beside it until all is gathered.
+    share = _DISK_SHARE + 1 if in_pieces else _DISK_SHARE
+    needed = int(share * grid.width * grid.height * sum(layer.bytes_per_pixel for layer in layers_of(placement)))
+    needed += 5_000_000
     existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
     free = shutil.disk_usage(existing).free
     across, along = grid.width * grid.gsd, grid.height * grid.gsd
@@ -125,22 +148,25 @@ def _announce(grid: Grid, placement: Placement, folder: Path, console: Console) 
 
 
 def _draw(
-    surveyor: Surveyor, grid: Grid, layers: tuple[Layer, ...], staging: Path, facts: dict[str, Any], console: Console
-) -> dict[str, Any]:
-    """Draw all tiles into files beside the final ones; what came out. One tile is in memory at a time."""
+    plan: Plan, tiles: Iterable[Tile], layers: tuple[Layer, ...], staging: Path, facts: dict[str, Any],
+    console: Console,
+) -> dict[str, Any]:  # fmt: skip
+    """Put all tiles into files beside the final ones; what came out. One tile is in memory at a time."""
+    grid = plan.grid
     tags = {"CRS_NAME": facts["crs_name"], "HEIGHTS": facts["heights"], "MODEL": facts["model"],
             "SOFTWARE": facts["software"]}  # fmt: skip
     mapped, poorly, low, high = 0, 0, np.inf, -np.inf
     with ExitStack() as open_files:
         files = [
-            open_files.enter_context(writing(staging / f"rough-{layer.name}", layer, grid, surveyor.placement, tags))
+            open_files.enter_context(writing(staging / f"rough-{layer.name}", layer, grid, plan.placement, tags))
             for layer in layers
         ]
-        tiles = track(
-            grid.tiles(), "drawing", total=grid.tile_count(), console=console, disable=not console.is_terminal
-        )
-        for column, row, part in tiles:
-            tile = surveyor.tile(part)
+        shown_tiles = track(
+            zip(grid.tiles(), tiles, strict=True), "drawing", total=grid.tile_count(), console=console,
+            disable=not console.is_terminal,
+        )  # fmt: skip
+        for (column, row, _), tile in shown_tiles:
+            stop_if_asked()
             shown = tile.alpha > 0
             if shown.any():
                 mapped += int(shown.sum())
@@ -160,16 +186,17 @@ def _bands(tile: Tile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.moveaxis(coloured, -1, 0), tile.heights[None], tile.visibility[None]
 
 
-def _facts(run: TrainedRun, grid: Grid, placement: Placement, surveyor: Surveyor) -> dict[str, Any]:
+def _facts(plan: Plan) -> dict[str, Any]:
     from vdgs import __version__
 
+    grid, placement, capture = plan.grid, plan.placement, plan.above.capture
     return {
-        "software": f"vdgs {__version__}", "model": run.name, "model_identity": run.status.model,
+        "software": f"vdgs {__version__}", "model": plan.model, "model_identity": plan.model_identity,
         "crs": placement.crs, "crs_name": placement.name,
-        "unit": placement.unit, "heights": placement.heights, "georeference": run.capture.ground.how,
+        "unit": placement.unit, "heights": placement.heights, "georeference": capture.ground.how,
         "gsd": grid.gsd, "width": grid.width, "height": grid.height, "bounds": list(grid.bounds),
-        "samples_per_pixel": surveyor.samples**2, "sharpened": surveyor.sharpener is not None,
-        "training_cameras": len(run.capture.train_views),
+        "samples_per_pixel": plan.samples**2, "sharpened": plan.sharp,
+        "training_cameras": len(capture.train_views),
         "notes": list(placement.notes),
     }  # fmt: skip
 

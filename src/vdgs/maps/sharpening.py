@@ -8,6 +8,7 @@ place: the scene as that photograph shows it is no nearer, and not of quite anot
 from __future__ import annotations
 
 from collections import OrderedDict
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -31,6 +32,21 @@ _STRAIGHT = 24
 _ALIKE = 0.08
 #: Detail is finer than this many pixels of the map; photographs fade out over so many of theirs at their borders.
 _BLUR_PX, _BORDER_PX = 6.0, 12.0
+
+
+class Held(NamedTuple):
+    """What a sharpener keeps between tiles, at most (bytes)."""
+
+    pictures: int = 0
+    depths: int = 0
+
+
+def held_bytes(sharp: bool, capture: Capture) -> Held:
+    """What drawing keeps of photographs, where detail is taken from them."""
+    if not sharp:
+        return Held()
+    pixels = max(view.camera.width * view.camera.height for view in capture.train_views)
+    return Held(_BUDGET_BYTES, 4 * _KEPT_DEPTHS * pixels)
 
 
 class Sharpener:

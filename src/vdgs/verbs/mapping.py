@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
+from vdgs.settings.executors import ExecutorOptions
+from vdgs.settings.ranges import WORKERS, Range
 from vdgs.settings.requests import MapRequest
 from vdgs.verbs.shared import open_console, parse, use_device, use_threads
 
@@ -20,12 +23,27 @@ class MapArguments(MapRequest):
 
     run: Positional[Path]
     """Run folder."""
+    jobs: Annotated[int, WORKERS] = 0
+    """Pieces of the tiles drawn at once, each in a process of its own; 0: on this machine one process draws all, a
+    cluster as many as it has room for."""
+    piece: Annotated[int | None, Range(0, 10_000)] = None
+    """Only draw this piece of the tiles, in this process: what is sent out."""
+    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def map(arguments: list[str]) -> None:
     asked = parse(MapArguments, arguments, "vdgs map")
-    from vdgs.maps.mapping import map_run
-
     device = use_device(asked.device)
     use_threads(asked.threads)
-    map_run(replace(asked, device=device), open_console())
+    if asked.piece is not None:
+        from vdgs.executors.parent import stop_when_parent_dies
+        from vdgs.maps.pieces import map_piece
+
+        stop_when_parent_dies()
+        map_piece(replace(asked, device=device), asked.piece, open_console())
+        return
+    from vdgs.executors.errand import Wish
+    from vdgs.maps.mapping import map_run
+
+    asked.where.check()
+    map_run(replace(asked, device=device), open_console(), Wish(asked.where, asked.jobs, device=device))

@@ -1,0 +1,63 @@
+"""What is to be drawn before anything is: the pixels of a map, the cameras above them, and of which model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from vdgs.captures.capture import Capture
+from vdgs.maps.grid import Grid, extent_of, grid_over, ground_sampling, middle_of, refuse_elsewhere
+from vdgs.maps.overhead import Overhead
+from vdgs.maps.sharpening import Sharpener
+from vdgs.maps.tiles import Surveyor, samples_for
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.placing.placement import Placement
+from vdgs.settings.requests import MapRequest
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A map that is to be drawn."""
+
+    folder: Path
+    """Where its files go."""
+    run_name: str
+    model: str
+    """Which model, in a word; `model_identity` tells it from every other."""
+    model_identity: str | None
+    above: Overhead
+    grid: Grid
+    samples: int
+    """Samples per pixel, each way."""
+    sharp: bool
+    """Whether detail is taken from the photographs."""
+
+    @staticmethod
+    def of(asked: MapRequest, run: Path, model: str, model_identity: str | None, capture: Capture) -> Plan:
+        """The map that is asked for of a run folder. Raises VdgsError for a system, pixel size or extent that makes
+        none."""
+        placement = Placement.of(capture.ground, asked.crs)
+        finest = ground_sampling(capture, placement.similarity_at(middle_of(capture)).scale)
+        shown = extent_of(capture, placement)
+        grid = grid_over(asked.bbox or shown, finest if asked.gsd is None else asked.gsd)
+        refuse_elsewhere(grid, shown, placement)
+        above = Overhead.of(capture, placement)
+        above.camera(grid.part(0, 0, 1, 1))  # a system that makes no map is refused here
+        folder = asked.output or run / "maps"
+        return Plan(folder, run.name, model, model_identity, above, grid, samples_for(grid.gsd, finest), asked.sharp)
+
+    @property
+    def placement(self) -> Placement:
+        return self.above.placement
+
+    @contextmanager
+    def surveyor(self, model: AnchorModel) -> Iterator[Surveyor]:
+        """What draws its tiles."""
+        sharpener = Sharpener(model, self.above.capture) if self.sharp else None
+        try:
+            yield Surveyor(model, self.above, self.samples, sharpener)
+        finally:
+            if sharpener is not None:
+                sharpener.close()
