@@ -71,6 +71,21 @@ def compiled_once(compiled_code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(cache.VARIABLE, str(compiled_code))
 
 
+@pytest.fixture(scope="session")
+def uncut(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with a coarse model of fifteen photographs, and five others to test with. Not to be changed: others copy
+    it (`cluster_support.copy_run`)."""
+    from captures_support import tiny_scene, write_colmap
+    from cli_support import vdgs
+    from cluster_support import COARSE
+
+    folder = tmp_path_factory.mktemp("uncut")
+    write_colmap(folder / "capture", tiny_scene(columns=5, rows=4))
+    done = vdgs("coarse", folder / "capture", "--output", folder / "coarse", *COARSE, "--test-every", "4")
+    assert done.returncode == 0, done.stderr + done.stdout
+    return folder / "coarse"
+
+
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     """What `-n auto` means: no workers (0) where only some files were asked for, for they take seconds to start."""
     if any(argument.partition("::")[0].endswith(".py") for argument in config.args):

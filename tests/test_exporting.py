@@ -17,7 +17,7 @@ from merging_support import camera_above, model_at
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
 from vdgs.errors import VdgsError
-from vdgs.export import exporting
+from vdgs.export import exporting, here
 from vdgs.export.baking import survey
 from vdgs.export.exporting import RECORD, export_run
 from vdgs.export.formats import registry
@@ -112,7 +112,7 @@ def test_a_frame_and_back_is_where_it_was():
     pytest.importorskip("pyproj")
     model = scattered()
     seen = survey(model, [view.camera for view in capture_at(None).train_views])
-    gaussians = next(iter(exporting.bake(seen, np.flatnonzero(seen.pixels > 0), 3)))
+    gaussians = next(iter(here.bake(seen, np.flatnonzero(seen.pixels > 0), 3)))
     for crs in ("EPSG:32632", "enu", "local"):
         frame = frame_of(ground(PLACE), crs, np.zeros(3))
         back = frame.to_ground(frame.place(gaussians))
@@ -154,7 +154,7 @@ def test_boxes_blocks_and_numbers_choose(export, tmp_path: Path):
 def test_what_cannot_be_written_is_said_before_anything_is_baked(
     export, tmp_path: Path, monkeypatch, names, asked, said
 ):
-    monkeypatch.setattr(exporting, "bake", lambda *_: pytest.fail("baked"))
+    monkeypatch.setattr(here, "bake", lambda *_: pytest.fail("baked"))
     with pytest.raises(VdgsError, match=said):
         export(*names, **asked)
     assert not list(tmp_path.glob("*.ply"))
@@ -174,7 +174,7 @@ def moved(model: AnchorModel, x: torch.Tensor) -> AnchorModel:
 
 
 def test_a_scene_too_wide_for_a_format_is_refused_before_it_is_baked(export, monkeypatch):
-    monkeypatch.setattr(exporting, "bake", lambda *_: pytest.fail("baked"))
+    monkeypatch.setattr(here, "bake", lambda *_: pytest.fail("baked"))
     looking_down_at(monkeypatch, -3000.0, 3000.0)
     sides = torch.where(torch.arange(200) % 2 == 0, 3000.0, -3000.0)
     with pytest.raises(VdgsError, match="2048"):
@@ -200,9 +200,9 @@ def test_a_file_goes_without_the_few_that_lie_beyond_its_reach(export, tmp_path,
     k = model.anchors.offsets.shape[1]
     there = slice(7 * k, 8 * k)
     pixels[there] = 0.01
-    monkeypatch.setattr(exporting, "survey", lambda *_: replace(real, pixels=pixels))
-    monkeypatch.setattr(exporting, "bake", lambda seen, kept, degree, _: iter([random_gaussians(len(kept), degree)]))
-    monkeypatch.setattr(exporting, "_improved", lambda *_: None)
+    monkeypatch.setattr(here, "survey", lambda *_: replace(real, pixels=pixels))
+    monkeypatch.setattr(here, "bake", lambda seen, kept, degree, _: iter([random_gaussians(len(kept), degree)]))
+    monkeypatch.setattr(here, "refit", lambda *_: None)
     record = export("all.ply", "near.spz", model=model)
     assert [file["gaussians"] for file in record["files"]] == [record["gaussians"], record["gaussians"] - k]
     assert len(registry.read(tmp_path / "near.spz")) == record["gaussians"] - k
@@ -215,7 +215,7 @@ def test_a_disk_that_fills_leaves_nothing(export, tmp_path: Path, monkeypatch):
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(exporting, "spooled", full)
+    monkeypatch.setattr(here, "spooled", full)
     with pytest.raises(VdgsError, match="No space left"):
         export("a.ply")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -22,6 +22,7 @@ from vdgs.captures.capture import Capture, GroundFrame, View
 from vdgs.errors import VdgsError
 from vdgs.maps import mapping, tiles
 from vdgs.maps.grid import Grid, extent_of, grid_over, ground_sampling
+from vdgs.maps.overhead import Overhead
 from vdgs.maps.pictures import hillshade, round_length
 from vdgs.maps.sharpening import Sharpener
 from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Surveyor, samples_for
@@ -56,6 +57,10 @@ def model_of(places: np.ndarray) -> AnchorModel:
         log_scales=torch.full_like(anchors.log_scales, float(np.log(SPACING))),
     )
     return replace(plane, anchors=anchors)
+
+
+def surveyor_of(model: AnchorModel, capture: Capture, placement: Placement, *given, **named) -> Surveyor:
+    return Surveyor(model, Overhead.of(capture, placement), *given, **named)
 
 
 GROUND, TOP = surface(-10, -10, 10, 10, 0.0), surface(*HOUSE, ROOF)
@@ -105,7 +110,7 @@ def test_every_place_falls_on_its_pixel_to_a_tenth(crs, away):
     exact = placement.places(places)
     x, y = placement.places(centre[None])[0, :2]
     grid = Grid(float(x) - 10.24, float(y) + 10.24, 0.04, 512, 512)
-    pixels, _ = Surveyor.of(model_of(places), capture, placement).camera(grid).project(places)
+    pixels, _ = Overhead.of(capture, placement).camera(grid).project(places)
     expected = np.stack([(exact[:, 0] - grid.left) / grid.gsd, (grid.top - exact[:, 1]) / grid.gsd], axis=1)
     assert np.abs(pixels - expected).max() < 0.1
 
@@ -155,7 +160,7 @@ def test_files_are_cloud_optimised_and_say_what_they_are(house, make):
 def test_walls_do_not_smear(house, samples):
     """No pixel has a height between ground and roof: not at an edge, not where samples are put together."""
     capture, model = house
-    surveyor = Surveyor.of(model, capture, Placement.of(capture.ground, "local"), samples)
+    surveyor = surveyor_of(model, capture, Placement.of(capture.ground, "local"), samples)
     tile = surveyor.tile(Grid(-4.0, 5.0, 0.1, 130, 100))
     heights = tile.heights[tile.alpha > 0]
     assert tile.alpha.mean() > 250
@@ -167,8 +172,8 @@ def test_walls_do_not_smear(house, samples):
 
 def test_tiles_show_what_one_picture_shows(house):
     capture, model = house
-    surveyor = Surveyor.of(model, capture, Placement.of(capture.ground))
-    x0, y0, x1, y1 = extent_of(capture, surveyor.overhead.placement)
+    surveyor = surveyor_of(model, capture, Placement.of(capture.ground))
+    x0, y0, x1, y1 = extent_of(capture, surveyor.above.placement)
     grid = grid_over((x0, y0, x1, y1), 0.2)
     whole = surveyor.tile(grid)
     for column, row, part in grid.tiles(40):
@@ -182,7 +187,7 @@ def test_tiles_show_what_one_picture_shows(house):
 
 def test_visibility_counts_cameras_and_what_none_sees_is_blank(house):
     capture, model = house
-    surveyor = Surveyor.of(model, capture, Placement.of(capture.ground, "local"))
+    surveyor = surveyor_of(model, capture, Placement.of(capture.ground, "local"))
     grid = Grid(-10.0, 10.0, 0.25, 80, 80)
     tile = surveyor.tile(grid)
     x, y = np.meshgrid(grid.left + (np.arange(80) + 0.5) * 0.25, grid.top - (np.arange(80) + 0.5) * 0.25)
@@ -202,11 +207,11 @@ def test_what_hangs_as_high_as_cameras_is_not_in_the_map_and_a_tower_is():
     capture = capture_of(np.concatenate([GROUND, TOP, tower]))
     model = model_of(np.concatenate([GROUND, TOP, tower, veil]))
     tower_seen = replace(capture, views=(*capture.views, replace(capture.views[0], camera=_above(5.0, 5.0, 60.0))))
-    surveyor = Surveyor.of(model, tower_seen, Placement.of(capture.ground, "local"))
+    surveyor = surveyor_of(model, tower_seen, Placement.of(capture.ground, "local"))
     grid = Grid(-3.0, 6.5, 0.25, 40, 40)
     heights = surveyor.tile(grid).heights
     assert heights.max() == pytest.approx(24.0, abs=0.1)
-    low = Surveyor.of(model, capture, Placement.of(capture.ground, "local")).tile(Grid(-3.0, 0.0, 0.25, 12, 12))
+    low = surveyor_of(model, capture, Placement.of(capture.ground, "local")).tile(Grid(-3.0, 0.0, 0.25, 12, 12))
     assert low.heights[low.alpha > 0].max() < 1.0
 
 
@@ -332,8 +337,8 @@ def test_detail_comes_from_the_photographs_where_they_see_the_place(house, tmp_p
     capture = photographed(capture, model, tmp_path, woven)
     grid = Grid(-3.0, 5.0, 0.08, 120, 100)
     placement, sharpener = Placement.of(capture.ground, "local"), Sharpener(model, capture)
-    plain = Surveyor.of(model, capture, placement).tile(grid)
-    sharp = Surveyor.of(model, capture, placement, sharpener=sharpener).tile(grid)
+    plain = surveyor_of(model, capture, placement).tile(grid)
+    sharp = surveyor_of(model, capture, placement, sharpener=sharpener).tile(grid)
     sharpener.close()
     np.testing.assert_array_equal(sharp.heights, plain.heights)
     gained = (sharp.colours.astype(float) - plain.colours).mean(axis=-1) / 255

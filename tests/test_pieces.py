@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from captures_support import tiny_scene, write_colmap
-from cli_support import begun, vdgs, wait_until
-from cluster_support import COARSE, alive, copy_run, evaluated, merge_run, train_here
+from cli_support import begun, do_tasks_here, vdgs, wait_until
+from cluster_support import alive, copy_run, evaluated, merge_run, train_here
 from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.by_block import BlockMetrics, SeamMetrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
@@ -26,7 +25,7 @@ from vdgs.executors.work import PieceWork, alone, at_work, spans_of
 from vdgs.runs.folder import StageFolder
 from vdgs.watching.interrupts import stop_if_asked, stop_requests
 
-pytestmark = pytest.mark.xdist_group("pieces")
+pytestmark = pytest.mark.xdist_group("pieces")  # one worker, which trains once
 
 
 @given(st.integers(1, 5000), st.integers(1, 5), st.integers(5, 40), st.integers(1, 30))
@@ -155,19 +154,9 @@ def test_pieces_of_other_work_go_unless_they_are_at_work(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def uncut(tmp_path_factory) -> Path:
-    """A run with a coarse model of ten photographs, and ten others to test with."""
-    folder = tmp_path_factory.mktemp("pieces")
-    write_colmap(folder / "capture", tiny_scene(columns=5, rows=4))
-    done = vdgs("coarse", folder / "capture", "--output", folder / "coarse", *COARSE, "--test-every", "2")
-    assert done.returncode == 0, done.stderr + done.stdout
-    return folder / "coarse"
-
-
-@pytest.fixture(scope="module")
-def merged(uncut) -> Path:
+def merged(uncut, tmp_path_factory) -> Path:
     """Cut into two blocks, trained and merged."""
-    run = copy_run(uncut, uncut.parent / "cut")
+    run = copy_run(uncut, tmp_path_factory.mktemp("merged") / "cut")
     done = vdgs("partition", run, "--blocks", "2", "--assignment.min-cameras", "3")
     assert done.returncode == 0, done.stderr + done.stdout
     return merge_run(train_here(run, run.parent / "local"), run.parent / "merged")
@@ -187,9 +176,9 @@ def measured(merged) -> dict[str, object]:
 
 def test_views_measured_in_pieces_are_those_of_one_process(merged, measured, tmp_path):
     run = copy_run(merged, tmp_path / "run")
-    done = vdgs("eval", run, "--jobs", "2")
+    done = vdgs("eval", run, "--jobs", "2", prepare=do_tasks_here)
     assert done.returncode == 0, done.stderr + done.stdout
-    assert "4 of 4 pieces done" in done.stdout
+    assert "2 of 2 pieces done" in done.stdout
     assert evaluated(run / "evaluation") == measured
     assert json.loads((run / "evaluation/metrics.json").read_text())["fps"] is None
     assert not (run / "evaluation/pieces").exists()
@@ -274,9 +263,9 @@ def test_what_a_piece_cannot_do_is_said_in_its_words(merged, tmp_path):
     weights = tmp_path / "none.pth"
     done = vdgs("eval", run, "--jobs", "2", "--lpips-weights", weights)
     assert done.returncode == 1
-    assert "4 of 4 pieces failed:" in done.stderr
-    assert done.stderr.count("none.pth") >= 4
+    assert "2 of 2 pieces failed:" in done.stderr
+    assert done.stderr.count("none.pth") >= 2
     assert "NN/output.log. The same command tries them again" in done.stderr
     done = vdgs("eval", run, "--piece", "7")
     assert done.returncode == 1
-    assert "--piece 7: there are 4 pieces, numbered from 0" in done.stderr
+    assert "--piece 7: there are 2 pieces, numbered from 0" in done.stderr

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import shutil
 import signal
 import sys
@@ -147,15 +148,19 @@ def test_views_are_measured_on_nodes_for_whatever_driver_lives(local, cluster, t
     assert evaluated(run / "evaluation") == evaluated(here / "evaluation")
 
 
-def test_a_map_is_put_together_from_the_pieces_of_several_nodes(cut, cluster, tmp_path):
+def test_pieces_of_several_nodes_are_joined_to_the_files_of_one_process(uncut, cluster, tmp_path):
+    """Training views and tiles of a map: two pieces each, two nodes."""
     pytest.importorskip("rasterio")
-    run, here = copy_run(cut, tmp_path / "run"), copy_run(cut, tmp_path / "here/run")  # previews name the run
-    asked = ("--gsd", "0.001", "--bbox", "-1.5", "0", "1.5", "0.05", "--crs", "local")  # six small tiles
-    assert vdgs("map", here, *asked).returncode == 0
-    done = vdgs("map", run, *asked, "--executor", "ray", "--address", cluster.address, environment=cluster.token)
-    assert done.returncode == 0, done.stderr + done.stdout
-    assert "2 of 2 pieces done" in done.stdout
-    assert evaluated(run / "maps") == evaluated(here / "maps")
+    here, there = (copy_run(uncut, tmp_path / name / "run") for name in ("here", "there"))
+    on_nodes = ("--executor", "ray", "--address", cluster.address)
+    for command in (("eval", "--views", "training"), ("map", "--gsd", "0.02")):
+        verb, *options = command
+        one = vdgs(verb, here, *options)
+        pieces = vdgs(verb, there, *options, *on_nodes, environment=cluster.token)
+        assert one.returncode == pieces.returncode == 0, one.stderr + pieces.stderr + pieces.stdout
+        assert re.search(r"([2-9]) of \1 pieces done", pieces.stdout)
+    for folder in ("coarse/evaluation_training", "maps"):
+        assert evaluated(there / folder) == evaluated(here / folder)
 
 
 def test_a_node_that_joins_late_and_cannot_work_on_the_run_is_named_and_avoided(cut, local, cluster, tmp_path):

@@ -124,6 +124,8 @@ def remove(work: PieceWork) -> None:
 
 
 def _refuse_at_work(work: Path) -> None:
+    if is_locked(work):
+        raise RunError(f"{work}: another vdgs process gathers pieces there. Wait for it or stop it.")
     for folder in work.iterdir():
         if is_locked(folder):
             raise RunError(

@@ -47,12 +47,18 @@ class Shown:
 
 
 @dataclass(frozen=True, eq=False)
-class Survey:
+class Seen:
     """What the cameras see of a model."""
 
     model: AnchorModel
     cameras: Sequence[Camera]
     shown: Sequence[Shown]
+
+
+@dataclass(frozen=True, eq=False)
+class Survey(Seen):
+    """The same, and what comes of it in all."""
+
     #: Pixels that each of the g = n · k Gaussians makes, over all views.
     pixels: Float[np.ndarray, " g"]
 
@@ -65,7 +71,7 @@ def survey(model: AnchorModel, cameras: Sequence[Camera], after_view: Callable[[
     k = model.anchors.offsets.shape[1]
     pixels, shown = np.zeros(len(model.anchors) * k, np.float32), []
     for camera in cameras:
-        view = _shown(model, camera, k)
+        view = shown_in(model, camera)
         pixels[view.gaussians.numpy()] += view.pixels.numpy()
         shown.append(view)
         after_view()
@@ -73,7 +79,9 @@ def survey(model: AnchorModel, cameras: Sequence[Camera], after_view: Callable[[
 
 
 @torch.no_grad()
-def _shown(model: AnchorModel, camera: Camera, k: int) -> Shown:
+def shown_in(model: AnchorModel, camera: Camera) -> Shown:
+    """Draw one view, on the device of the model: what it shows."""
+    k = model.anchors.offsets.shape[1]
     rows, splats = decode_view(model, camera)
     kernels = choose(rows.device)
     _, pullback = kernels.rasterise_vjp(splats, splats.means_px.new_zeros(3), camera.width, camera.height)
@@ -84,21 +92,35 @@ def _shown(model: AnchorModel, camera: Camera, k: int) -> Shown:
     return Shown(gaussians[kept].to("cpu", torch.int32), pixels[kept].cpu())
 
 
+def part_count(model: AnchorModel) -> int:
+    """Into how many parts the anchors of a model are cut, to be fitted apart from each other."""
+    return -(-len(model.anchors) // ANCHORS_AT_ONCE)
+
+
+def part_size(model: AnchorModel) -> int:
+    """How many Gaussians the anchors of a part spawn."""
+    return ANCHORS_AT_ONCE * model.anchors.offsets.shape[1]
+
+
+def part_of(kept: Int[np.ndarray, " m"], model: AnchorModel, number: int) -> Int[np.ndarray, " p"]:
+    """Those of the given Gaussians (ascending) that a part of the anchors spawns."""
+    step = part_size(model)
+    low, high = np.searchsorted(kept, [number * step, (number + 1) * step])
+    return kept[low:high]
+
+
 def bake(
-    seen: Survey, kept: Int[np.ndarray, " m"], degree: int, after_part: Callable[[int], None] = lambda done: None
+    seen: Seen, kept: Int[np.ndarray, " m"], degree: int, after_part: Callable[[int], None] = lambda done: None
 ) -> Iterator[Gaussians]:
     """The Gaussians of the given numbers (ascending, each shown by some view), part by part in this order.
 
     `degree` is that of the spherical harmonics, 0 to 3. `after_part` is told how many Gaussians are done.
     """
-    k = seen.model.anchors.offsets.shape[1]
-    anchors = len(seen.model.anchors)
     kept = np.ascontiguousarray(kept)
-    firsts = range(0, anchors, ANCHORS_AT_ONCE)
-    bounds = [np.searchsorted(kept, [first * k, min(first + ANCHORS_AT_ONCE, anchors) * k]) for first in firsts]
-    parts = [kept[low:high] for low, high in bounds if low < high]
+    cut = (part_of(kept, seen.model, number) for number in range(part_count(seen.model)))
+    parts = [part for part in cut if len(part)]
     done = 0
-    for gaussians in in_order(lambda wanted: _fitted(_gathered(seen, wanted), wanted, seen, degree), parts):
+    for gaussians in in_order(lambda wanted: fitted(seen, wanted, degree), parts):
         yield gaussians
         done += len(gaussians)
         after_part(done)
@@ -118,7 +140,7 @@ class _Pairs:
     quaternions: Float[Tensor, "p 4"]
 
 
-def _gathered(seen: Survey, wanted: Int[np.ndarray, " m"]) -> _Pairs:
+def _gathered(seen: Seen, wanted: Int[np.ndarray, " m"]) -> _Pairs:
     """How the cameras see the wanted Gaussians, which lie close together in number."""
     columns: list[tuple[Tensor, ...]] = []
     numbers = torch.from_numpy(wanted)
@@ -154,7 +176,9 @@ def _seen_from(model: AnchorModel, gaussians: Tensor, camera: Camera) -> tuple[T
     return torch.nn.functional.normalize(rays, dim=1), colours, opacities, scales.log(), quaternions
 
 
-def _fitted(pairs: _Pairs, wanted: Int[np.ndarray, " m"], seen: Survey, degree: int) -> Gaussians:
+def fitted(seen: Seen, wanted: Int[np.ndarray, " m"], degree: int) -> Gaussians:
+    """The Gaussians of the given numbers: ascending, close together, each shown by some view."""
+    pairs = _gathered(seen, wanted)
     anchors, k = seen.model.anchors, seen.model.anchors.offsets.shape[1]
     coefficients = fit_harmonics(pairs.directions, pairs.colours, pairs.pixels, pairs.starts, degree)
     opacities = _means(pairs.opacities[:, None], pairs)[:, 0].clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)

@@ -21,7 +21,7 @@ from jaxtyping import Float, Float16, Int, Int32
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.export.baking import ANCHORS_AT_ONCE, LEAST_PIXELS
+from vdgs.export.baking import LEAST_PIXELS, part_count, part_size
 from vdgs.export.formats.spool import Spooled
 from vdgs.export.harmonics_fit import fit_harmonics
 from vdgs.export.working import in_order
@@ -31,6 +31,9 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.gaussians import Gaussians
 from vdgs.model.render import decode_view, draw
 from vdgs.model.spherical_harmonics import view_colours
+
+#: How often colours are fitted again to what pictures lack (chosen on validation views, docs/export.md).
+REFITS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +81,15 @@ def refit(baked: Baked, cameras: Sequence[Camera], after_view: Callable[[], None
     for camera in cameras:
         views.append(lacking(baked, camera))
         after_view()
-    count = len(baked.spool.means)
-    step = ANCHORS_AT_ONCE * baked.model.anchors.offsets.shape[1]
-    parts = [(first, min(first + step, count)) for first in range(0, count, step)]
-    for _ in in_order(lambda part: _add(baked, cameras, views, *part), parts):
+    parts = [rows_of(baked, number) for number in range(part_count(baked.model))]
+    for _ in in_order(lambda rows: baked.spool.add_colours(*added(baked, cameras, views, rows)), parts):
         pass
+
+
+def rows_of(baked: Baked, number: int) -> range:
+    """The rows of the spool that a part fits; none of the last parts where few of all Gaussians are baked."""
+    step, count = part_size(baked.model), len(baked.spool.means)
+    return range(min(number * step, count), min((number + 1) * step, count))
 
 
 @torch.no_grad()
@@ -116,21 +123,22 @@ def _directions(means: Float[Tensor, "m 3"], camera: Camera) -> Float[Tensor, "m
     return torch.nn.functional.normalize(means - torch.from_numpy(camera.position.astype(np.float32)), dim=1)
 
 
-def _add(baked: Baked, cameras: Sequence[Camera], views: Sequence[Lacking], first: int, last: int) -> None:
-    """Fit, for the Gaussians from `first` to before `last`."""
+def added(
+    baked: Baked, cameras: Sequence[Camera], views: Sequence[Lacking], rows: range
+) -> tuple[Int[np.ndarray, " c"], Float[Tensor, "c f 3"]]:
+    """What is to be added to the colours of the Gaussians of some rows: of which, ascending, and how much."""
     means = torch.from_numpy(baked.spool.means)
     columns: list[tuple[Tensor, ...]] = []
     for camera, view in zip(cameras, views, strict=True):
-        low, high = np.searchsorted(view.gaussians.numpy(), [first, last])
+        low, high = np.searchsorted(view.gaussians.numpy(), [rows.start, rows.stop])
         if low < high:
             here = view.gaussians[low:high].long()
             directions = _directions(means[here], camera)
             columns.append((here, directions, view.colours[low:high].float(), view.pixels[low:high].float()))
     if not columns:
-        return
+        return np.zeros(0, np.int64), torch.zeros(0, (baked.spool.degree + 1) ** 2, 3)
     numbers, *rest = (torch.cat(column) for column in zip(*columns, strict=True))
     order = numbers.sort(stable=True)
     changed, starts = np.unique(order.values.numpy(), return_index=True)
     directions, colours, pixels = (column[order.indices] for column in rest)
-    found = fit_harmonics(directions, colours + 0.5, pixels, starts, baked.spool.degree)
-    baked.spool.add_colours(changed, found)
+    return changed, fit_harmonics(directions, colours + 0.5, pixels, starts, baked.spool.degree)

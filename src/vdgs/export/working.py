@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
+
+import torch
 
 from vdgs.kernels import threads
 
@@ -16,9 +19,12 @@ MOST = 8
 
 
 def in_order(work: Callable[[P], R], parts: Iterable[P]) -> Iterator[R]:
-    """work(part) of every part, in their order, on as many threads as kernels use."""
+    """work(part) of every part, in their order, on as many threads as kernels use.
+
+    Each part has one thread of torch, so that the last bits of a product do not depend on how many there are.
+    """
     workers = max(1, min(MOST, threads()))
-    with ThreadPoolExecutor(workers) as pool:
+    with _one_thread_of_torch(), ThreadPoolExecutor(workers) as pool:
         under_way: deque[Future[R]] = deque()
         try:
             for part in parts:
@@ -30,3 +36,13 @@ def in_order(work: Callable[[P], R], parts: Iterable[P]) -> Iterator[R]:
         finally:
             for each in under_way:
                 each.cancel()
+
+
+@contextmanager
+def _one_thread_of_torch() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -53,10 +53,13 @@ class Grid:
 
     def tiles(self, side: int = TILE_PX) -> Iterator[tuple[int, int, Grid]]:
         """Column, row and pixels of every tile, row by row; the last ones are smaller."""
-        for row in range(0, self.height, side):
-            for column in range(0, self.width, side):
-                size = min(side, self.width - column), min(side, self.height - row)
-                yield column, row, self.part(column, row, *size)
+        return (self.tile(number, side) for number in range(self.tile_count(side)))
+
+    def tile(self, number: int, side: int = TILE_PX) -> tuple[int, int, Grid]:
+        """The tile of this number among `tiles`, from 0."""
+        row, column = (side * place for place in divmod(number, -(-self.width // side)))
+        size = min(side, self.width - column), min(side, self.height - row)
+        return column, row, self.part(column, row, *size)
 
     def tile_count(self, side: int = TILE_PX) -> int:
         return -(-self.width // side) * -(-self.height // side)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,17 +17,18 @@ from rich.progress import track
 
 from vdgs.errors import VdgsError
 from vdgs.executors.errand import Wish
-from vdgs.executors.work import alone, remove
+from vdgs.executors.work import clear
 from vdgs.maps.geotiff import Layer, bounded_cache, cloud_optimised, require_rasterio, write_tile, writing
 from vdgs.maps.pictures import Sheet, hillshade_png, preview_png
-from vdgs.maps.pieces import draw_pieces, tiles_of, work_of
-from vdgs.maps.plan import MapPlan, plan_map
+from vdgs.maps.pieces import drawn_elsewhere
+from vdgs.maps.plan import Plan
 from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Tile
 from vdgs.placing.placement import Placement
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import find_model, open_capture, open_run
 from vdgs.settings.requests import MapRequest
 from vdgs.storage.files import jsonable, read_record, write_json
+from vdgs.watching.interrupts import stop_if_asked
 
 ORTHOPHOTO, DSM, VISIBILITY = "orthophoto.tif", "dsm.tif", "visibility.tif"
 HILLSHADE, PREVIEW, FACTS = "hillshade.png", "preview.png", "map.json"
@@ -43,55 +44,60 @@ def map_run(asked: MapRequest, console: Console, wish: Wish | None = None) -> Pa
     rasterio or pyproj is missing; and what `Errand.run` raises.
     """
     require_rasterio()
+    began = time.monotonic()
     if wish is not None and wish.sends:
-        return _map_in_pieces(asked, wish, console)
-    run = open_run(asked.run, asked.model, asked.device)
-    plan = plan_map(asked, run.folder.path, run.capture, run.name, run.status.model or "")
-    _announce(plan, console)
-    with plan.surveyor(run.model) as surveyor:
-        tiles = (surveyor.tile(part) for _, _, part in plan.grid.tiles())
-        return _write(plan, tiles, console)
-
-
-def _map_in_pieces(asked: MapRequest, wish: Wish, console: Console) -> Path:
-    """As `map_run`, the tiles drawn elsewhere."""
-    run = RunFolder(Path(os.path.abspath(asked.run)))  # as in `stages.train`: other machines may mount it so
-    found = find_model(run, asked.model)
-    plan = plan_map(asked, run.path, open_capture(run), found.name, found.stage.status().model or "")
-    work = work_of(plan)
-    with alone(plan.folder, work.key):
-        _announce(plan, console, tiles_kept=True)
-        draw_pieces(plan, work, found, asked, wish, console)
-        folder = _write(plan, tiles_of(work), console)
-        remove(work)
+        facts, folder = _map_in_pieces(asked, wish, console)
+    else:
+        facts, folder = _map_here(asked, console)
+    console.print(
+        f"maps: {folder} ({facts['mapped_share']:.0%} of the pixels, {time.monotonic() - began:.0f} s)",
+        highlight=False,
+    )
     return folder
 
 
-def _write(plan: MapPlan, tiles: Iterator[Tile], console: Console) -> Path:
-    """The files of a map from its tiles, in the order of the grid; returns their folder."""
-    folder, started = plan.folder, time.monotonic()
+def _map_here(asked: MapRequest, console: Console) -> tuple[dict[str, Any], Path]:
+    """Draw in this process; what came out, and where."""
+    run = open_run(asked.run, asked.model, asked.device)
+    plan = Plan.of(asked, run.folder.path, run.name, run.status.model, run.capture)
+    _announce(plan, console)
+    clear(plan.folder)
+    with plan.surveyor(run.model) as surveyor:
+        return _write(plan, (surveyor.tile(part) for _, _, part in plan.grid.tiles()), console), plan.folder
+
+
+def _map_in_pieces(asked: MapRequest, wish: Wish, console: Console) -> tuple[dict[str, Any], Path]:
+    """Let pieces of the tiles be drawn elsewhere, and gather them one at a time. No model is in the memory of this
+    process."""
+    run = RunFolder(Path(os.path.abspath(asked.run)))  # as in `stages.train`: other machines may mount it so
+    found, capture = find_model(run, asked.model), open_capture(run)
+    plan = Plan.of(asked, run.path, found.name, found.stage.status().model, capture)
+    _announce(plan, console, in_pieces=True)
+    with drawn_elsewhere(plan, asked, run, found, wish, console) as tiles:
+        return _write(plan, tiles, console), plan.folder
+
+
+def _write(plan: Plan, tiles: Iterable[Tile], console: Console) -> dict[str, Any]:
+    """Make maps of all tiles, which come in their order: files that come to stand in the folder together. Returns
+    what map.json says."""
     layers = layers_of(plan.placement)
-    with _staged(folder) as staging, bounded_cache():
+    with _staged(plan.folder) as staging, bounded_cache():
         facts = _facts(plan)
-        facts |= _gather(plan, tiles, layers, staging, facts, console)
+        facts |= _draw(plan, tiles, layers, staging, facts, console)
         if not facts["mapped_share"]:
             raise VdgsError(
-                f"{folder}: the {plan.model} model shows nothing solid there, or no training photograph looks there. "
-                "Give another --bbox or leave it out."
+                f"{plan.folder}: the {plan.model} model shows nothing solid there, or no training photograph looks "
+                "there. Give another --bbox or leave it out."
             )
         for layer in layers:
             rough = staging / f"rough-{layer.name}"
             cloud_optimised(rough, staging / layer.name, layer)
             rough.unlink()
-        sheet = Sheet(plan.run.name, plan.grid, plan.placement, facts)
+        sheet = Sheet(plan.run_name, plan.grid, plan.placement, facts)
         hillshade_png(staging / DSM, staging / HILLSHADE, plan.grid)
         preview_png(staging / ORTHOPHOTO, staging / DSM, staging / VISIBILITY, staging / PREVIEW, sheet)
         write_json(staging / FACTS, jsonable(facts))
-    console.print(
-        f"maps: {folder} ({facts['mapped_share']:.0%} of the pixels, {time.monotonic() - started:.0f} s)",
-        highlight=False,
-    )
-    return folder
+    return facts
 
 
 def is_mapped(run: RunFolder) -> bool:
@@ -117,15 +123,15 @@ def layers_of(placement: Placement) -> tuple[Layer, Layer, Layer]:
     )  # fmt: skip
 
 
-def _announce(plan: MapPlan, console: Console, tiles_kept: bool = False) -> None:
-    """Say how large the map will be; raise VdgsError where the disk has no room for it, and its tiles where they are
-    kept until all are drawn."""
+def _announce(plan: Plan, console: Console, in_pieces: bool = False) -> None:
+    """Say how large the map will be; raise VdgsError where the disk has no room for it."""
     grid, placement, folder = plan.grid, plan.placement, plan.folder
     for note in placement.notes:
         console.print(f"[yellow]note[/] {note}", highlight=False)
-    share = _DISK_SHARE + (1.0 if tiles_kept else 0.0)
-    pixels = grid.width * grid.height
-    needed = int(share * pixels * sum(layer.bytes_per_pixel for layer in layers_of(placement))) + 5_000_000
+    # What pieces have drawn lies beside it until all is gathered.
+    share = _DISK_SHARE + 1 if in_pieces else _DISK_SHARE
+    needed = int(share * grid.width * grid.height * sum(layer.bytes_per_pixel for layer in layers_of(placement)))
+    needed += 5_000_000
     existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
     free = shutil.disk_usage(existing).free
     across, along = grid.width * grid.gsd, grid.height * grid.gsd
@@ -141,8 +147,8 @@ def _announce(plan: MapPlan, console: Console, tiles_kept: bool = False) -> None
         )
 
 
-def _gather(
-    plan: MapPlan, tiles: Iterator[Tile], layers: tuple[Layer, ...], staging: Path, facts: dict[str, Any],
+def _draw(
+    plan: Plan, tiles: Iterable[Tile], layers: tuple[Layer, ...], staging: Path, facts: dict[str, Any],
     console: Console,
 ) -> dict[str, Any]:  # fmt: skip
     """Put all tiles into files beside the final ones; what came out. One tile is in memory at a time."""
@@ -155,10 +161,12 @@ def _gather(
             open_files.enter_context(writing(staging / f"rough-{layer.name}", layer, grid, plan.placement, tags))
             for layer in layers
         ]
-        places = track(
-            grid.tiles(), "drawing", total=grid.tile_count(), console=console, disable=not console.is_terminal
-        )
-        for (column, row, _), tile in zip(places, tiles, strict=True):
+        shown_tiles = track(
+            zip(grid.tiles(), tiles, strict=True), "drawing", total=grid.tile_count(), console=console,
+            disable=not console.is_terminal,
+        )  # fmt: skip
+        for (column, row, _), tile in shown_tiles:
+            stop_if_asked()
             shown = tile.alpha > 0
             if shown.any():
                 mapped += int(shown.sum())
@@ -178,12 +186,12 @@ def _bands(tile: Tile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.moveaxis(coloured, -1, 0), tile.heights[None], tile.visibility[None]
 
 
-def _facts(plan: MapPlan) -> dict[str, Any]:
+def _facts(plan: Plan) -> dict[str, Any]:
     from vdgs import __version__
 
-    grid, placement, capture = plan.grid, plan.placement, plan.capture
+    grid, placement, capture = plan.grid, plan.placement, plan.above.capture
     return {
-        "software": f"vdgs {__version__}", "model": plan.model, "model_identity": plan.identity,
+        "software": f"vdgs {__version__}", "model": plan.model, "model_identity": plan.model_identity,
         "crs": placement.crs, "crs_name": placement.name,
         "unit": placement.unit, "heights": placement.heights, "georeference": capture.ground.how,
         "gsd": grid.gsd, "width": grid.width, "height": grid.height, "bounds": list(grid.bounds),

@@ -1,4 +1,4 @@
-"""The cameras of a map: orthographic, straight above, under all that flew and over all that stands."""
+"""Cameras that look straight down on tiles of a map, by what a capture and its coordinates say: no model is needed."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Ceiling:
 
 @dataclass(frozen=True, eq=False)
 class Overhead:
-    """Where a map of a capture is seen from."""
+    """Cameras above a capture, in the coordinates of a map."""
 
     capture: Capture
     placement: Placement

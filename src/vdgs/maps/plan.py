@@ -1,4 +1,4 @@
-"""What is decided before a map is drawn: which pixels, in which coordinates, from which model, into which folder."""
+"""What is to be drawn before anything is: the pixels of a map, the cameras above them, and of which model."""
 
 from __future__ import annotations
 
@@ -18,50 +18,46 @@ from vdgs.settings.requests import MapRequest
 
 
 @dataclass(frozen=True, eq=False)
-class MapPlan:
-    """A map that can be drawn."""
+class Plan:
+    """A map that is to be drawn."""
 
     folder: Path
-    run: Path
+    """Where its files go."""
+    run_name: str
     model: str
-    """Which model of the run, "coarse" or "merged", and the identity of its file."""
-    identity: str
-    overhead: Overhead
+    """Which model, in a word; `model_identity` tells it from every other."""
+    model_identity: str | None
+    above: Overhead
     grid: Grid
     samples: int
     """Samples per pixel, each way."""
     sharp: bool
+    """Whether detail is taken from the photographs."""
 
-    @property
-    def capture(self) -> Capture:
-        return self.overhead.capture
+    @staticmethod
+    def of(asked: MapRequest, run: Path, model: str, model_identity: str | None, capture: Capture) -> Plan:
+        """The map that is asked for of a run folder. Raises VdgsError for a system, pixel size or extent that makes
+        none."""
+        placement = Placement.of(capture.ground, asked.crs)
+        finest = ground_sampling(capture, placement.similarity_at(middle_of(capture)).scale)
+        shown = extent_of(capture, placement)
+        grid = grid_over(asked.bbox or shown, finest if asked.gsd is None else asked.gsd)
+        refuse_elsewhere(grid, shown, placement)
+        above = Overhead.of(capture, placement)
+        above.camera(grid.part(0, 0, 1, 1))  # a system that makes no map is refused here
+        folder = asked.output or run / "maps"
+        return Plan(folder, run.name, model, model_identity, above, grid, samples_for(grid.gsd, finest), asked.sharp)
 
     @property
     def placement(self) -> Placement:
-        return self.overhead.placement
+        return self.above.placement
 
     @contextmanager
     def surveyor(self, model: AnchorModel) -> Iterator[Surveyor]:
-        """What draws the tiles of this map."""
-        sharpener = Sharpener(model, self.capture) if self.sharp else None
+        """What draws its tiles."""
+        sharpener = Sharpener(model, self.above.capture) if self.sharp else None
         try:
-            yield Surveyor(model, self.overhead, self.samples, sharpener)
+            yield Surveyor(model, self.above, self.samples, sharpener)
         finally:
             if sharpener is not None:
                 sharpener.close()
-
-
-def plan_map(asked: MapRequest, run: Path, capture: Capture, model: str, identity: str) -> MapPlan:
-    """The map that is asked for, of a model of a run with this capture.
-
-    Raises VdgsError for a system, pixel size or extent that makes no map.
-    """
-    placement = Placement.of(capture.ground, asked.crs)
-    finest = ground_sampling(capture, placement.similarity_at(middle_of(capture)).scale)
-    shown = extent_of(capture, placement)
-    grid = grid_over(asked.bbox or shown, finest if asked.gsd is None else asked.gsd)
-    refuse_elsewhere(grid, shown, placement)
-    overhead = Overhead.of(capture, placement)
-    overhead.camera(grid.part(0, 0, 1, 1))  # a system that makes no map is refused here
-    folder = asked.output or run / "maps"
-    return MapPlan(folder, run, model, identity, overhead, grid, samples_for(grid.gsd, finest), asked.sharp)

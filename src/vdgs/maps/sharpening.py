@@ -8,6 +8,7 @@ place: the scene as that photograph shows it is no nearer, and not of quite anot
 from __future__ import annotations
 
 from collections import OrderedDict
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import render
 
 #: Photographs looked up for one tile; bytes of photographs, and depth maps, that are kept between tiles.
-_MOST_VIEWS, SHARPENING_BYTES, _KEPT_DEPTHS = 12, 512_000_000, 24
+_MOST_VIEWS, _BUDGET_BYTES, _KEPT_DEPTHS = 12, 512_000_000, 24
 #: How far behind the surface that a photograph shows a place may lie, in parts of its depth.
 _BEHIND = 0.01
 #: How much a view straight from above is preferred: the power of the cosine. High, so that pixels are not means.
@@ -33,13 +34,28 @@ _ALIKE = 0.08
 _BLUR_PX, _BORDER_PX = 6.0, 12.0
 
 
+class Held(NamedTuple):
+    """What a sharpener keeps between tiles, at most (bytes)."""
+
+    pictures: int = 0
+    depths: int = 0
+
+
+def held_bytes(sharp: bool, capture: Capture) -> Held:
+    """What drawing keeps of photographs, where detail is taken from them."""
+    if not sharp:
+        return Held()
+    pixels = max(view.camera.width * view.camera.height for view in capture.train_views)
+    return Held(_BUDGET_BYTES, 4 * _KEPT_DEPTHS * pixels)
+
+
 class Sharpener:
     """Takes detail from the training photographs of a capture; remembers pictures and depths between tiles."""
 
     def __init__(self, model: AnchorModel, capture: Capture) -> None:
         self._model = model
         self._views = capture.train_views
-        self._pictures = ImageCache(self._views, SHARPENING_BYTES)
+        self._pictures = ImageCache(self._views, _BUDGET_BYTES)
         self._depths: OrderedDict[int, Float[np.ndarray, "h w"]] = OrderedDict()
 
     def close(self) -> None:

@@ -9,14 +9,12 @@ import torch
 from jaxtyping import Float, UInt8, UInt16
 
 from vdgs.cameras import Camera
-from vdgs.captures.capture import Capture
 from vdgs.maps.grid import Grid
 from vdgs.maps.overhead import Overhead
 from vdgs.maps.sharpening import Sharpener
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import render
 from vdgs.model.visibility import visibility_of
-from vdgs.placing.placement import Placement
 
 #: At least this opaque, a pixel shows a surface: the median depth is that of half.
 DRAWN_ALPHA = 0.5
@@ -41,26 +39,16 @@ class Surveyor:
     """Draws tiles of a map of one model."""
 
     model: AnchorModel
-    overhead: Overhead
+    above: Overhead
     #: Samples per pixel, each way.
-    samples: int
+    samples: int = 1
     #: Takes detail from the photographs, where that is asked for.
-    sharpener: Sharpener | None
-
-    @staticmethod
-    def of(
-        model: AnchorModel, capture: Capture, placement: Placement, samples: int = 1, sharpener: Sharpener | None = None
-    ) -> Surveyor:
-        return Surveyor(model, Overhead.of(capture, placement), samples, sharpener)
-
-    def camera(self, grid: Grid) -> Camera:
-        """As `Overhead.camera`."""
-        return self.overhead.camera(grid)
+    sharpener: Sharpener | None = None
 
     def tile(self, grid: Grid) -> Tile:
         """Draw the pixels of a grid, each from `samples`² of its own."""
         fine = Grid(grid.left, grid.top, grid.gsd / self.samples, grid.width * self.samples, grid.height * self.samples)
-        camera = self.camera(fine)
+        camera = self.above.camera(fine)
         with torch.inference_mode():
             raster = render(self.model, camera, background=(0.0, 0.0, 0.0), depth=True)
         assert raster.median_depth is not None
@@ -71,7 +59,7 @@ class Surveyor:
         depth[raster.alpha.cpu().numpy() < DRAWN_ALPHA] = np.nan
         # One of the samples, not their mean: at a wall the mean is a height that nothing has.
         depth = _lower_median(_blocks(depth, self.samples))
-        return self._tile(self.camera(grid) if self.samples > 1 else camera, light, opacity, depth)
+        return self._tile(self.above.camera(grid) if self.samples > 1 else camera, light, opacity, depth)
 
     def _tile(
         self, camera: Camera, light: Float[np.ndarray, "h w 3"], opacity: Float[np.ndarray, "h w"],
@@ -80,9 +68,9 @@ class Surveyor:
         shown = (opacity >= DRAWN_ALPHA) & np.isfinite(depth)
         points = camera.unproject(np.where(shown, depth, 0.0))[shown]
         counts = visibility_of(
-            torch.from_numpy(points), [view.camera for view in self.overhead.capture.train_views]
+            torch.from_numpy(points), [view.camera for view in self.above.capture.train_views]
         ).numpy()
-        heights = self.overhead.placement.places(points)[:, 2] if len(points) else np.zeros(0)
+        heights = self.above.placement.places(points)[:, 2] if len(points) else np.zeros(0)
         seen = counts > 0  # what no photograph shows, the model invents
         shown[shown] = seen
         tile = Tile(

@@ -177,7 +177,7 @@ class ExportRequest:
     measure: bool = True
     """Read a file back, draw the test views and say what was lost against the model itself."""
     threads: Annotated[int, WORKERS] = 0
-    """Threads of the kernels; 0 for all cores."""
+    """Threads of the kernels; 0 for all cores. The result does not depend on it, but for --refine."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, UseAppendAction
+from tyro.conf import Positional, UseAppendAction, arg
 
+from vdgs.settings.executors import ExecutorOptions
+from vdgs.settings.ranges import WORKERS, Range
 from vdgs.settings.requests import ExportRequest
 from vdgs.verbs.shared import open_console, parse, use_device, use_threads
 
@@ -24,15 +26,30 @@ class ExportArguments(ExportRequest):
     scene is baked once (docs/export.md)."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
+    jobs: Annotated[int, WORKERS] = 0
+    """Pieces of the baking done at once, each in a process of its own; 0: on this machine one process bakes all, a
+    cluster as many as it has room for."""
+    piece: Annotated[int | None, Range(0, 100_000)] = None
+    """Only do this piece of the baking, in this process: what is sent out."""
+    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def export(arguments: list[str]) -> None:
     asked = parse(ExportArguments, arguments, "vdgs export")
+    device, console = use_device(asked.device), open_console(asked.quiet)
+    use_threads(asked.threads)
+    if asked.piece is not None:
+        from vdgs.executors.parent import stop_when_parent_dies
+        from vdgs.export.piece import bake_piece
+
+        stop_when_parent_dies()
+        bake_piece(replace(asked, device=device), asked.piece, console)
+        return
+    from vdgs.executors.errand import Wish
     from vdgs.export.exporting import export_run
 
-    device = use_device(asked.device)
-    use_threads(asked.threads)
-    export_run(replace(asked, device=device), open_console(asked.quiet))
+    asked.where.check()
+    export_run(replace(asked, device=device), console, Wish(asked.where, asked.jobs, device=device))
     from vdgs.report.write import FILE, write_report
     from vdgs.runs.folder import RunFolder
 

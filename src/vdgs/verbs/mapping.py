@@ -24,26 +24,26 @@ class MapArguments(MapRequest):
     run: Positional[Path]
     """Run folder."""
     jobs: Annotated[int, WORKERS] = 0
-    """Pieces of the map drawn at once, each in a process of its own; 0: on this machine one process draws all, a
+    """Pieces of the tiles drawn at once, each in a process of its own; 0: on this machine one process draws all, a
     cluster as many as it has room for."""
     piece: Annotated[int | None, Range(0, 10_000)] = None
-    """Only this piece of the tiles, in this process: what is sent out."""
+    """Only draw this piece of the tiles, in this process: what is sent out."""
     where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
 def map(arguments: list[str]) -> None:
     asked = parse(MapArguments, arguments, "vdgs map")
-    from vdgs.executors.errand import Wish
-    from vdgs.executors.parent import stop_when_parent_dies
-    from vdgs.maps.mapping import map_run
-    from vdgs.maps.pieces import map_piece
-
     device = use_device(asked.device)
     use_threads(asked.threads)
-    request = replace(asked, device=device)
     if asked.piece is not None:
+        from vdgs.executors.parent import stop_when_parent_dies
+        from vdgs.maps.pieces import map_piece
+
         stop_when_parent_dies()
-        map_piece(request, asked.piece, open_console())
-    else:
-        asked.where.check()
-        map_run(request, open_console(), Wish(asked.where, asked.jobs, device=device))
+        map_piece(replace(asked, device=device), asked.piece, open_console())
+        return
+    from vdgs.executors.errand import Wish
+    from vdgs.maps.mapping import map_run
+
+    asked.where.check()
+    map_run(replace(asked, device=device), open_console(), Wish(asked.where, asked.jobs, device=device))

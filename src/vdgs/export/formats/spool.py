@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vdgs.errors import RunError
 from vdgs.export.formats.scene import ROWS, Scene
 from vdgs.model.gaussians import Gaussians
 
@@ -25,10 +26,7 @@ class Spooled:
 
     def rows(self, rows: np.ndarray) -> Gaussians:
         """The Gaussians of the given rows (indices), in their order."""
-        sizes = [int(np.prod(shape)) for shape in self.shapes.values()]
-        parts = torch.from_numpy(np.array(self.table[rows])).split(sizes, 1)
-        named = zip(self.shapes.items(), parts, strict=True)
-        return Gaussians(**{name: part.reshape(len(rows), *shape).contiguous() for (name, shape), part in named})
+        return _unflattened(torch.from_numpy(np.array(self.table[rows])), self.shapes)
 
     @property
     def degree(self) -> int:
@@ -38,13 +36,14 @@ class Spooled:
     def add_colours(self, rows: np.ndarray, added: Float[Tensor, "n f 3"]) -> None:
         """Add to the coefficients of the Gaussians of the given rows, each named once: of the constant function first.
         Threads may do so at once for different rows."""
-        self.table[rows, -added[0].numel() :] += added.reshape(len(added), -1).numpy()
+        if len(rows):
+            self.table[rows, -added[0].numel() :] += added.reshape(len(added), -1).numpy()
 
     def replace(self, rows: np.ndarray, gaussians: Gaussians) -> None:
         """Write Gaussians in place of those of the given rows."""
         for first in range(0, len(rows), ROWS):
             part = slice(first, first + ROWS)
-            self.table[rows[part]] = _flat(gaussians.select(torch.arange(len(gaussians))[part]))
+            self.table[rows[part]] = flat(gaussians.select(torch.arange(len(gaussians))[part]))
 
     def sample(self, most: int) -> Gaussians:
         """At most so many, evenly taken."""
@@ -59,13 +58,45 @@ def spooled(scene: Scene, file: Path, turn: np.ndarray | None = None) -> Spooled
     with file.open("wb") as handle:
         for piece in scene.pieces(turn):
             shapes = shapes or {name: tuple(tensor.shape[1:]) for name, tensor in piece.tensors().items()}
-            _flat(piece).tofile(handle)
+            flat(piece).tofile(handle)
             means[done : done + len(piece)] = piece.means.numpy()
             done += len(piece)
     width = sum(int(np.prod(shape)) for shape in shapes.values())
     return Spooled(means, np.memmap(file, np.float32, "r+", shape=(scene.count, width)), shapes)
 
 
-def _flat(gaussians: Gaussians) -> Float[np.ndarray, "n w"]:
-    flat = [tensor.reshape(len(gaussians), -1) for tensor in gaussians.tensors().values()]
-    return torch.cat(flat, 1).numpy()
+def opened(file: Path, degree: int, writable: bool = False) -> Spooled:
+    """The Gaussians of this degree that `spooled` has written, on the disk, their means too. Raises RunError for a file
+    that is missing or damaged."""
+    shapes = shapes_of(degree)
+    width = sum(int(np.prod(shape)) for shape in shapes.values())
+    try:
+        table = np.memmap(file, np.float32, "r+" if writable else "c").reshape(-1, width)
+    except (OSError, ValueError) as error:
+        raise RunError(
+            f"{file}: is missing or damaged ({error}). Delete {file.parent} and run the same command again."
+        ) from error
+    return Spooled(table[:, :3], table, shapes)
+
+
+def shapes_of(degree: int) -> dict[str, tuple[int, ...]]:
+    """The numbers of a Gaussian, in their order."""
+    rest = (degree + 1) ** 2 - 1
+    return {"means": (3,), "log_scales": (3,), "quaternions": (4,), "logits": (), "dc": (3,), "rest": (rest, 3)}
+
+
+def unflattened(rows: Float[Tensor, "n w"], degree: int) -> Gaussians:
+    """The inverse of `flat`."""
+    return _unflattened(rows, shapes_of(degree))
+
+
+def _unflattened(rows: Float[Tensor, "n w"], shapes: dict[str, tuple[int, ...]]) -> Gaussians:
+    parts = rows.split([int(np.prod(shape)) for shape in shapes.values()], 1)
+    named = zip(shapes.items(), parts, strict=True)
+    return Gaussians(**{name: part.reshape(len(rows), *shape).contiguous() for (name, shape), part in named})
+
+
+def flat(gaussians: Gaussians) -> Float[np.ndarray, "n w"]:
+    """All numbers of each, as a spool holds them."""
+    columns = [tensor.reshape(len(gaussians), -1) for tensor in gaussians.tensors().values()]
+    return torch.cat(columns, 1).numpy()

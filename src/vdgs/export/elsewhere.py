@@ -1,0 +1,192 @@
+"""A scene baked in pieces, elsewhere or by several processes: what a driver does between their steps.
+
+What views show and lack stays on the disk, and is removed when it is used up; the driver reads a view or a part at a
+time. A driver that is started again goes on where the last one was.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from rich.console import Console
+
+from vdgs.errors import RunError
+from vdgs.executors.errand import Errand, Wish
+from vdgs.executors.fitness import Question, photographs_of
+from vdgs.executors.placement import Share
+from vdgs.executors.work import clear, remove
+from vdgs.export.baking import part_size
+from vdgs.export.formats.scene import Scene
+from vdgs.export.formats.spool import Spooled, opened, spooled, unflattened
+from vdgs.export.refit import REFITS
+from vdgs.export.saved import load_added, load_array, load_shown
+from vdgs.export.steps import COMPARE, FIT, FOLDER, MEND, SURVEY, BakingWork, Step
+from vdgs.memory.estimate import drawing_bytes
+from vdgs.model.gaussians import Gaussians
+from vdgs.runs.locks import hold
+from vdgs.runs.opening import TrainedRun
+from vdgs.settings.requests import ExportRequest
+from vdgs.storage.files import write_array, write_atomically
+from vdgs.watching.interrupts import stop_if_asked
+
+#: Memory of fitting, for each pair of a Gaussian and a view: what is known of it, copies in double precision (a
+#: choice, not measured). So many parts are fitted at once.
+PAIR_BYTES, PARTS_AT_ONCE = 400, 8
+#: Of comparing pictures, for each Gaussian, as if a view showed all.
+GAUSSIAN_BYTES = 500
+
+
+@contextmanager
+def baked_elsewhere(run: TrainedRun, asked: ExportRequest, wish: Wish, console: Console) -> Iterator[BakedElsewhere]:
+    """What lets a scene be baked in pieces. All that they leave is removed at the end, if it is a good one.
+
+    Raises RunError where another process bakes the same, or pieces of an earlier command are at work.
+    """
+    work = BakingWork.of(run, asked)
+    clear(work.pieces.output, work.pieces.key)
+    with hold(work.pieces.folder):
+        yield BakedElsewhere(run, asked, work, wish, console)
+        remove(work.pieces)
+    _remove_if_empty(work.pieces.output)
+
+
+def forget_pieces(run: TrainedRun) -> None:
+    """Remove what pieces of an earlier command have left, unless they are at work: they bake for other files."""
+    output = run.folder.path / FOLDER
+    with suppress(RunError):
+        clear(output)
+        _remove_if_empty(output / "pieces")
+        _remove_if_empty(output)
+
+
+def _remove_if_empty(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()
+
+
+class BakedElsewhere:
+    """Lets pieces bake the scene of a run, step by step; as `BakedHere`."""
+
+    def __init__(
+        self, run: TrainedRun, asked: ExportRequest, work: BakingWork, wish: Wish, console: Console
+    ) -> None:  # fmt: skip
+        self._run, self._asked, self._work, self._wish, self._console = run, asked, work, wish, console
+        self.cameras = work.cameras
+
+    def pixels(self) -> Float[np.ndarray, " g"]:
+        """How many pixels each Gaussian of the model makes of what the training cameras see."""
+        if not self._work.pixels_file.exists():
+            step = self._work.step(SURVEY)
+            self._send(step)
+            anchors = self._run.model.anchors
+            pixels = np.zeros(len(anchors) * anchors.offsets.shape[1], np.float32)
+            for file in self._work.files(step):  # in the order of one process: sums have its bits
+                stop_if_asked()
+                view = load_shown(file)
+                pixels[view.gaussians.numpy()] += view.pixels.numpy()
+            write_array(self._work.pixels_file, pixels)
+        return np.array(load_array(self._work.pixels_file, np.float32, 1))
+
+    @contextmanager
+    def spool(self, kept: Int[np.ndarray, " m"]) -> Iterator[Spooled]:
+        """These Gaussians in a file; `pixels` was asked before."""
+        work = self._work
+        if not work.kept_file.exists():
+            write_array(work.kept_file, kept.astype(np.int64))
+        there = [number for number in range(REFITS + 1) if work.spool_file(number).exists()]
+        for number in range(max(there, default=-1) + 1, REFITS + 1):
+            for step in work.steps_of(number):
+                self._send(step)
+            self._gather(number, len(kept))
+            self._tidy(number)
+        file = work.spool_file(REFITS)
+        if self._asked.refine > 0:  # which changes it: what pieces came to stays as it is
+            file = Path(shutil.copyfile(file, file.with_name("refined.spool")))
+        spool = opened(file, self._asked.sh_degree, writable=self._asked.refine > 0)
+        yield replace(spool, means=np.array(spool.means))
+
+    def _gather(self, number: int, count: int) -> None:
+        """Make the Gaussians of a round of what its pieces came to: a part at a time."""
+        if number == 0:
+            scene = Scene(self._parts(), count, self._asked.sh_degree)
+            write_atomically(self._work.spool_file(0), lambda file: _spool(scene, file))
+            return
+
+        def write(file: Path) -> None:
+            shutil.copyfile(self._work.spool_file(number - 1), file)
+            spool = opened(file, self._asked.sh_degree, writable=True)
+            for part in self._work.files(self._work.step(MEND, number)):
+                stop_if_asked()
+                spool.add_colours(*load_added(part))
+
+        write_atomically(self._work.spool_file(number), write)
+
+    def _parts(self) -> Iterator[Gaussians]:
+        for file in self._work.files(self._work.step(FIT)):
+            stop_if_asked()
+            rows = load_array(file, np.float32, 2)
+            if len(rows):
+                yield unflattened(torch.from_numpy(rows), self._asked.sh_degree)
+
+    def _tidy(self, number: int) -> None:
+        """Remove what is used up once the Gaussians of a round are there."""
+        steps = self._work.steps_of(number) + ([self._work.step(SURVEY)] if number == 0 else [])
+        for step in steps:
+            for file in self._work.files(step):
+                file.unlink(missing_ok=True)
+        if number:
+            self._work.spool_file(number - 1).unlink(missing_ok=True)
+
+    def _send(self, step: Step) -> None:
+        """Let the pieces of a step be done that are not."""
+        work = self._work.pieces
+        if left := [index for index in step.pieces if not work.is_done(index)]:
+            errand = Errand(
+                step.kind, work.folder, len(step.pieces), left, work.piece, self._command, self._piece_bytes(step),
+                self._question,
+            )  # fmt: skip
+            # No photographs are read.
+            errand.run(replace(self._wish, image_gb=1e-9), self._console, work.mark_queued)
+
+    def _question(self) -> Question:
+        run = self._run
+        photographs = photographs_of(run.capture.train_views)
+        return Question(self._work.pieces.folder, [run.folder.config_file, run.model_path, *photographs])
+
+    def _piece_bytes(self, step: Step) -> int:
+        """Memory by estimate."""
+        model = self._run.model_path.stat().st_size
+        if step.kind in (SURVEY, COMPARE):
+            gaussians = len(self._run.model.anchors) * self._run.model.anchors.offsets.shape[1]
+            held = GAUSSIAN_BYTES * gaussians if step.kind is COMPARE else 0
+            return drawing_bytes(model, held, max(camera.width * camera.height for camera in self._work.cameras))
+        before = self._work.step(COMPARE, step.round) if step.kind is MEND else self._work.step(SURVEY)
+        pairs = sum(file.stat().st_size for file in self._work.files(before)) // (12 if step.kind is MEND else 8)
+        most = min(PARTS_AT_ONCE, len(step.items))
+        return drawing_bytes(model, PAIR_BYTES * pairs * most // len(step.items), part_size(self._run.model))
+
+    def _command(self, index: int, share: Share, device: str) -> list[str]:
+        """As it was asked for, so that a piece finds the same work; floats with all their digits."""
+        asked = self._asked
+        given = [word for path in asked.to for word in ("--to", os.path.abspath(path))]
+        given += [] if asked.block is None else ["--block", str(asked.block)]
+        given += [] if asked.bbox is None else ["--bbox", *map(repr, asked.bbox)]
+        given += [] if asked.crs is None else ["--crs", asked.crs]
+        return [
+            sys.executable, "-m", "vdgs.cli", "export", os.path.abspath(self._run.folder.path), "--piece", str(index),
+            "--model", self._run.name, *given, "--max-gaussians", str(asked.max_gaussians),
+            "--sh-degree", str(asked.sh_degree), "--threads", str(share.needs.processors), "--device", device,
+        ]  # fmt: skip
+
+
+def _spool(scene: Scene, file: Path) -> None:
+    spooled(scene, file)

@@ -1,0 +1,90 @@
+"""A scene baked by one process: what views show and lack is in its memory, Gaussians are in a temporary file."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from rich.console import Console
+from rich.progress import Progress
+
+from vdgs.errors import VdgsError
+from vdgs.export.baking import Survey, bake, survey
+from vdgs.export.between import between
+from vdgs.export.formats.scene import Scene
+from vdgs.export.formats.spool import Spooled, spooled
+from vdgs.export.refit import REFITS, Baked, refit
+from vdgs.runs.opening import TrainedRun
+from vdgs.settings.requests import ExportRequest
+from vdgs.watching.interrupts import stop_if_asked
+
+
+def bar_on(console: Console) -> Progress:
+    """A bar that shows how far work is, to be used as a context."""
+    return Progress(console=console, disable=not console.is_terminal, transient=True)
+
+
+class BakedHere:
+    """Bakes the scene of a run."""
+
+    def __init__(self, run: TrainedRun, asked: ExportRequest, console: Console) -> None:
+        self._run, self._asked, self._console = run, asked, console
+        training = [view.camera for view in run.capture.train_views]
+        #: By which pictures are compared: those of the photographs and others between them.
+        self.cameras = [*training, *between(training)]
+        self._seen: Survey | None = None
+
+    def pixels(self) -> Float[np.ndarray, " g"]:
+        """How many pixels each Gaussian of the model makes of what the training cameras see."""
+        training = [view.camera for view in self._run.capture.train_views]
+        with bar_on(self._console) as bar:
+            task = bar.add_task("what the training cameras see", total=len(training))
+
+            def after_view() -> None:
+                stop_if_asked()
+                bar.advance(task)
+
+            self._seen = survey(self._run.model, training, after_view)
+        return self._seen.pixels
+
+    @contextmanager
+    def spool(self, kept: Int[np.ndarray, " m"]) -> Iterator[Spooled]:
+        """These Gaussians in a temporary file beside the first output; `pixels` was asked before."""
+        assert self._seen is not None
+        seen, folder = self._seen, self._asked.to[0].parent
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".baking-") as temporary:
+            with bar_on(self._console) as bar:
+                try:
+                    spool = self._fitted(seen, kept, Path(temporary) / "spool", bar)
+                except OSError as error:
+                    raise VdgsError(
+                        f"{folder}: cannot hold the scene ({error.strerror or error}). Nothing was written."
+                    ) from error
+                self._improve(Baked(seen.model, kept, spool), bar)
+            yield spool
+
+    def _fitted(self, seen: Survey, kept: Int[np.ndarray, " m"], file: Path, bar: Progress) -> Spooled:
+        degree = self._asked.sh_degree
+        task = bar.add_task("fitting Gaussians", total=len(kept))
+
+        def after_part(done: int) -> None:
+            stop_if_asked()
+            bar.update(task, completed=done)
+
+        return spooled(Scene(bake(seen, kept, degree, after_part), len(kept), degree), file)
+
+    def _improve(self, baked: Baked, bar: Progress) -> None:
+        """Fit the colours again to what pictures lack."""
+        task = bar.add_task("comparing pictures", total=REFITS * len(self.cameras))
+
+        def after_view() -> None:
+            stop_if_asked()
+            bar.advance(task)
+
+        for _ in range(REFITS):
+            refit(baked, self.cameras, after_view)

@@ -1,0 +1,121 @@
+"""Baking in pieces: its steps, how each is cut, and the files between them.
+
+Each step needs all of the one before. Pieces are numbered through all steps, so that a number says what is to be done:
+
+    survey              training views      what each shows
+    fit                 parts of anchors    their Gaussians
+    compare, then mend  views, then parts   what pictures lack; what is added to colours. REFITS times
+
+    RUN/baking/pieces/KEY/   of all pieces together (`executors.work`): pixels.npy and kept.npy, from the survey;
+                             N.spool, the Gaussians after N rounds of fitting colours, the last of them alone
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from vdgs.cameras import Camera
+from vdgs.executors.kinds import Kind
+from vdgs.executors.work import PieceWork, spans_of
+from vdgs.export.baking import part_count
+from vdgs.export.between import between
+from vdgs.export.formats import registry
+from vdgs.export.frame import usual_crs
+from vdgs.export.refit import REFITS
+from vdgs.runs.opening import TrainedRun
+from vdgs.settings.requests import ExportRequest
+
+#: Where pieces work, in the run folder.
+FOLDER = "baking"
+#: Views and parts of a piece, least and most, and how many pieces there are in between (choice).
+VIEWS_OF_PIECE, PARTS_OF_PIECE = (8, 100, 8), (2, 50, 8)
+SURVEY = Kind("piece", "pieces", "survey views", "at work", "views", "views/s")
+FIT = Kind("piece", "pieces", "fit Gaussians", "at work", "parts", "parts/s")
+COMPARE = Kind("piece", "pieces", "compare pictures", "at work", "views", "views/s")
+MEND = Kind("piece", "pieces", "fit colours again", "at work", "parts", "parts/s")
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of the work. Its items and pieces are numbered through all steps."""
+
+    kind: Kind
+    round: int
+    """0: before colours are fitted again."""
+    items: range
+    pieces: range
+
+
+@dataclass(frozen=True)
+class BakingWork:
+    """All steps of baking a scene."""
+
+    pieces: PieceWork
+    steps: tuple[Step, ...]
+    training: Sequence[Camera]
+    cameras: Sequence[Camera]
+    """By which pictures are compared: the training views and others between them."""
+
+    @staticmethod
+    def of(run: TrainedRun, asked: ExportRequest) -> BakingWork:
+        """What baking a run as it is asked for (`as_files_hold`) comes to, and what it depends on."""
+        training = [view.camera for view in run.capture.train_views]
+        cameras = [*training, *between(training)]
+        steps, spans = _cut(len(training), len(cameras), part_count(run.model))
+        output = Path(os.path.abspath(run.folder.path)) / FOLDER
+        return BakingWork(PieceWork.of(output, _depends_on(run, asked), spans), steps, training, cameras)
+
+    def steps_of(self, round_: int) -> list[Step]:
+        """From what comes before the Gaussians of a round to them; before the first, what views show is known."""
+        return [step for step in self.steps if step.round == round_ and step.kind is not SURVEY]
+
+    def step(self, kind: Kind, round_: int = 0) -> Step:
+        return next(step for step in self.steps if step.kind is kind and step.round == round_)
+
+    def step_of_piece(self, index: int) -> Step:
+        return next(step for step in self.steps if index in step.pieces)
+
+    def files(self, step: Step) -> list[Path]:
+        """What the items of a step leave, in their order."""
+        return [self.pieces.file(item, ".npy") for item in step.items]
+
+    @property
+    def pixels_file(self) -> Path:
+        return self.pieces.folder / "pixels.npy"
+
+    @property
+    def kept_file(self) -> Path:
+        return self.pieces.folder / "kept.npy"
+
+    def spool_file(self, round_: int) -> Path:
+        return self.pieces.folder / f"{round_}.spool"
+
+
+def as_files_hold(asked: ExportRequest) -> ExportRequest:
+    """Without colours that change with the direction where no file that is asked for holds them."""
+    if all(registry.format_of(path).fixed for path in asked.to):
+        return replace(asked, sh_degree=0)
+    return asked
+
+
+def _cut(views: int, cameras: int, parts: int) -> tuple[tuple[Step, ...], list[range]]:
+    steps, spans, first = list[Step](), list[range](), 0
+    order = [(SURVEY, 0, views), (FIT, 0, parts)]
+    order += [(kind, i, n) for i in range(1, REFITS + 1) for kind, n in ((COMPARE, cameras), (MEND, parts))]
+    for kind, round_, items in order:
+        own = spans_of(items, *(VIEWS_OF_PIECE if kind in (SURVEY, COMPARE) else PARTS_OF_PIECE))
+        steps.append(Step(kind, round_, range(first, first + items), range(len(spans), len(spans) + len(own))))
+        spans += [range(first + span.start, first + span.stop) for span in own]
+        first += items
+    return tuple(steps), spans
+
+
+def _depends_on(run: TrainedRun, asked: ExportRequest) -> list[Any]:
+    """The model, the degree, and what chooses among its Gaussians."""
+    crs = None if asked.bbox is None else asked.crs or usual_crs(run.capture.ground, asked.to[0])
+    box = None if asked.bbox is None else list(asked.bbox)
+    return [run.name, run.key, run.status.model, asked.sh_degree, asked.block, box, crs, asked.max_gaussians]
