@@ -230,34 +230,6 @@ def test_cameras_scored_in_pieces_are_assigned_as_by_one_process(tmp_path, uncut
     assert vdgs("partition", run, "--piece", "0").returncode == 1
 
 
-def test_a_map_drawn_in_pieces_is_that_of_one_process(tmp_path, uncut):
-    """Also where the driver was killed, and then a piece; tiles that were drawn are not drawn again."""
-    pytest.importorskip("rasterio")
-    here, run = copy_run(uncut, tmp_path / "here/run"), copy_run(uncut, tmp_path / "run")  # previews name the run
-    asked = ("--gsd", "0.001", "--bbox", "-1.5", "0", "1.5", "0.05", "--crs", "local")  # six small tiles
-    done = vdgs("map", here, *asked)
-    assert done.returncode == 0, done.stderr + done.stdout
-    with begun("map", run, *asked, "--jobs", "2", pause_at=("*/pieces/*/000001.npz", 1)) as first:
-        first.wait_until_paused(1)
-        first.send_signal(signal.SIGKILL)
-        first.finished()
-        (piece,) = first.paused()
-        wait_until(lambda: not alive(piece))
-    (work,) = (run / "maps/pieces").iterdir()
-    kept = {file: file.stat().st_mtime_ns for file in work.glob("*/*.npz")}
-    assert work / "00/000000.npz" in kept
-    with begun("map", run, *asked, "--jobs", "2", pause_at=("*/pieces/*/000002.npz", 1)) as second:
-        second.wait_until_paused(1)
-        second.kill_paused()
-        assert {file: file.stat().st_mtime_ns for file in kept} == kept
-        done = second.finished()
-    assert done.returncode == 0, done.stderr + done.stdout
-    assert "piece 00: crashed by SIGKILL" in done.stdout
-    assert not (run / "maps/pieces").exists()
-    assert evaluated(run / "maps") == evaluated(here / "maps")
-    assert len(evaluated(run / "maps")) == 6
-
-
 def test_what_a_piece_cannot_do_is_said_in_its_words(merged, tmp_path):
     run = copy_run(merged, tmp_path / "run")
     weights = tmp_path / "none.pth"
