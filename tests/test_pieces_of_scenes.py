@@ -6,17 +6,22 @@ import signal
 import numpy as np
 import pytest
 import torch
+from rich.console import Console
 
 from cli_support import begun, do_tasks_here, vdgs, wait_until
 from cluster_support import alive, copy_run, evaluated
-from vdgs.errors import RunError
-from vdgs.export import baking
+from vdgs import pipeline
+from vdgs.errors import RunError, Stopped
+from vdgs.export import baking, steps
 from vdgs.export.baking import Shown
 from vdgs.export.formats.spool import flat, opened, unflattened
 from vdgs.export.refit import Lacking
 from vdgs.export.saved import load_added, load_lacking, load_shown, save_added, save_lacking, save_shown
 from vdgs.maps.pieces import load_tile, save_tile
 from vdgs.maps.tiles import Tile
+from vdgs.runs.folder import RunFolder
+from vdgs.settings.executors import ExecutorOptions
+from vdgs.settings.requests import RunRequest
 
 pytestmark = pytest.mark.xdist_group("pieces")  # one worker, which trains once
 
@@ -80,9 +85,29 @@ def test_a_tile_that_is_damaged_is_named(tmp_path):
         load_tile(tmp_path / "1.npz")
 
 
+def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path, monkeypatch):
+    monkeypatch.setattr(pipeline, "can_map", lambda: True)
+    wishes = []
+    monkeypatch.setattr(pipeline, "map_run", lambda asked, console, wish: wishes.append(wish))
+    for executor in ("local", "slurm"):
+        asked = RunRequest(tmp_path, tmp_path, jobs=3, where=ExecutorOptions(executor))
+        pipeline._map(RunFolder(tmp_path), asked, Console(quiet=True))
+    assert [(wish.sends, wish.jobs, wish.where.executor) for wish in wishes] == [
+        (False, 0, "local"),
+        (True, 3, "slurm"),
+    ]
+
+    def stopped(*_):
+        raise Stopped("Stopped")
+
+    monkeypatch.setattr(pipeline, "map_run", stopped)
+    with pytest.raises(Stopped):
+        pipeline._map(RunFolder(tmp_path), asked, Console(quiet=True))
+
+
 def small_parts() -> None:
-    """Let this process fit so few anchors at once that a small scene has parts for several pieces."""
-    baking.ANCHORS_AT_ONCE = 64
+    """Let so few anchors be fitted at once, and pieces be so small, that a small scene has several for each step."""
+    baking.ANCHORS_AT_ONCE, steps.VIEWS_OF_PIECE, steps.PARTS_OF_PIECE = 64, (8, 100, 8), (2, 50, 8)
 
 
 def small_parts_here() -> None:
@@ -140,7 +165,7 @@ def test_what_is_chosen_is_baked_alike_in_pieces_and_moved_on_by_the_driver(uncu
 def test_a_piece_of_baking_whose_turn_has_not_come_says_so(uncut, tmp_path):
     run = copy_run(uncut, tmp_path / "run")
     for piece, said in ((2, "nobody has chosen what is to be baked yet"), (99, "numbered from 0")):
-        done = vdgs("export", run, "--to", tmp_path / "scene.ply", "--piece", piece)
+        done = vdgs("export", run, "--to", tmp_path / "scene.ply", "--piece", piece, prepare=small_parts)
         assert done.returncode == 1
         assert said in done.stderr
 

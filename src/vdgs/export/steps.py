@@ -31,8 +31,9 @@ from vdgs.settings.requests import ExportRequest
 
 #: Where pieces work, in the run folder.
 FOLDER = "baking"
-#: Views and parts of a piece, least and most, and how many pieces there are in between (choice).
-VIEWS_OF_PIECE, PARTS_OF_PIECE = (8, 100, 8), (2, 50, 8)
+#: Views and parts of a piece, least and most, and how many pieces there are in between (choice): few, for each step
+#: starts its processes anew.
+VIEWS_OF_PIECE, PARTS_OF_PIECE = (16, 100, 8), (4, 50, 8)
 SURVEY = Kind("piece", "pieces", "survey views", "at work", "views", "views/s")
 FIT = Kind("piece", "pieces", "fit Gaussians", "at work", "parts", "parts/s")
 COMPARE = Kind("piece", "pieces", "compare pictures", "at work", "views", "views/s")
