@@ -215,6 +215,8 @@ def test_cameras_scored_in_pieces_are_assigned_as_by_one_process(tmp_path, uncut
     assert vdgs("partition", one, *cut).returncode == 0
     with begun("partition", run, *cut, "--jobs", "2", pause_at=("*/pieces/*/000001.npz", 1)) as first:
         first.wait_until_paused(1)
+        pattern = "partition/pieces/*/00/status.json"
+        wait_until(lambda: [json.loads(file.read_text())["state"] for file in run.glob(pattern)] == ["done"])
         first.send_signal(signal.SIGKILL)
         first.finished()
         (piece,) = first.paused()
