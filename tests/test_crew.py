@@ -16,7 +16,7 @@ from vdgs.executors.executor import Listener, Needs, Task
 from vdgs.executors.fitness import Question, examine
 from vdgs.executors.lines import Lines
 from vdgs.executors.placement import Work, by_queue, on_cluster, on_this_machine
-from vdgs.runs.folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.executors import ExecutorOptions, SlurmOptions
 from vdgs.verbs import starting

@@ -20,7 +20,7 @@ from vdgs.executors.lines import Lines
 from vdgs.executors.local import LocalExecutor
 from vdgs.executors.parent import PARENT, stop_when_parent_dies
 from vdgs.executors.pieces import Piece, run_pieces
-from vdgs.runs.folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder
 
 #: What every fake block begins with: it knows its folder, can say how far it is, and lists the SIGTERMs it gets.
 PRELUDE = f"""
@@ -262,7 +262,7 @@ from pathlib import Path
 from rich.console import Console
 from vdgs.executors.pieces import Piece, run_pieces
 from vdgs.executors.local import LocalExecutor
-from vdgs.runs.folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder
 
 class Counted(LocalExecutor):
     def run(self, tasks, listener):

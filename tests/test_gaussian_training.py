@@ -33,7 +33,7 @@ from vdgs.comparators.gaussians.training import (
 from vdgs.comparators.gaussians.watching import train_watched
 from vdgs.errors import TrainingDiverged, VdgsError
 from vdgs.kernels import native, set_threads, threads
-from vdgs.runs.folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.checkpoints import load_newest, save_state
 

@@ -24,7 +24,8 @@ from vdgs.comparators.gaussians.training import (
 )
 from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.measured_model import EvaluationSettings
-from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.watching import WatchOptions
 

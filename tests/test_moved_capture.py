@@ -147,11 +147,11 @@ def test_the_command_that_is_advised_names_the_capture_where_it_lies_now(folder,
         ("vdgs run place --output run", None),
         (None, None),
     ):
-        run._write(settings, command)
+        run.config.write(settings, command)
         run.move_capture(gone)  # where it was
-        assert run.command() == command
+        assert run.config.command() == command
         run.move_capture(folder / "place")
-        assert run.command() == moved
+        assert run.config.command() == moved
 
 
 def test_a_run_without_cameras_takes_the_capture_that_is_named(folder, tmp_path):

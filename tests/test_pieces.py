@@ -22,7 +22,7 @@ from vdgs.evaluation.records import load_view, save_view
 from vdgs.evaluation.seams import BlockFigures
 from vdgs.evaluation.view import ViewFigures
 from vdgs.executors.work import PieceWork, alone, at_work, spans_of
-from vdgs.runs.folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.watching.interrupts import stop_if_asked, stop_requests
 
 pytestmark = pytest.mark.xdist_group("pieces")  # one worker, which trains once

@@ -6,7 +6,8 @@ import pytest
 
 from vdgs.errors import RunError, VdgsError
 from vdgs.partition.records import AssignedBlock, CutBlock, MergedBlock, PartitionRecord
-from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.storage.records import known, plain, record_of
 

@@ -9,8 +9,9 @@ from captures_support import tiny_scene, write_colmap
 from vdgs.captures.facts import capture_facts
 from vdgs.errors import RunError
 from vdgs.runs.beginning import begin_run
-from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.folder import RunFolder
 from vdgs.runs.keys import SINCE, stage_keys
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.checks import validate

@@ -258,18 +258,18 @@ def test_the_command_that_began_a_run_is_advised_while_the_settings_are_its_own(
     assert standing_of(run).next_command() == COMMAND
     other = run.settings() | {"merge": asdict(MethodConfig().merge) | {"rule": "best_seen"}}
     run.change_settings(other, redo=True)
-    assert run.command() is None
+    assert run.config.command() is None
     assert standing_of(run).next_command() == f"vdgs merge {run.path}"
     run.change_settings(run.settings() | {"merge": asdict(MethodConfig().merge)}, redo=True, command="vdgs run anew")
     assert standing_of(run).next_command() == "vdgs run anew"
 
 
 def test_a_copy_of_a_run_is_not_continued_where_the_run_lies(run, tmp_path):
-    run._write(run.settings(), f"vdgs run place --output {run.path}")
-    assert run.command() is not None
+    run.config.write(run.settings(), f"vdgs run place --output {run.path}")
+    assert run.config.command() is not None
     copy = RunFolder(tmp_path / "a copy")
     shutil.copytree(run.path, copy.path)
-    assert copy.command() is None
+    assert copy.config.command() is None
 
 
 def test_settings_that_cannot_be_read_are_to_be_mended(run):

@@ -24,7 +24,8 @@ from vdgs.memory.estimate import GROWTH, Need, estimate, in_gb
 from vdgs.memory.process import available_bytes
 from vdgs.partition.cut import SEEN, choose_block_count
 from vdgs.runs.beginning import reads_otherwise, run_settings
-from vdgs.runs.folder import RunFolder, changed_options
+from vdgs.runs.config_file import changed_options
+from vdgs.runs.folder import RunFolder
 from vdgs.runs.standing import RunStanding, standing_of
 from vdgs.settings.checks import validate
 from vdgs.settings.method import MethodConfig, TrainConfig, block_limit, block_training, with_iterations

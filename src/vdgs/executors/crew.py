@@ -19,7 +19,7 @@ from vdgs.executors.engine import DONE, EXPLAINED, STOPPED, Attempt, End, Engine
 from vdgs.executors.executor import EndState, Listener, Outcome, Task
 from vdgs.executors.output import explanation, last_lines
 from vdgs.memory.estimate import in_gb
-from vdgs.runs.folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.watching.interrupts import stop_requests
 
 #: Seconds that tasks get to save when this process fails itself, and between two looks at them meanwhile.

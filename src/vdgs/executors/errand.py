@@ -17,7 +17,7 @@ from vdgs.executors.pieces import Piece, run_pieces
 from vdgs.executors.placement import Share, Work
 from vdgs.kernels import threads as threads_available
 from vdgs.memory.process import available_bytes
-from vdgs.runs.folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.settings.executors import ExecutorOptions
 
 

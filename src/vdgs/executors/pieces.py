@@ -16,7 +16,7 @@ from vdgs.executors.kinds import BLOCKS, Kind
 from vdgs.executors.lines import Lines
 from vdgs.executors.progress import PieceProgress, read_figures
 from vdgs.executors.table import STYLES, Board, duration
-from vdgs.runs.folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder
 
 
 @dataclass(frozen=True)

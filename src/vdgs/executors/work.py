@@ -24,8 +24,8 @@ from typing import Any
 from vdgs.errors import Interrupted, RunError, Stopped, VdgsError
 from vdgs.executors.fitness import code_identity
 from vdgs.memory.process import peak_memory_bytes
-from vdgs.runs.folder import StageFolder
 from vdgs.runs.locks import hold, is_locked
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 
 #: The name of the folder of all pieces in the folder that the work is for.

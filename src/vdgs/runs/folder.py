@@ -2,151 +2,24 @@
 
 from __future__ import annotations
 
-import json
-import os
 import shlex
-import shutil
-import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from vdgs import __version__
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.errors import RunError, VdgsError
 from vdgs.partition.records import PartitionRecord
+from vdgs.runs.config_file import SECTIONS, ConfigFile, changed_options
 from vdgs.runs.keys import StageKeys, stage_keys
 from vdgs.runs.locks import hold, is_locked
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.settings.method import MethodConfig
-from vdgs.settings.plain import differences, from_dict, to_dict
-from vdgs.settings.ranges import numbers, option
-from vdgs.storage.files import read_json, write_json, write_text
-from vdgs.storage.records import known, record_of
-
-#: The parts of config.yaml.
-SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
-#: Those whose options have no prefix on the command line.
-PLAIN_SECTIONS = ("capture", "training", "partition")
-
-
-def option_of(setting: str) -> str:
-    """`--lambda-vis` for partition.lambda_vis: how `vdgs run` calls a setting of config.yaml."""
-    section, _, name = setting.partition(".")
-    return option((name,) if section in PLAIN_SECTIONS else (section, name))
-
-
-def changed_options(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Lines that say which options differ between the settings of two runs; where the capture lies is none."""
-    paths = [line.partition(": ") for line in differences(old, new) if not line.startswith("capture.path: ")]
-    return [f"{option_of(path)}: {values}" for path, _, values in paths]
-
-
-@dataclass(frozen=True)
-class StageFolder:
-    """Where one stage (coarse, a block) keeps its checkpoints, log and model."""
-
-    path: Path
-
-    @property
-    def checkpoints(self) -> Path:
-        return self.path / "checkpoints"
-
-    @property
-    def log(self) -> Path:
-        return self.path / "log.jsonl"
-
-    @property
-    def model(self) -> Path:
-        return self.path / "model.safetensors"
-
-    @property
-    def status_file(self) -> Path:
-        return self.path / "status.json"
-
-    def status(self) -> Status:
-        """What `set_status` wrote last; state "new" if nothing did. RunError if the file is damaged."""
-        if not self.status_file.exists():
-            return Status()
-        written = read_json(self.status_file)
-        try:
-            if isinstance(written, dict) and "state" not in written:
-                raise ValueError("it says no state")
-            return record_of(Status, written)
-        except ValueError as error:
-            raise RunError(
-                f"{self.status_file}: is damaged ({error}). Delete this file and run the same command again."
-            ) from error
-
-    def set_status(self, status: Status) -> None:
-        write_json(self.status_file, known(status))
-
-    @property
-    def key_file(self) -> Path:
-        return self.path / "key"
-
-    def key(self) -> str | None:
-        """For which settings (`stages/keys.py`) this folder works; None if it says nothing of it."""
-        try:
-            return self.key_file.read_text(encoding="ascii", errors="replace").strip()
-        except OSError:
-            return None
-
-    def discard_unless(self, key: str) -> None:
-        """Delete what is here unless it was made for these settings, and let the folder work for them from now on.
-
-        What was made for other or unknown settings goes first and the key is written last: a folder never holds what
-        its key does not say.
-        """
-        if self.key() == key:
-            return
-        if self.path.exists():
-            for stale in self.path.iterdir():
-                if stale.is_dir():
-                    shutil.rmtree(stale)
-                elif stale not in (self.path / ".lock", self.key_file):
-                    stale.unlink()
-        write_text(self.key_file, key + "\n")
-
-    def holds_work(self) -> bool:
-        """Something was trained here."""
-        return self.model.exists() or any(self.checkpoints.glob("*.json"))
-
-    def is_done(self, key: str | None = None) -> bool:
-        """Trained to the end, for the settings of `key` where one is given."""
-        return self.status().state == "done" and self.model.exists() and key in (None, self.key())
-
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Hold this stage for this process; RunError if another one works on it."""
-        with hold(self.path):
-            yield
-
-    def is_held(self) -> bool:
-        """Another process works on this stage. A folder that cannot be written is held by none."""
-        try:
-            with self.locked():
-                return False
-        except RunError as error:
-            return isinstance(error.__cause__, BlockingIOError)
-
-    def truncate_log(self, iteration: int) -> None:
-        """Drop log lines after `iteration` (and a half-written last one), so that a continued run repeats none."""
-        if not self.log.exists():
-            return
-        kept = []
-        for line in self.log.read_text(encoding="utf-8", errors="replace").splitlines():
-            try:
-                if json.loads(line)["iteration"] <= iteration:
-                    kept.append(line)
-            except (ValueError, KeyError, TypeError):
-                break
-        write_text(self.log, "".join(line + "\n" for line in kept))
+from vdgs.settings.plain import from_dict
+from vdgs.storage.files import read_json
+from vdgs.storage.records import record_of
 
 
 @dataclass(frozen=True)
@@ -163,6 +36,10 @@ class RunFolder:
     @property
     def config_file(self) -> Path:
         return self.path / "config.yaml"
+
+    @property
+    def config(self) -> ConfigFile:
+        return ConfigFile(self.config_file)
 
     @property
     def capture_file(self) -> Path:
@@ -232,7 +109,7 @@ class RunFolder:
                 )
             return
         self.refuse_strangers()
-        self._write(settings, command)
+        self.config.write(settings, command)
 
     def refuse_strangers(self) -> None:
         """Raise RunError where a new run would be begun among other files."""
@@ -275,66 +152,25 @@ class RunFolder:
                 + f"\nThey make {' and '.join(lost)} useless. Add --redo to train that again, give the old settings to "
                 "continue, or take another --output."
             )  # fmt: skip
-        self._write(settings, command)
+        self.config.write(settings, command)
         if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
             self.coarse.discard_unless(after.coarse)
         return changed
 
     def move_capture(self, to: Path) -> None:
         """Remember that the capture of the run lies elsewhere now. That it is the same one is for the caller to see."""
-        settings, command = self.settings(), self.command()
+        settings, command = self.settings(), self.config.command()
         before, now = settings["capture"]["path"], str(to.resolve())
         if before == now:
             return
         words = shlex.split(command) if command else []
         moved = shlex.join([now if word == before else word for word in words]) if before in words else None
         settings["capture"]["path"] = now
-        self._write(settings, moved)
-
-    def _write(self, settings: dict[str, Any], command: str | None = None) -> None:
-        header = {"vdgs": {"version": __version__, "commit": _commit()} | ({"command": command} if command else {})}
-        write_text(self.config_file, yaml.safe_dump(header | settings, sort_keys=False, allow_unicode=True))
-
-    def command(self) -> str | None:
-        """The command that gave the run the settings that it has; None where several did, nothing says it, or the
-        folder is a copy of the one that the command works on."""
-        try:
-            header = yaml.safe_load(self.config_file.read_text(encoding="utf-8-sig"))["vdgs"]
-        except (OSError, yaml.YAMLError, RecursionError, ValueError, KeyError, TypeError):
-            return None
-        command = header.get("command") if isinstance(header, dict) else None
-        return command if isinstance(command, str) and not _makes_another(command, self.path) else None
+        self.config.write(settings, moved)
 
     def settings(self) -> dict[str, Any]:
-        """The settings of the run, every section whole, without the header that says which version wrote them."""
-        if not self.config_file.exists():
-            raise RunError(
-                f"{self.path}: is not a run folder (no config.yaml). Train first: vdgs run CAPTURE --output RUN"
-            )
-        try:
-            settings = yaml.safe_load(self.config_file.read_text(encoding="utf-8-sig"))
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise RunError(f"{self.config_file}: is damaged, not valid YAML ({error})") from error
-        if not isinstance(settings, dict) or not {"capture", "training"} <= settings.keys():
-            raise RunError(f"{self.config_file}: is damaged or not of a vdgs run (no `capture` and `training`)")
-        settings.pop("vdgs", None)
-        capture = settings.pop("capture")
-        if not isinstance(capture, dict) or not isinstance(capture.get("path"), str):
-            raise RunError(f"{self.config_file}: is damaged: `capture` must be a group of settings with a path")
-        try:
-            return {"capture": capture} | to_dict(self._read(settings))
-        except (ValueError, TypeError) as error:
-            raise RunError(f"{self.config_file}: {error}. Write it as it was, or start a new --output.") from error
-
-    @staticmethod
-    def _read(settings: dict[str, Any]) -> MethodConfig:
-        """Raises ValueError for a setting that there is not, of another kind or out of its range."""
-        method = from_dict(MethodConfig, settings, "")
-        for section in SECTIONS[1:]:
-            for each in numbers(getattr(method, section), (section,)):
-                if each.value is not None and each.range is not None and not each.range.holds(each.value):
-                    raise ValueError(f"{'.'.join(each.path)} is {each.value}; it must be {each.range}")
-        return method
+        """The settings of the run (`ConfigFile.settings`)."""
+        return self.config.settings()
 
     def method(self) -> MethodConfig:
         """The settings of the run but for the capture."""
@@ -374,27 +210,3 @@ class RunFolder:
     @property
     def _driver(self) -> Path:
         return self.path / ".run"
-
-
-def _makes_another(command: str, folder: Path) -> bool:
-    """Whether a command names the whole path of another folder as its output: this one is a copy."""
-    try:
-        words = shlex.split(command)
-    except ValueError:
-        return True
-    outputs = [after for word, after in pairwise(words) if word == "--output"]
-    outputs += [word.removeprefix("--output=") for word in words if word.startswith("--output=")]
-    return any(os.path.isabs(each) and os.path.realpath(each) != os.path.realpath(folder) for each in outputs)
-
-
-def _commit() -> str | None:
-    """The commit of the checkout that this package runs from; None outside a checkout of vdgs."""
-    root = Path(__file__).resolve().parents[3]
-    if not (root / ".git").exists() or not (root / "native").exists():
-        return None
-    command = ["git", "-C", str(root), "rev-parse", "HEAD"]
-    try:
-        found = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError:  # no git on this machine
-        return None
-    return found.stdout.strip() or None

@@ -14,7 +14,8 @@ from vdgs.captures.facts import refuse_another_capture
 from vdgs.captures.loading import load_capture
 from vdgs.errors import CaptureError, RunError
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.standing import standing_of
 from vdgs.runs.status import Status
 from vdgs.runs.vouching import load_vouched

@@ -15,9 +15,10 @@ from typing import Any, Literal
 
 from vdgs.errors import VdgsError
 from vdgs.partition.records import PartitionRecord
-from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.folder import RunFolder
 from vdgs.runs.keys import StageKeys, stage_keys
 from vdgs.runs.locks import is_locked
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.runs.vouching import foreign, to_delete
 from vdgs.storage.files import read_record
@@ -128,7 +129,7 @@ def standing_of(run: RunFolder, settings: dict[str, Any] | None = None) -> RunSt
         keys, why = run.keys() if settings is None else stage_keys(settings, run.coarse_identity()), ""
     except VdgsError as error:
         keys, why = None, _first_line(str(error))
-    return RunStanding(run.path, tuple(_Survey(run, keys, why).stages()), run.command(), run.is_driven())
+    return RunStanding(run.path, tuple(_Survey(run, keys, why).stages()), run.config.command(), run.is_driven())
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from safetensors import SafetensorError, safe_open
 
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import FORMAT, FORMAT_OF_PARTS, AnchorModel
-from vdgs.runs.folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.storage.tensors import identity
 
 NOT_VOUCHED = "not the model that status.json beside it speaks of"

@@ -27,10 +27,11 @@ from vdgs.model.visibility import effective_count
 from vdgs.partition.blocks import Blocks
 from vdgs.partition.regions import drawn_by, holds, ramp, split_anchors
 from vdgs.runs.cut import blocks_of, views_of_block
-from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.folder import RunFolder
 from vdgs.runs.ground import ground_of
 from vdgs.runs.opening import open_run
 from vdgs.runs.seldom import seldom_terms
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.method import block_limit, block_training
 from vdgs.settings.watching import WatchOptions

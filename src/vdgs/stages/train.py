@@ -18,8 +18,9 @@ from vdgs.executors.kinds import BLOCKS
 from vdgs.executors.placement import Share
 from vdgs.memory.estimate import Need, estimate
 from vdgs.runs.cut import blocks_of
-from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_capture
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.executors import ExecutorOptions
 from vdgs.settings.method import block_limit

@@ -15,8 +15,9 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.partition.merging import merge
 from vdgs.runs.cut import blocks_of, views_of_blocks
-from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import TrainedRun, open_capture, open_run
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.standing import standing_of
 from vdgs.runs.vouching import load_vouched
 from vdgs.settings.requests import ModelName

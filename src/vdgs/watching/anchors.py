@@ -10,7 +10,7 @@ from rich.console import Console
 
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.runs.folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.method import TrainConfig
 from vdgs.settings.watching import WatchOptions

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from vdgs.errors import RunError, Stopped, TrainingDiverged, VdgsError
 from vdgs.memory.process import is_out_of_memory, peak_memory_bytes, return_unused
-from vdgs.runs.folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.storage.checkpoints import SavedState, discard_after, load_newest, save_state
 from vdgs.watching.interrupts import stop_requests

@@ -43,7 +43,8 @@ from vdgs.evaluation.seen import seen_map
 from vdgs.inspection.starting import refuse_unworkable
 from vdgs.kernels.types import Raster
 from vdgs.model.spherical_harmonics import MAX_DEGREE
-from vdgs.runs.folder import RunFolder, StageFolder
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.settings.plain import differences, to_dict
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.files import read_json, write_json

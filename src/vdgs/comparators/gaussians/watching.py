@@ -26,7 +26,7 @@ from vdgs.comparators.gaussians.training import (
     to_saved,
     train,
 )
-from vdgs.runs.folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.checkpoints import save_state

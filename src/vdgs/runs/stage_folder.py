@@ -1,0 +1,118 @@
+"""The folder of one stage of a run: its checkpoints, log, model and status, as files (docs/architecture.md)."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from vdgs.errors import RunError
+from vdgs.runs.locks import hold
+from vdgs.runs.status import Status
+from vdgs.storage.files import read_json, write_json, write_text
+from vdgs.storage.records import known, record_of
+
+
+@dataclass(frozen=True)
+class StageFolder:
+    """Where one stage (coarse, a block) keeps its checkpoints, log and model."""
+
+    path: Path
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def log(self) -> Path:
+        return self.path / "log.jsonl"
+
+    @property
+    def model(self) -> Path:
+        return self.path / "model.safetensors"
+
+    @property
+    def status_file(self) -> Path:
+        return self.path / "status.json"
+
+    def status(self) -> Status:
+        """What `set_status` wrote last; state "new" if nothing did. RunError if the file is damaged."""
+        if not self.status_file.exists():
+            return Status()
+        written = read_json(self.status_file)
+        try:
+            if isinstance(written, dict) and "state" not in written:
+                raise ValueError("it says no state")
+            return record_of(Status, written)
+        except ValueError as error:
+            raise RunError(
+                f"{self.status_file}: is damaged ({error}). Delete this file and run the same command again."
+            ) from error
+
+    def set_status(self, status: Status) -> None:
+        write_json(self.status_file, known(status))
+
+    @property
+    def key_file(self) -> Path:
+        return self.path / "key"
+
+    def key(self) -> str | None:
+        """For which settings (`stages/keys.py`) this folder works; None if it says nothing of it."""
+        try:
+            return self.key_file.read_text(encoding="ascii", errors="replace").strip()
+        except OSError:
+            return None
+
+    def discard_unless(self, key: str) -> None:
+        """Delete what is here unless it was made for these settings, and let the folder work for them from now on.
+
+        What was made for other or unknown settings goes first and the key is written last: a folder never holds what
+        its key does not say.
+        """
+        if self.key() == key:
+            return
+        if self.path.exists():
+            for stale in self.path.iterdir():
+                if stale.is_dir():
+                    shutil.rmtree(stale)
+                elif stale not in (self.path / ".lock", self.key_file):
+                    stale.unlink()
+        write_text(self.key_file, key + "\n")
+
+    def holds_work(self) -> bool:
+        """Something was trained here."""
+        return self.model.exists() or any(self.checkpoints.glob("*.json"))
+
+    def is_done(self, key: str | None = None) -> bool:
+        """Trained to the end, for the settings of `key` where one is given."""
+        return self.status().state == "done" and self.model.exists() and key in (None, self.key())
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold this stage for this process; RunError if another one works on it."""
+        with hold(self.path):
+            yield
+
+    def is_held(self) -> bool:
+        """Another process works on this stage. A folder that cannot be written is held by none."""
+        try:
+            with self.locked():
+                return False
+        except RunError as error:
+            return isinstance(error.__cause__, BlockingIOError)
+
+    def truncate_log(self, iteration: int) -> None:
+        """Drop log lines after `iteration` (and a half-written last one), so that a continued run repeats none."""
+        if not self.log.exists():
+            return
+        kept = []
+        for line in self.log.read_text(encoding="utf-8", errors="replace").splitlines():
+            try:
+                if json.loads(line)["iteration"] <= iteration:
+                    kept.append(line)
+            except (ValueError, KeyError, TypeError):
+                break
+        write_text(self.log, "".join(line + "\n" for line in kept))
