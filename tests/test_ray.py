@@ -20,9 +20,9 @@ from cluster_support import (
     copy_run,
     evaluated,
     make_run,
-    merge_run,
     models,
     parent_of,
+    piece_of,
     train_here,
 )  # fmt: skip
 from vdgs import cli
@@ -74,8 +74,21 @@ def test_nodes_that_cannot_work_on_a_run_are_named_before_anything_starts(cut, c
     assert not list(run.glob(".fitness*"))
 
 
+def of_another_version(folder: Path) -> dict[str, str]:
+    """What makes a node import another vdgs."""
+    source = Path(cli.__file__).parent
+    shutil.copytree(source, folder / "vdgs", ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    (folder / "vdgs/of_another_version.py").touch()
+    # An installation that leads to its sources by a hook would lead there from that node too.
+    (folder / "sitecustomize.py").write_text(
+        "import sys\nsys.meta_path[:] = [each for each in sys.meta_path if 'editable' not in type(each).__module__]\n"
+    )
+    return {"PYTHONPATH": str(folder)}
+
+
 def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, cluster, tmp_path):
-    """A node dies under a block, one that joins late takes it; a command is killed, then the worker that keeps it."""
+    """A node dies under a block; of two that join late one cannot work on the run, the other takes the block; a command
+    is killed, then the worker that keeps it."""
     run = copy_run(cut, tmp_path / "run")
     with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
 
@@ -88,6 +101,8 @@ def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, clus
         processes = wait_for(2)
         cluster.remove(cluster.node_of(processes[1]))
         wait_until(lambda: not alive(processes[1]))
+        cluster.add("stranger", of_another_version(tmp_path / "stranger"))
+        wait_until(lambda: "cannot work on the run" in driver.printed())
         cluster.add("late")
         processes = wait_for(3)
         assert cluster.node_of(processes[1]) == "late"
@@ -97,9 +112,12 @@ def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, clus
         wait_for(5)
         driver.go_on()
         done = driver.finished()
+    cluster.remove("stranger")
     assert done.returncode == 0, done.stderr + done.stdout
     assert models(run) == models(local)
     assert "block 01: crashed by the loss of its node" in done.stdout
+    assert done.stdout.count("crashed by a node that cannot work on the run") == 1
+    assert "not the same code" in done.stdout
     assert "block 00: crashed by SIGKILL; continues from its last checkpoint, attempts left: 2" in done.stdout
     assert "block 00: crashed by the loss of its worker" in done.stdout
     assert "2 of 2 blocks done" in done.stdout
@@ -128,62 +146,37 @@ def test_a_driver_that_was_killed_finds_its_blocks_again_and_stops_them_when_ask
         assert "continuing at iteration 40" in (run / f"blocks/{block:02d}/output.log").read_text()
 
 
-def test_views_are_measured_on_nodes_for_whatever_driver_lives(local, cluster, tmp_path):
-    """The driver is killed; the next finds the piece, and the worker that keeps it is killed."""
-    run = merge_run(local, tmp_path / "run")
-    here = copy_run(run, tmp_path / "here")
-    assert vdgs("eval", here).returncode == 0
-    command = ("eval", run, "--executor", "ray", "--address", cluster.address)
-    with begun(*command, pause_at=("*/pieces/*/000001.npz", 1), environment=cluster.token) as first:
-        first.wait_until_paused(1)
+def test_views_are_measured_in_pieces_of_several_nodes_for_whatever_driver_lives(uncut, cluster, tmp_path):
+    """The driver is killed while both pieces are at work; the next finds them, and the worker of one is killed."""
+    here, run = (copy_run(uncut, tmp_path / name / "run") for name in ("here", "there"))
+    done = vdgs("eval", here, "--views", "training")
+    assert done.returncode == 0, done.stderr + done.stdout
+    command = ("eval", run, "--views", "training", "--executor", "ray", "--address", cluster.address)
+    with begun(*command, pause_at=("*/pieces/*/00000[19].npz", 1), environment=cluster.token) as first:
+        first.wait_until_paused(2)
         first.send_signal(signal.SIGKILL)
         first.finished()
+        keeper = {piece_of(piece): parent_of(piece) for piece in first.paused()}[0]
+        assert len({cluster.node_of(piece) for piece in first.paused()}) == 2
         with begun(*command, environment=cluster.token) as second:
-            wait_until(lambda: "piece 00: is still at work" in second.printed())
-            os.kill(parent_of(first.paused()[0]), signal.SIGKILL)
+            wait_until(lambda: second.printed().count("is still at work") == 2)
+            os.kill(keeper, signal.SIGKILL)
             wait_until(lambda: "piece 00: crashed by the loss of its worker" in second.printed())
             first.go_on()
             done = second.finished()
     assert done.returncode == 0, done.stderr + done.stdout
-    assert evaluated(run / "evaluation") == evaluated(here / "evaluation")
+    assert evaluated(run / "coarse/evaluation_training") == evaluated(here / "coarse/evaluation_training")
 
 
-def test_pieces_of_several_nodes_are_joined_to_the_files_of_one_process(uncut, cluster, tmp_path):
-    """Training views and tiles of a map: two pieces each, two nodes."""
+def test_a_map_is_put_together_from_pieces_of_several_nodes(uncut, cluster, tmp_path):
     pytest.importorskip("rasterio")
-    here, there = (copy_run(uncut, tmp_path / name / "run") for name in ("here", "there"))
+    command = ("map", uncut, "--gsd", "0.02", "--output")
     on_nodes = ("--executor", "ray", "--address", cluster.address)
-    for command in (("eval", "--views", "training"), ("map", "--gsd", "0.02")):
-        verb, *options = command
-        one = vdgs(verb, here, *options)
-        pieces = vdgs(verb, there, *options, *on_nodes, environment=cluster.token)
-        assert one.returncode == pieces.returncode == 0, one.stderr + pieces.stderr + pieces.stdout
-        assert re.search(r"([2-9]) of \1 pieces done", pieces.stdout)
-    for folder in ("coarse/evaluation_training", "maps"):
-        assert evaluated(there / folder) == evaluated(here / folder)
-
-
-def test_a_node_that_joins_late_and_cannot_work_on_the_run_is_named_and_avoided(cut, local, cluster, tmp_path):
-    run, stranger = copy_run(cut, tmp_path / "run"), tmp_path / "stranger"
-    source = Path(cli.__file__).parent
-    shutil.copytree(source, stranger / "vdgs", ignore=shutil.ignore_patterns("*.so", "__pycache__"))
-    (stranger / "vdgs/of_another_version.py").touch()
-    # An installation that leads to its sources by a hook would lead there from that node too.
-    (stranger / "sitecustomize.py").write_text(
-        "import sys\nsys.meta_path[:] = [each for each in sys.meta_path if 'editable' not in type(each).__module__]\n"
-    )
-    for name in cluster.names[1:]:
-        cluster.remove(name)
-    with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
-        driver.wait_until_paused(1)
-        cluster.add("stranger", {"PYTHONPATH": str(stranger)})
-        wait_until(lambda: "cannot work on the run" in driver.printed())
-        driver.go_on()
-        done = driver.finished()
-    assert done.returncode == 0, done.stderr + done.stdout
-    assert models(run) == models(local)
-    assert done.stdout.count("crashed by a node that cannot work on the run") == 1
-    assert "not the same code" in done.stdout
+    one = vdgs(*command, tmp_path / "one")
+    pieces = vdgs(*command, tmp_path / "pieces", *on_nodes, environment=cluster.token)
+    assert one.returncode == pieces.returncode == 0, one.stderr + pieces.stderr + pieces.stdout
+    assert re.search(r"([2-9]) of \1 pieces done", pieces.stdout)
+    assert evaluated(tmp_path / "pieces") == evaluated(tmp_path / "one")
 
 
 def test_a_block_for_which_a_node_has_no_memory_goes_to_a_larger_one_and_a_slow_node_is_waited_for(
