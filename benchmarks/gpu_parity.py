@@ -242,6 +242,22 @@ def keys_of(kernels: Operations, place: Place) -> Tensor:
     return kernels.cell_keys(place.anchors.positions, 0.5, place.background)
 
 
+def harmonic_colours(kernels: Operations, place: Place) -> Results:
+    means, count = place.anchors.positions, len(place.anchors)
+    rows = torch.arange(0, count, 3).to(place.device)
+    coefficients = place.random(count, 48)
+    return {"colours": kernels.harmonic_colours(means[rows], coefficients, rows, place.background, 3)}
+
+
+def fit_harmonics(kernels: Operations, place: Place) -> Results:
+    """Twenty pairs of each Gaussian, so that the third degree is known."""
+    pairs = 20 * (len(place.anchors) // 20)
+    directions = torch.nn.functional.normalize(place.random(pairs, 3), dim=1)
+    starts = torch.arange(0, pairs, 20).to(place.device)
+    weights = place.random(pairs).abs() + 0.1
+    return {"coefficients": kernels.fit_harmonics(directions, place.random(pairs, 3, seed=2), weights, starts, 3, 1e-3)}
+
+
 def member(rows: Tensor, count: int) -> Tensor:
     """Which of so many are among the rows."""
     found = torch.zeros(count, dtype=torch.bool).to(rows.device)
@@ -254,8 +270,8 @@ CASES: dict[str, Callable[[Operations, Place], Results]] = {
     case.__name__: case
     for case in (
         adam_rows, add_view_statistics, cell_centres, cell_keys, contains, count_visibility, cull, decode,
-        decode_to_train, decode_backward_adam, group_cells, group_max, mark_visible, morton_order, photometric_loss,
-        project, rasterise, rasterise_vjp,
+        decode_to_train, decode_backward_adam, fit_harmonics, group_cells, group_max, harmonic_colours, mark_visible,
+        morton_order, photometric_loss, project, rasterise, rasterise_vjp,
     )
 }  # fmt: skip
 

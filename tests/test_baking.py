@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from vdgs.export.harmonics_fit import RIDGE, fit_harmonics
 
 from merging_support import camera_above, model_at
 from vdgs.cameras import Camera
@@ -18,16 +19,15 @@ from vdgs.export.baking import Survey, bake, survey
 from vdgs.export.between import between
 from vdgs.export.formats.scene import Scene
 from vdgs.export.formats.spool import spooled
-from vdgs.export.harmonics_fit import RIDGE, fit_harmonics
 from vdgs.export.refining import refine
 from vdgs.export.refit import Baked, refit
 from vdgs.export.shapes import ellipsoids, logarithms
+from vdgs.kernels.spherical_harmonics import basis, function_count, view_colours
 from vdgs.kernels.types import DecoderWeights, HeadWeights
 from vdgs.model.anchor_model import AnchorModel, Part
 from vdgs.model.decoder import Decoder
 from vdgs.model.gaussians import Gaussians, draw_gaussians
 from vdgs.model.render import decode_view, render
-from vdgs.model.spherical_harmonics import basis, function_count, view_colours
 from vdgs.model.world import places, spawned
 
 VIEWS = [camera_above(0.3, -0.2), camera_above(-2.0, 1.0, tilt_deg=30.0), camera_above(1.5, 2.0, tilt_deg=-25.0)]

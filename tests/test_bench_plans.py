@@ -128,10 +128,11 @@ def test_presets_of_the_paper_restart_the_coarse_stage_and_literal_leaves_our_ch
         line.split(":")[0] for line in differences(to_dict(paper), to_dict(literal))
     }  # fmt: skip
     assert own == {
-        "assignment.best_block", "assignment.min_cameras", "assignment.mode", "block.compensation.added_to",
+        "assignment.best_block", "assignment.min_cameras", "assignment.mode", "block.background_noise",
+        "block.compensation.added_to",
         "block.compensation.gate", "block.context", "training.adam", "training.anchors.bound_sizes",
-        "training.anchors.fill_gaps", "training.anchors.outlier_distance", "training.loss.alpha_weight",
-        "training.loss.background", "training.loss.background_noise",
+        "training.anchors.fill_gaps", "training.anchors.outlier_distance", "training.loss.background",
+        "training.loss.background_noise",
     }  # fmt: skip
     assert not validate(literal)
 

@@ -20,9 +20,9 @@ from vdgs.errors import VdgsError
 from vdgs.export.formats import registry
 from vdgs.export.formats.scene import Facts, Page, Scene
 from vdgs.films.paths import look_at
+from vdgs.kernels.spherical_harmonics import dc_of_colours
 from vdgs.model.gaussians import Gaussians, draw_gaussians
 from vdgs.model.similarity import covariances
-from vdgs.model.spherical_harmonics import dc_of_colours
 from viewer_support import browser, open_page
 
 pytestmark = pytest.mark.xdist_group("viewer")

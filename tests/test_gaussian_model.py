@@ -14,8 +14,8 @@ from vdgs.cameras import Camera
 from vdgs.comparators.gaussians.density import DensityConfig, control_density, reset_logits, split
 from vdgs.comparators.gaussians.model import GaussiansModel, initial_gaussians
 from vdgs.errors import VdgsError
+from vdgs.kernels.spherical_harmonics import view_colours
 from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows
-from vdgs.model.spherical_harmonics import view_colours
 
 # What a view shows
 

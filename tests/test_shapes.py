@@ -15,8 +15,8 @@ from conftest import PACKAGE, files_with_shapes, module_name
 from vdgs.captures.heights import reach
 from vdgs.evaluation.metrics import squared_error
 from vdgs.kernels import native, reference, rotations
+from vdgs.kernels.spherical_harmonics import basis
 from vdgs.model.gaps import gap_points
-from vdgs.model.spherical_harmonics import basis
 from vdgs.model.visibility import visibility_of
 from vdgs.partition.plane import principal_plane
 from vdgs.settings.method import CompensationConfig

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from formats_support import overhead, picture, psnr, random_gaussians
 from vdgs.cameras import Camera
+from vdgs.kernels.spherical_harmonics import view_colours
 from vdgs.model.similarity import band_rotation, covariances, quaternion_of, rotate_harmonics, transformed
-from vdgs.model.spherical_harmonics import view_colours
 
 
 def moved(camera: Camera, scale: float, rotation: np.ndarray, translation: np.ndarray) -> Camera:

@@ -25,6 +25,7 @@ from vdgs.model.sizes import REACH, SPAN, SPREAD, largest_log_scales
 from vdgs.runs.ground import ground_of
 from vdgs.settings.method import AnchorConfig, BlockConfig, GrowthConfig, LossConfig
 from vdgs.training import Stage, train
+from vdgs.training.background import background_at
 from vdgs.training.target import Target
 
 FOCAL, WIDTH, HEIGHT = 100.0, 200, 160
@@ -161,25 +162,54 @@ def test_opaque_ground_costs_nothing_and_what_is_no_ground_neither():
     assert half == pytest.approx(0.5 * 0.5, rel=0.05)  # half of the pixels, weight a half
 
 
-def trained(loss: LossConfig, background: tuple[float, float, float] = (0.5, 0.5, 0.5)) -> AnchorModel:
+class Grey(Photographs):
+    """Of a place that has the colour of the background."""
+
+    def get(self, index: int, downscale: int = 1) -> tuple[torch.Tensor, None]:
+        return torch.full_like(super().get(index, downscale)[0], 128), None
+
+
+def light_through(loss: LossConfig, photographs: Photographs) -> float:
+    """The median of 1 - alpha, of a model that was trained before the colour of grey."""
     stage, state = block_stage(BlockConfig())
     config = replace(stage.config, iterations=300, loss=loss, growth=GrowthConfig(levels=0, start=10_000))
-    ground = [torch.ones(24, 32, dtype=torch.bool)] * 8
-    stage = replace(stage, config=config, background=background, surroundings=None, ground=ground)
+    ground, grey = [torch.ones(24, 32, dtype=torch.bool)] * 8, (128 / 255,) * 3
+    stage = replace(
+        stage, config=config, background=grey, surroundings=None, ground=ground, images=photographs
+    )  # fmt: skip
     train(state, stage, stop=lambda: False, after_step=lambda *_: None)
-    return AnchorModel(*state.result(), stage.voxel, background, {})
+    model = AnchorModel(*state.result(), stage.voxel, grey, {})
+    return float((1.0 - render(model, photographs.camera(0)).alpha.clamp(0, 1)).quantile(0.5))
 
 
-def test_ground_becomes_opaque_although_the_background_has_its_colour():
-    """The board's mean colour stands behind it: without the term light shines through, with it nearly none does."""
-    through = {
-        weight: 1.0 - render(trained(LossConfig(alpha_weight=weight, background_noise=0.0)), seen).alpha.clamp(0, 1)
-        for weight in (0.0, 0.05)
-        for seen in [Photographs().camera(0)]
-    }
-    board = through[0.05].quantile(0.5)
-    assert float(board) < 0.02
-    assert float(through[0.0].quantile(0.5)) > 3 * float(board)
+@pytest.mark.parametrize(
+    ("means", "photographs"),
+    [(LossConfig(), Grey()), (LossConfig(alpha_weight=0.05, background_noise=0.0), Photographs())],
+)
+def test_ground_becomes_opaque_although_the_background_has_its_colour(means, photographs):
+    """Without any means light shines through, with one nearly none does."""
+    board = light_through(means, photographs)
+    assert board < 0.02
+    assert light_through(LossConfig(background_noise=0.0), photographs) > 3 * board
+
+
+def test_backgrounds_are_of_all_colours_the_same_for_a_seed_and_no_others_without_noise():
+    stage, _ = block_stage(BlockConfig())
+
+    def colours(share: float) -> torch.Tensor:
+        loss = LossConfig(background_noise=share)
+        changed = replace(stage, config=replace(stage.config, loss=loss), background=(0.2, 0.5, 0.8))
+        return torch.stack([background_at(changed, iteration) for iteration in range(500)])
+
+    own = torch.tensor([0.2, 0.5, 0.8])
+    every = colours(1.0)
+    assert torch.equal(every, colours(1.0))
+    assert float(every.min()) >= 0
+    assert float(every.max()) <= 1
+    assert (every.amin(0) < 0.03).all()
+    assert (every.amax(0) > 0.97).all()
+    torch.testing.assert_close(colours(0.25), own + 0.25 * (every - own))
+    assert (colours(0.0) == own).all()
 
 
 # ------------------------------------------------------------------------------------------------ the law of sizes

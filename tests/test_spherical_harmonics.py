@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from vdgs.model.spherical_harmonics import basis, dc_of_colours, function_count, view_colours
+from vdgs.kernels.spherical_harmonics import basis, dc_of_colours, function_count, view_colours
 
 
 def quadrature() -> tuple[torch.Tensor, torch.Tensor]:

@@ -21,9 +21,8 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.export.harmonics_fit import fit_harmonics, segment_sums
 from vdgs.export.shapes import ellipsoids, logarithms
-from vdgs.export.working import in_order
+from vdgs.export.working import in_order, view_by_view
 from vdgs.kernels import choose
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.gaussians import Gaussians
@@ -34,6 +33,9 @@ from vdgs.model.world import places, spawned
 LEAST_PIXELS = 1e-3
 #: Anchors that a thread fits at once.
 ANCHORS_AT_ONCE = 4096
+#: Pull of spherical harmonics towards one colour for all directions (choice): where cameras look from few directions,
+#: the others must not swing. Chosen on validation views (docs/export.md).
+RIDGE = 1e-3
 #: Opacities are kept away from 0 and 1, where their logits have no end.
 OPACITY_MARGIN = 1e-4
 
@@ -70,8 +72,7 @@ def survey(model: AnchorModel, cameras: Sequence[Camera], after_view: Callable[[
         raise ValueError("baking needs the training cameras")
     k = model.anchors.offsets.shape[1]
     pixels, shown = np.zeros(len(model.anchors) * k, np.float32), []
-    for camera in cameras:
-        view = shown_in(model, camera)
+    for view in view_by_view(lambda camera: shown_in(model, camera), cameras, model.anchors.positions.device):
         pixels[view.gaussians.numpy()] += view.pixels.numpy()
         shown.append(view)
         after_view()
@@ -180,7 +181,9 @@ def fitted(seen: Seen, wanted: Int[np.ndarray, " m"], degree: int) -> Gaussians:
     """The Gaussians of the given numbers: ascending, close together, each shown by some view."""
     pairs = _gathered(seen, wanted)
     anchors, k = seen.model.anchors, seen.model.anchors.offsets.shape[1]
-    coefficients = fit_harmonics(pairs.directions, pairs.colours, pairs.pixels, pairs.starts, degree)
+    coefficients = choose(pairs.colours.device).fit_harmonics(
+        pairs.directions, pairs.colours, pairs.pixels, torch.from_numpy(pairs.starts), degree, RIDGE
+    )
     opacities = _means(pairs.opacities[:, None], pairs)[:, 0].clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     rows = torch.from_numpy(wanted // k)
     means = places(anchors.select(rows.to(anchors.positions.device))).cpu()
@@ -198,6 +201,6 @@ def fitted(seen: Seen, wanted: Int[np.ndarray, " m"], degree: int) -> Gaussians:
 def _means(values: Float[Tensor, "p d"], pairs: _Pairs) -> Float[Tensor, "m d"]:
     """The mean of each Gaussian's values, by its pixels in each view."""
     pixels = pairs.pixels.numpy()
-    total = segment_sums(pixels, pairs.starts)
-    columns = [segment_sums(pixels * column, pairs.starts) / total for column in values.numpy().T]
+    total = np.add.reduceat(pixels, pairs.starts)
+    columns = [np.add.reduceat(pixels * column, pairs.starts) / total for column in values.numpy().T]
     return torch.from_numpy(np.stack(columns, axis=1))

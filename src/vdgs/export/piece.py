@@ -16,7 +16,7 @@ from vdgs.export.refit import Baked, added, lacking, rows_of
 from vdgs.export.saved import load_array, load_lacking, load_shown, save_added, save_lacking, save_shown
 from vdgs.export.steps import COMPARE, FIT, SURVEY, BakingWork, Step, as_files_hold
 from vdgs.export.working import in_order
-from vdgs.model.spherical_harmonics import function_count
+from vdgs.kernels.spherical_harmonics import function_count
 from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.settings.requests import ExportRequest
 from vdgs.storage.files import write_array

@@ -21,16 +21,13 @@ from jaxtyping import Float, Float16, Int, Int32
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.export.baking import LEAST_PIXELS, part_count, part_size
+from vdgs.export.baking import LEAST_PIXELS, RIDGE, part_count, part_size
 from vdgs.export.formats.spool import Spooled
-from vdgs.export.harmonics_fit import fit_harmonics
-from vdgs.export.working import in_order
+from vdgs.export.working import in_order, view_by_view
 from vdgs.kernels import choose
 from vdgs.kernels.types import Splats
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.gaussians import Gaussians
 from vdgs.model.render import decode_view, draw
-from vdgs.model.spherical_harmonics import view_colours
 
 #: How often colours are fitted again to what pictures lack (chosen on validation views, docs/export.md).
 REFITS = 2
@@ -78,8 +75,8 @@ class Baked:
 def refit(baked: Baked, cameras: Sequence[Camera], after_view: Callable[[], None] = lambda: None) -> None:
     """Add to the colours of all Gaussians, on the disk, what the pictures of these cameras lack."""
     views = []
-    for camera in cameras:
-        views.append(lacking(baked, camera))
+    for view in view_by_view(lambda camera: lacking(baked, camera), cameras, baked.model.anchors.positions.device):
+        views.append(view)
         after_view()
     parts = [rows_of(baked, number) for number in range(part_count(baked.model))]
     for _ in in_order(lambda rows: baked.spool.add_colours(*added(baked, cameras, views, rows)), parts):
@@ -97,7 +94,7 @@ def lacking(baked: Baked, camera: Camera) -> Lacking:
     """What the baked Gaussians do not show of the model's picture."""
     wanted, numbers = baked.drawn(camera)
     raster, pullback = choose(torch.device("cpu")).rasterise_vjp(
-        _splats(baked.spool.rows(numbers), camera), torch.tensor(baked.model.background), camera.width, camera.height,
+        _splats(baked.spool, numbers, camera), torch.tensor(baked.model.background), camera.width, camera.height,
         depth=True,
     )  # fmt: skip
     # The derivative of the sum of the expected depth by the depth of a splat is the pixels that it makes.
@@ -110,17 +107,16 @@ def lacking(baked: Baked, camera: Camera) -> Lacking:
     )
 
 
-def _splats(gaussians: Gaussians, camera: Camera) -> Splats:
-    seen = choose(gaussians.means.device).project(
-        gaussians.means, gaussians.log_scales.exp(), gaussians.quaternions, camera
-    )
-    colours = view_colours(gaussians.dc, gaussians.rest, _directions(gaussians.means, camera), gaussians.degree)
-    opacities = torch.where(seen.valid, gaussians.logits.sigmoid(), 0.0)
+def _splats(spool: Spooled, numbers: Int[np.ndarray, " p"], camera: Camera) -> Splats:
+    kernels, (means, log_scales, quaternions, logits) = choose(torch.device("cpu")), spool.ellipsoids(numbers)
+    seen = kernels.project(means, log_scales.exp(), quaternions, camera)
+    colours = kernels.harmonic_colours(means, spool.coefficients, torch.from_numpy(numbers), _eye(camera), spool.degree)
+    opacities = torch.where(seen.valid, logits.sigmoid(), 0.0)
     return Splats(seen.means_px, seen.conics, seen.depths, colours, opacities)
 
 
-def _directions(means: Float[Tensor, "m 3"], camera: Camera) -> Float[Tensor, "m 3"]:
-    return torch.nn.functional.normalize(means - torch.from_numpy(camera.position.astype(np.float32)), dim=1)
+def _eye(camera: Camera) -> Float[Tensor, "3"]:
+    return torch.from_numpy(camera.position.astype(np.float32))
 
 
 def added(
@@ -133,7 +129,7 @@ def added(
         low, high = np.searchsorted(view.gaussians.numpy(), [rows.start, rows.stop])
         if low < high:
             here = view.gaussians[low:high].long()
-            directions = _directions(means[here], camera)
+            directions = torch.nn.functional.normalize(means[here] - _eye(camera), dim=1)
             columns.append((here, directions, view.colours[low:high].float(), view.pixels[low:high].float()))
     if not columns:
         return np.zeros(0, np.int64), torch.zeros(0, (baked.spool.degree + 1) ** 2, 3)
@@ -141,4 +137,5 @@ def added(
     order = numbers.sort(stable=True)
     changed, starts = np.unique(order.values.numpy(), return_index=True)
     directions, colours, pixels = (column[order.indices] for column in rest)
-    return changed, fit_harmonics(directions, colours + 0.5, pixels, starts, baked.spool.degree)
+    kernels, runs = choose(colours.device), torch.from_numpy(starts)
+    return changed, kernels.fit_harmonics(directions, colours + 0.5, pixels, runs, baked.spool.degree, RIDGE)

@@ -25,6 +25,8 @@ Names and dimensions, fixed once for all files in this folder:
        adam_rows(parameter [n,...], rows [v], gradient [v,...], moments, ...) -> finite; in place
        add_view_statistics(visible [v], inside [v], source [m], opacities [m], gradient_px [m,2], ..., sums)
                  in place
+       harmonic_colours(means [m,3], coefficients [n,c], rows [m], eye [3], degree) -> colours [m,3]
+       fit_harmonics(directions [p,3], colours [p,3], weights [p], starts [m], degree, ridge) -> coefficients [m,f,3]
        count_visibility(points [n,3], cameras) -> int32 [n];  mark_visible(points [n,3], camera) -> bool [n]
        cell_keys, cell_centres, group_cells, group_max, contains, morton_order: the lattice of growth
 

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.kernels.rotations import rotation_matrices
+from vdgs.kernels.spherical_harmonics import MAX_DEGREE, basis
 from vdgs.model.gaussians import Gaussians
-from vdgs.model.spherical_harmonics import MAX_DEGREE, basis
 
 #: How far a rotation matrix may be from one, in each of its numbers.
 TOLERANCE = 1e-6

@@ -133,16 +133,15 @@ class LossConfig:
     """Loss = (1 - w) L1 + w (1 - SSIM) + volume."""
     volume_weight: Annotated[float, Range(0, LARGE)] = 0.01
     """Weight of the mean product of the three scales of the Gaussians that are drawn."""
-    alpha_weight: Annotated[float, Range(0, LARGE)] = 0.02
+    alpha_weight: Annotated[float, Range(0, LARGE)] = 0.0
     """Weight of the root of 1 - alpha, averaged over a picture's pixels: those below the horizon and those that show
-    known ground; the sky is left alone. Without it ground stays half transparent and borrows the colour of the
-    background (choice; the paper is silent on its background)."""
+    known ground; the sky is left alone. A stronger means than backgrounds of random colour, which suffice as a rule."""
     background: Literal["mean", "black"] = "mean"
     """Colour behind the scene: the mean of the training photographs (choice: what no photograph shows is then drawn
     in a colour of the place), or black."""
-    background_noise: Annotated[float, SHARE] = 0.2
-    """In training the background is up to this much brighter or darker in each channel, at random, fading to nothing at
-    the end: transparent ground cannot then hide before a background of its own colour (choice)."""
+    background_noise: Annotated[float, SHARE] = 1.0
+    """So much of the background's colour is drawn anew for every step of training, from the whole RGB cube: ground that
+    were left transparent could not borrow a colour from it (choice; the paper is silent on its background)."""
 
 
 @dataclass(frozen=True)
@@ -286,8 +285,8 @@ class BlockConfig:
     """... and those of features times this."""
     early: Annotated[float, Range(1, 1000)] = 1.0
     """As `early` of the coarse stage, for the block's own updates: its anchors begin trained."""
-    background_noise: Annotated[float, SHARE] = 0.0
-    """As in the loss of the coarse stage, but for blocks: there the ground is opaque already (choice)."""
+    background_noise: Annotated[float, SHARE] = 1.0
+    """As in the loss of the coarse stage: without, blocks make ground transparent that was opaque (choice)."""
     decoder: Literal["frozen", "own"] = "frozen"
     """`frozen`: as the coarse stage left it (the paper). `own`: each block trains its copy, which its anchors keep in
     the merged scene (choice: with a frozen decoder blocks overfit sooner where few cameras see them)."""

@@ -1,11 +1,11 @@
 """Settings by name.
 
 `paper`     the paper's numbers. Where it is silent, or a reading of it leaves a scene that cannot be used, our choices
-            stay: gaps are filled and outliers start no anchor, ground is asked to be opaque before a background of the
-            mean colour, Gaussians are bounded in size and stay about their anchors; cameras are assigned by `coverage`,
-            join their best block, and blocks are topped up; what lies around a block is drawn; the gate of compensated
-            growth is lower where few cameras look, and g is added to means; only anchors that a photograph shows are
-            moved.
+            stay: gaps are filled and outliers start no anchor; the background is the mean colour, and in training
+            random ones, so that ground becomes opaque; Gaussians are bounded in size and stay about their anchors;
+            cameras are assigned by `coverage`, join their best block, and blocks are topped up; what lies around a
+            block is drawn; the gate of compensated growth is lower where few cameras look, and g is added to means;
+            only anchors that a photograph shows are moved.
 `literal`   none of those. What remains ours has no reading without a choice: the threshold tau, the number of clusters'
             starts, the width of a ring, who owns a place, how volumes are weighted in scenes of another scale.
 `laptop`    a good result in minutes on a CPU; docs/findings.md says what each of its departures brings.
@@ -36,10 +36,12 @@ PRESETS: dict[str, MethodConfig] = {
         training=TrainConfig(
             adam="dense",
             anchors=AnchorConfig(outlier_distance=0.0, fill_gaps=False, bound_sizes=False),
-            loss=LossConfig(alpha_weight=0.0, background="black", background_noise=0.0),
+            loss=LossConfig(background="black", background_noise=0.0),
         ),
         assignment=AssignmentConfig(mode="literal", best_block=False, min_cameras=0),
-        block=BlockConfig(context=False, compensation=CompensationConfig(gate="literal", added_to="sum")),
+        block=BlockConfig(
+            background_noise=0.0, context=False, compensation=CompensationConfig(gate="literal", added_to="sum")
+        ),
     ),
     "laptop": MethodConfig(
         training=TrainConfig(

@@ -1,4 +1,4 @@
-"""The colour behind the scene: the mean of the photographs, in training with noise that fades to nothing."""
+"""The colour behind the scene: the mean of the photographs, in training another one at every step."""
 
 from __future__ import annotations
 
@@ -22,11 +22,10 @@ def mean_colour(images: TrainingImages, count: int, downscale: int, at_most: int
 
 
 def background_at(stage: Stage, iteration: int) -> Tensor:
-    """Colour [3] behind the scene at this iteration (from 0)."""
-    colour = torch.tensor(stage.background)
-    noise = stage.config.loss.background_noise * (1 - iteration / stage.config.iterations)
-    if noise:
+    """Colour [3] behind the scene at this iteration (from 0): from its own to a random one of the RGB cube."""
+    colour, share = torch.tensor(stage.background), stage.config.loss.background_noise
+    if share:
         generator = torch.Generator().manual_seed(stage.config.seed * 1_000_033 + iteration)
         # Drawn on the CPU: the same colours for any device.
-        colour = colour + noise * (2 * torch.rand(3, generator=generator) - 1)
+        colour = torch.lerp(colour, torch.rand(3, generator=generator), share)
     return colour.to(stage.device, non_blocking=True)

@@ -21,9 +21,9 @@ from scipy.spatial import cKDTree
 
 from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
+from vdgs.kernels.spherical_harmonics import MAX_DEGREE, dc_of_colours, function_count
 from vdgs.kernels.types import Raster
 from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows
-from vdgs.model.spherical_harmonics import MAX_DEGREE, dc_of_colours, function_count
 from vdgs.storage.files import write_atomically
 from vdgs.storage.tensors import checksum, read_tensors, write_tensors
 

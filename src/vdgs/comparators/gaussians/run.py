@@ -41,8 +41,8 @@ from vdgs.evaluation.measured_model import EvaluationSettings, MeasuredModel, Mo
 from vdgs.evaluation.of_run import cached_photographs, true_depth
 from vdgs.evaluation.seen import seen_map
 from vdgs.inspection.starting import refuse_unworkable
+from vdgs.kernels.spherical_harmonics import MAX_DEGREE
 from vdgs.kernels.types import Raster
-from vdgs.model.spherical_harmonics import MAX_DEGREE
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.settings.plain import differences, to_dict

@@ -14,8 +14,8 @@ import torch
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.scene import ROWS, Facts, Scene, joined, one_line
+from vdgs.kernels.spherical_harmonics import MAX_DEGREE, function_count
 from vdgs.model.gaussians import Gaussians
-from vdgs.model.spherical_harmonics import MAX_DEGREE, function_count
 from vdgs.storage.files import write_atomically
 
 LONGEST_HEADER = 1 << 16

@@ -21,9 +21,9 @@ from torch import Tensor
 
 from vdgs import __version__
 from vdgs.errors import VdgsError
+from vdgs.kernels.spherical_harmonics import DC
 from vdgs.model.gaussians import Gaussians
 from vdgs.model.similarity import transformed
-from vdgs.model.spherical_harmonics import DC
 from vdgs.storage.files import write_json
 
 #: Writers work on so many Gaussians at a time, however large the chunks are that they are given: about 100 MB.

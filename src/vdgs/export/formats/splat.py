@@ -24,8 +24,8 @@ from vdgs.export.formats.scene import (
     unturned,
     write_beside,
 )
+from vdgs.kernels.spherical_harmonics import dc_of_colours
 from vdgs.model.gaussians import Gaussians
-from vdgs.model.spherical_harmonics import dc_of_colours
 from vdgs.storage.files import write_atomically
 
 LAYOUT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])

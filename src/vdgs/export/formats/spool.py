@@ -15,6 +15,9 @@ from vdgs.errors import RunError
 from vdgs.export.formats.scene import ROWS, Scene
 from vdgs.model.gaussians import Gaussians
 
+#: Where a Gaussian's coefficients of the spherical harmonics begin: behind its mean, scales, quaternion and logit.
+COEFFICIENTS = 3 + 3 + 4 + 1
+
 
 @dataclass(frozen=True, eq=False)
 class Spooled:
@@ -27,6 +30,17 @@ class Spooled:
     def rows(self, rows: np.ndarray) -> Gaussians:
         """The Gaussians of the given rows (indices), in their order."""
         return _unflattened(torch.from_numpy(np.array(self.table[rows])), self.shapes)
+
+    def ellipsoids(self, rows: np.ndarray) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Means [r, 3], log-scales [r, 3], quaternions [r, 4] and logits [r] of the given rows, in their order."""
+        columns = torch.from_numpy(np.array(self.table[:, :COEFFICIENTS][rows]))
+        means, log_scales, quaternions, logits = (each.contiguous() for each in columns.split([3, 3, 4, 1], 1))
+        return means, log_scales, quaternions, logits[:, 0]
+
+    @property
+    def coefficients(self) -> Float[Tensor, "n c"]:
+        """Of the spherical harmonics of all, on the disk: RGB of the constant function first."""
+        return torch.from_numpy(self.table)[:, COEFFICIENTS:]
 
     @property
     def degree(self) -> int:

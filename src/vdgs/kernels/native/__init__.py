@@ -5,6 +5,7 @@ from vdgs.kernels.native.cells import cell_centres, cell_keys, contains, group_c
 from vdgs.kernels.native.cull import cull
 from vdgs.kernels.native.decode import decode, decode_to_train
 from vdgs.kernels.native.decode_adam import decode_backward_adam
+from vdgs.kernels.native.harmonics import fit_harmonics, harmonic_colours
 from vdgs.kernels.native.loss import photometric_loss
 from vdgs.kernels.native.project import project
 from vdgs.kernels.native.rasterise import rasterise, rasterise_vjp
@@ -22,8 +23,10 @@ __all__ = [
     "decode",
     "decode_backward_adam",
     "decode_to_train",
+    "fit_harmonics",
     "group_cells",
     "group_max",
+    "harmonic_colours",
     "mark_visible",
     "morton_order",
     "photometric_loss",

@@ -1,0 +1,246 @@
+// Colours as spherical harmonics: what they show from a place, and their fit to what cameras saw. Sixteen Gaussians are
+// lanes. The functions are those of vdgs.kernels.spherical_harmonics.
+#include <algorithm>
+#include <cstdint>
+
+#include "bindings.h"
+#include "simd/simd.h"
+#include "threads.h"
+
+namespace vdgs {
+namespace {
+
+constexpr int kMaxDegree = 3;
+constexpr int64_t kTaskGroups = 32;
+// A pivot below this is one of no weight at all: what it would ask for stays 0.
+constexpr float kLeastPivot = 1e-12f;
+
+constexpr int functions(int degree) { return (degree + 1) * (degree + 1); }
+// Where element (i, j), j <= i, of a symmetric matrix lies.
+constexpr int packed(int i, int j) { return i * (i + 1) / 2 + j; }
+
+template <int degree>
+VDGS_INLINE void basis(F16 x, F16 y, F16 z, F16* out) {
+  out[0] = splat(0.28209479177387814f);
+  if constexpr (degree >= 1) {
+    const F16 a = splat(-0.4886025119029199f);
+    out[1] = a * y, out[2] = splat(0.4886025119029199f) * z, out[3] = a * x;
+  }
+  const F16 xx = x * x, yy = y * y, zz = z * z;
+  if constexpr (degree >= 2) {
+    const float a = 1.0925484305920792f;
+    out[4] = splat(a) * x * y, out[5] = splat(-a) * y * z;
+    out[6] = splat(0.31539156525252005f) * (splat(3.0f) * zz - splat(1.0f));
+    out[7] = splat(-a) * x * z, out[8] = splat(0.5f * a) * (xx - yy);
+  }
+  if constexpr (degree >= 3) {
+    const float a = 0.5900435899266435f, b = 2.890611442640554f, c = 0.4570457994644658f;
+    const F16 five = splat(5.0f) * zz - splat(1.0f);
+    out[9] = splat(-a) * y * (splat(3.0f) * xx - yy), out[10] = splat(b) * x * y * z, out[11] = splat(-c) * y * five;
+    out[12] = splat(0.3731763325901154f) * z * (splat(5.0f) * zz - splat(3.0f));
+    out[13] = splat(-c) * x * five, out[14] = splat(0.5f * b) * z * (xx - yy);
+    out[15] = splat(-a) * x * (xx - splat(3.0f) * yy);
+  }
+}
+
+// ------------------------------------------------------------------------------------------------ colours
+
+struct Coefficients {
+  const float* first;
+  int64_t stride;  // floats from one Gaussian to the next
+};
+
+template <int degree>
+void show(const float* means, const int64_t* rows, Coefficients all, const float* eye, int64_t count, float* colours) {
+  constexpr int f = functions(degree);
+  alignas(64) float own[3 * f][kLanes] = {}, there[3][kLanes] = {};
+  for (int64_t lane = 0; lane < count; ++lane) {
+    const float* from = all.first + rows[lane] * all.stride;
+    for (int i = 0; i < 3 * f; ++i) own[i][lane] = from[i];
+    for (int i = 0; i < 3; ++i) there[i][lane] = means[3 * lane + i] - eye[i];
+  }
+  const F16 x = load(there[0]), y = load(there[1]), z = load(there[2]);
+  const F16 scale = rsqrt(max(x * x + y * y + z * z, splat(1e-24f)));
+  F16 functions_there[f];
+  basis<degree>(x * scale, y * scale, z * scale, functions_there);
+  alignas(64) float shown[3][kLanes];
+  for (int channel = 0; channel < 3; ++channel) {
+    F16 sum = splat(0.5f);
+    for (int i = 0; i < f; ++i) sum = fma(functions_there[i], load(own[3 * i + channel]), sum);
+    store(shown[channel], max(sum, splat(0.0f)));
+  }
+  for (int64_t lane = 0; lane < count; ++lane)
+    for (int channel = 0; channel < 3; ++channel) colours[3 * lane + channel] = shown[channel][lane];
+}
+
+// ---------------------------------------------------------------------------------------------------- fit
+
+struct Pairs {
+  const float *directions, *colours, *weights;
+};
+
+// The pairs of one group of Gaussians: where those of each lane begin and how many there are; lanes beyond have none.
+struct Runs {
+  int64_t begin[kLanes] = {}, count[kLanes] = {};
+  int64_t most = 0;
+};
+
+// A direction, what was seen of the colour - 1/2, and its share of the Gaussian's weight, for every lane.
+struct Seen {
+  alignas(64) float direction[3][kLanes] = {}, colour[3][kLanes] = {}, share[kLanes] = {};
+};
+
+VDGS_INLINE void gather(const Pairs& pairs, const Runs& runs, const float* of_one, int64_t turn, Seen& seen) {
+  for (int lane = 0; lane < kLanes; ++lane) {
+    seen.share[lane] = 0.0f;
+    if (turn >= runs.count[lane]) continue;
+    const int64_t pair = runs.begin[lane] + turn;
+    for (int i = 0; i < 3; ++i) {
+      seen.direction[i][lane] = pairs.directions[3 * pair + i];
+      seen.colour[i][lane] = pairs.colours[3 * pair + i] - 0.5f;
+    }
+    seen.share[lane] = pairs.weights[pair] * of_one[lane];
+  }
+}
+
+// The ridge regression of sixteen Gaussians: normal equations, then Cholesky's factors in the matrix' place.
+template <int degree>
+class Regression {
+ public:
+  void add(const Seen& seen) {
+    F16 at[f];
+    basis<degree>(load(seen.direction[0]), load(seen.direction[1]), load(seen.direction[2]), at);
+    const F16 share = load(seen.share);
+    for (int i = 0; i < f; ++i) {
+      const F16 weighted = share * at[i];
+      for (int j = 0; j <= i; ++j) add_to(matrix_[packed(i, j)], weighted, at[j]);
+      for (int c = 0; c < 3; ++c) add_to(right_[3 * i + c], weighted, load(seen.colour[c]));
+    }
+  }
+
+  void solve(float ridge) {
+    for (int i = 0; i < f; ++i) factorise(i, i == 0 ? 0.0f : ridge);
+    for (int c = 0; c < 3; ++c) {
+      for (int i = 0; i < f; ++i) {
+        F16 rest = load(right_[3 * i + c]);
+        for (int j = 0; j < i; ++j) rest = fnma(load(matrix_[packed(i, j)]), load(right_[3 * j + c]), rest);
+        store(right_[3 * i + c], rest * load(inverse_[i]));
+      }
+      for (int i = f - 1; i >= 0; --i) {
+        F16 rest = load(right_[3 * i + c]);
+        for (int j = i + 1; j < f; ++j) rest = fnma(load(matrix_[packed(j, i)]), load(right_[3 * j + c]), rest);
+        store(right_[3 * i + c], rest * load(inverse_[i]));
+      }
+    }
+  }
+
+  float solution(int i, int lane) const { return right_[i][lane]; }
+
+ private:
+  static constexpr int f = functions(degree);
+
+  static VDGS_INLINE void add_to(float* sum, F16 a, F16 b) { store(sum, fma(a, b, load(sum))); }
+
+  // Row i of the lower factor; the reciprocal of its diagonal apart.
+  void factorise(int i, float ridge) {
+    F16 pivot = load(matrix_[packed(i, i)]) + splat(ridge);
+    for (int j = 0; j < i; ++j) {
+      F16 rest = load(matrix_[packed(i, j)]);
+      for (int k = 0; k < j; ++k) rest = fnma(load(matrix_[packed(i, k)]), load(matrix_[packed(j, k)]), rest);
+      rest = rest * load(inverse_[j]);
+      store(matrix_[packed(i, j)], rest);
+      pivot = fnma(rest, rest, pivot);
+    }
+    store(inverse_[i], zero_unless(gt(pivot, splat(kLeastPivot)), rsqrt(max(pivot, splat(kLeastPivot)))));
+  }
+
+  alignas(64) float matrix_[packed(f, 0)][kLanes] = {}, right_[3 * f][kLanes] = {}, inverse_[f][kLanes] = {};
+};
+
+Runs runs_of(const int64_t* starts, int64_t first, int64_t m, int64_t p) {
+  Runs runs;
+  for (int64_t lane = 0; lane < std::min<int64_t>(kLanes, m - first); ++lane) {
+    const int64_t own = first + lane;
+    runs.begin[lane] = starts[own];
+    runs.count[lane] = (own + 1 < m ? starts[own + 1] : p) - starts[own];
+    runs.most = std::max(runs.most, runs.count[lane]);
+  }
+  return runs;
+}
+
+template <int degree>
+void fit(const Pairs& pairs, const Runs& runs, float ridge, int64_t lanes, float* found) {
+  float of_one[kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) {
+    double total = 0.0;
+    for (int64_t turn = 0; turn < runs.count[lane]; ++turn) total += pairs.weights[runs.begin[lane] + turn];
+    of_one[lane] = total > 0.0 ? static_cast<float>(1.0 / total) : 0.0f;
+  }
+  Regression<degree> regression;
+  Seen seen;
+  for (int64_t turn = 0; turn < runs.most; ++turn) {
+    gather(pairs, runs, of_one, turn, seen);
+    regression.add(seen);
+  }
+  regression.solve(ridge);
+  constexpr int width = 3 * functions(degree);
+  for (int64_t lane = 0; lane < lanes; ++lane)
+    for (int i = 0; i < width; ++i) found[lane * width + i] = regression.solution(i, static_cast<int>(lane));
+}
+
+// Calls body(group's first Gaussian, how many it has) for all groups of sixteen.
+template <class Body>
+void in_groups(int64_t m, const Body& body) {
+  constexpr int64_t task = kTaskGroups * kLanes;
+  parallel_for((m + task - 1) / task, [&](int64_t index) {
+    const int64_t end = std::min(m, (index + 1) * task);
+    for (int64_t first = index * task; first < end; first += kLanes) body(first, std::min<int64_t>(kLanes, end - first));
+  });
+}
+
+using Vector = Array<const float, nb::ndim<1>>;
+using Matrix = Array<const float, nb::ndim<2>>;
+using Numbers = Array<const int64_t, nb::ndim<1>>;
+// Rows may stand apart from each other.
+using Rows = nb::ndarray<const float, nb::ndim<2>, nb::device::cpu>;
+
+template <int degree = 0, class Body>
+void with_degree(int wanted, const Body& body) {
+  if (wanted == degree) return body(std::integral_constant<int, degree>{});
+  if constexpr (degree < kMaxDegree) with_degree<degree + 1>(wanted, body);
+}
+
+void bound_fit(Matrix directions, Matrix colours, Vector weights, Numbers starts, int degree, float ridge,
+               Array<float, nb::ndim<2>> found) {
+  nb::gil_scoped_release release;
+  const Pairs pairs{directions.data(), colours.data(), weights.data()};
+  const int64_t m = static_cast<int64_t>(starts.shape(0)), p = static_cast<int64_t>(weights.shape(0));
+  with_degree(degree, [&](auto of) {
+    in_groups(m, [&](int64_t first, int64_t lanes) {
+      const Runs runs = runs_of(starts.data(), first, m, p);
+      fit<decltype(of)::value>(pairs, runs, ridge, lanes, found.data() + first * 3 * functions(decltype(of)::value));
+    });
+  });
+}
+
+void bound_show(Matrix means, Rows coefficients, Numbers rows, Vector eye, int degree, Array<float, nb::ndim<2>> colours) {
+  nb::gil_scoped_release release;
+  const Coefficients all{coefficients.data(), coefficients.stride(0)};
+  with_degree(degree, [&](auto of) {
+    in_groups(static_cast<int64_t>(rows.shape(0)), [&](int64_t first, int64_t lanes) {
+      show<decltype(of)::value>(means.data() + 3 * first, rows.data() + first, all, eye.data(), lanes,
+                                colours.data() + 3 * first);
+    });
+  });
+}
+
+}  // namespace
+
+VDGS_BIND(harmonics) {
+  m.def("fit_harmonics", &bound_fit, nb::arg("directions"), nb::arg("colours"), nb::arg("weights"), nb::arg("starts"),
+        nb::arg("degree"), nb::arg("ridge"), nb::arg("found"));
+  m.def("harmonic_colours", &bound_show, nb::arg("means"), nb::arg("coefficients"), nb::arg("rows"), nb::arg("eye"),
+        nb::arg("degree"), nb::arg("colours"));
+}
+
+}  // namespace vdgs
