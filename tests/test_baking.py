@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from vdgs.export.harmonics_fit import RIDGE, fit_harmonics
 
 from merging_support import camera_above, model_at
 from vdgs.cameras import Camera
@@ -22,7 +21,7 @@ from vdgs.export.formats.spool import spooled
 from vdgs.export.refining import refine
 from vdgs.export.refit import Baked, refit
 from vdgs.export.shapes import ellipsoids, logarithms
-from vdgs.kernels.spherical_harmonics import basis, function_count, view_colours
+from vdgs.kernels.spherical_harmonics import function_count
 from vdgs.kernels.types import DecoderWeights, HeadWeights
 from vdgs.model.anchor_model import AnchorModel, Part
 from vdgs.model.decoder import Decoder
@@ -237,45 +236,3 @@ def test_the_mean_of_ellipsoids_minds_neither_the_order_nor_the_signs_of_axes():
     w, x, y, z = turns.unbind(1)
     anew = torch.stack([w - x, w + x, y + z, z - y], 1) * quarter[0]
     torch.testing.assert_close(logarithms(scales[:, [0, 2, 1]], -anew), logarithm, atol=1e-4, rtol=0)
-
-
-def test_each_regression_is_solved_as_if_it_were_alone():
-    generator = torch.Generator().manual_seed(1)
-    counts = [1, 30, 2, 17, 2, 90]
-    starts = np.cumsum([0, *counts[:-1]])
-    directions = torch.nn.functional.normalize(torch.randn(sum(counts), 3, generator=generator), dim=1)
-    colours, weights = torch.rand(sum(counts), 3, generator=generator), torch.rand(sum(counts), generator=generator)
-    together = fit_harmonics(directions, colours, weights, starts, 3)
-    for number, (start, count) in enumerate(zip(starts, counts, strict=True)):
-        part = slice(start, start + count)
-        functions = basis(directions[part].double(), 3)
-        share = (weights[part] / weights[part].sum()).double()[:, None]
-        ridge = torch.diag(torch.tensor([0.0] + 15 * [RIDGE], dtype=torch.float64))
-        matrix = functions.T @ (share * functions) + ridge
-        alone = torch.linalg.solve(matrix, functions.T @ (share * (colours[part].double() - 0.5)))
-        torch.testing.assert_close(together[number].double(), alone, atol=2e-3, rtol=1e-3)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_harmonics_that_were_seen_from_everywhere_are_found_again(degree):
-    generator = torch.Generator().manual_seed(degree)
-    m, views = 5, 400
-    dc = 0.3 * torch.randn(m, 3, generator=generator)
-    rest = 0.03 * torch.randn(m, function_count(degree) - 1, 3, generator=generator)
-    directions = torch.nn.functional.normalize(torch.randn(m * views, 3, generator=generator), dim=1)
-    colours = view_colours(dc.repeat_interleave(views, 0), rest.repeat_interleave(views, 0), directions, degree)
-    weights = 0.5 + torch.rand(m * views, generator=generator)
-    found = fit_harmonics(directions, colours, weights, np.arange(m) * views, degree)
-    assert torch.allclose(found[:, 0], dc, atol=0.02)
-    # The ridge shrinks by RIDGE against the mean square of a function, 1 / (4 pi).
-    assert torch.allclose(found[:, 1:], rest, atol=0.03)
-
-
-def test_one_view_says_one_colour_for_all_directions():
-    colour = torch.tensor([[0.2, 0.5, 0.9]])
-    one = torch.tensor([[0.0, 0.0, -1.0]])
-    found = fit_harmonics(one, colour, torch.ones(1), np.array([0]), 3)
-    shown = view_colours(found[:, 0], found[:, 1:], one, 3)
-    assert torch.allclose(shown, colour, atol=0.01)
-    sideways = view_colours(found[:, 0], found[:, 1:], torch.tensor([[1.0, 0.0, 0.0]]), 3)
-    assert (sideways - colour).abs().max() < 0.25

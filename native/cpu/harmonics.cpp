@@ -1,6 +1,7 @@
 // Colours as spherical harmonics: what they show from a place, and their fit to what cameras saw. Sixteen Gaussians are
 // lanes. The functions are those of vdgs.kernels.spherical_harmonics.
 #include <algorithm>
+#include <cmath>
 #include <cstdint>
 
 #include "bindings.h"
@@ -13,7 +14,7 @@ namespace {
 constexpr int kMaxDegree = 3;
 constexpr int64_t kTaskGroups = 32;
 // A pivot below this is one of no weight at all: what it would ask for stays 0.
-constexpr float kLeastPivot = 1e-12f;
+constexpr double kLeastPivot = 1e-12;
 
 constexpr int functions(int degree) { return (degree + 1) * (degree + 1); }
 // Where element (i, j), j <= i, of a symmetric matrix lies.
@@ -103,58 +104,68 @@ VDGS_INLINE void gather(const Pairs& pairs, const Runs& runs, const float* of_on
   }
 }
 
-// The ridge regression of sixteen Gaussians: normal equations, then Cholesky's factors in the matrix' place.
+// The ridge regression of sixteen Gaussians: normal equations, then Cholesky's factors in the matrix' place. In double
+// precision, for where cameras look from few directions nothing but the ridge stands against what rounding leaves.
 template <int degree>
 class Regression {
  public:
   void add(const Seen& seen) {
     F16 at[f];
     basis<degree>(load(seen.direction[0]), load(seen.direction[1]), load(seen.direction[2]), at);
-    const F16 share = load(seen.share);
+    alignas(64) float there[f][kLanes];
+    for (int i = 0; i < f; ++i) store(there[i], at[i]);
     for (int i = 0; i < f; ++i) {
-      const F16 weighted = share * at[i];
-      for (int j = 0; j <= i; ++j) add_to(matrix_[packed(i, j)], weighted, at[j]);
-      for (int c = 0; c < 3; ++c) add_to(right_[3 * i + c], weighted, load(seen.colour[c]));
+      alignas(64) Lanes weighted;
+      for (int lane = 0; lane < kLanes; ++lane) weighted[lane] = double{seen.share[lane]} * there[i][lane];
+      for (int j = 0; j <= i; ++j) add_product(matrix_[packed(i, j)], weighted, there[j]);
+      for (int c = 0; c < 3; ++c) add_product(right_[3 * i + c], weighted, seen.colour[c]);
     }
   }
 
-  void solve(float ridge) {
-    for (int i = 0; i < f; ++i) factorise(i, i == 0 ? 0.0f : ridge);
+  void solve(double ridge) {
+    for (int i = 0; i < f; ++i) factorise(i, i == 0 ? 0.0 : ridge);
     for (int c = 0; c < 3; ++c) {
       for (int i = 0; i < f; ++i) {
-        F16 rest = load(right_[3 * i + c]);
-        for (int j = 0; j < i; ++j) rest = fnma(load(matrix_[packed(i, j)]), load(right_[3 * j + c]), rest);
-        store(right_[3 * i + c], rest * load(inverse_[i]));
+        for (int j = 0; j < i; ++j) subtract_product(right_[3 * i + c], matrix_[packed(i, j)], right_[3 * j + c]);
+        scale(right_[3 * i + c], inverse_[i]);
       }
       for (int i = f - 1; i >= 0; --i) {
-        F16 rest = load(right_[3 * i + c]);
-        for (int j = i + 1; j < f; ++j) rest = fnma(load(matrix_[packed(j, i)]), load(right_[3 * j + c]), rest);
-        store(right_[3 * i + c], rest * load(inverse_[i]));
+        for (int j = i + 1; j < f; ++j) subtract_product(right_[3 * i + c], matrix_[packed(j, i)], right_[3 * j + c]);
+        scale(right_[3 * i + c], inverse_[i]);
       }
     }
   }
 
-  float solution(int i, int lane) const { return right_[i][lane]; }
+  float solution(int i, int lane) const { return static_cast<float>(right_[i][lane]); }
 
  private:
+  using Lanes = double[kLanes];
   static constexpr int f = functions(degree);
 
-  static VDGS_INLINE void add_to(float* sum, F16 a, F16 b) { store(sum, fma(a, b, load(sum))); }
-
-  // Row i of the lower factor; the reciprocal of its diagonal apart.
-  void factorise(int i, float ridge) {
-    F16 pivot = load(matrix_[packed(i, i)]) + splat(ridge);
-    for (int j = 0; j < i; ++j) {
-      F16 rest = load(matrix_[packed(i, j)]);
-      for (int k = 0; k < j; ++k) rest = fnma(load(matrix_[packed(i, k)]), load(matrix_[packed(j, k)]), rest);
-      rest = rest * load(inverse_[j]);
-      store(matrix_[packed(i, j)], rest);
-      pivot = fnma(rest, rest, pivot);
-    }
-    store(inverse_[i], zero_unless(gt(pivot, splat(kLeastPivot)), rsqrt(max(pivot, splat(kLeastPivot)))));
+  static VDGS_INLINE void add_product(Lanes& sum, const Lanes& a, const float* b) {
+    for (int lane = 0; lane < kLanes; ++lane) sum[lane] += a[lane] * b[lane];
+  }
+  static VDGS_INLINE void subtract_product(Lanes& sum, const Lanes& a, const Lanes& b) {
+    for (int lane = 0; lane < kLanes; ++lane) sum[lane] -= a[lane] * b[lane];
+  }
+  static VDGS_INLINE void scale(Lanes& values, const Lanes& factor) {
+    for (int lane = 0; lane < kLanes; ++lane) values[lane] *= factor[lane];
   }
 
-  alignas(64) float matrix_[packed(f, 0)][kLanes] = {}, right_[3 * f][kLanes] = {}, inverse_[f][kLanes] = {};
+  // Row i of the lower factor; the reciprocal of its diagonal apart.
+  void factorise(int i, double ridge) {
+    for (int j = 0; j < i; ++j) {
+      for (int k = 0; k < j; ++k) subtract_product(matrix_[packed(i, j)], matrix_[packed(i, k)], matrix_[packed(j, k)]);
+      scale(matrix_[packed(i, j)], inverse_[j]);
+    }
+    for (int j = 0; j < i; ++j) subtract_product(matrix_[packed(i, i)], matrix_[packed(i, j)], matrix_[packed(i, j)]);
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const double pivot = matrix_[packed(i, i)][lane] + ridge;
+      inverse_[i][lane] = pivot > kLeastPivot ? 1.0 / std::sqrt(pivot) : 0.0;
+    }
+  }
+
+  alignas(64) Lanes matrix_[packed(f, 0)] = {}, right_[3 * f] = {}, inverse_[f] = {};
 };
 
 Runs runs_of(const int64_t* starts, int64_t first, int64_t m, int64_t p) {
@@ -169,7 +180,7 @@ Runs runs_of(const int64_t* starts, int64_t first, int64_t m, int64_t p) {
 }
 
 template <int degree>
-void fit(const Pairs& pairs, const Runs& runs, float ridge, int64_t lanes, float* found) {
+void fit(const Pairs& pairs, const Runs& runs, double ridge, int64_t lanes, float* found) {
   float of_one[kLanes];
   for (int lane = 0; lane < kLanes; ++lane) {
     double total = 0.0;
@@ -194,7 +205,8 @@ void in_groups(int64_t m, const Body& body) {
   constexpr int64_t task = kTaskGroups * kLanes;
   parallel_for((m + task - 1) / task, [&](int64_t index) {
     const int64_t end = std::min(m, (index + 1) * task);
-    for (int64_t first = index * task; first < end; first += kLanes) body(first, std::min<int64_t>(kLanes, end - first));
+    for (int64_t first = index * task; first < end; first += kLanes)
+      body(first, std::min<int64_t>(kLanes, end - first));
   });
 }
 
@@ -210,7 +222,7 @@ void with_degree(int wanted, const Body& body) {
   if constexpr (degree < kMaxDegree) with_degree<degree + 1>(wanted, body);
 }
 
-void bound_fit(Matrix directions, Matrix colours, Vector weights, Numbers starts, int degree, float ridge,
+void bound_fit(Matrix directions, Matrix colours, Vector weights, Numbers starts, int degree, double ridge,
                Array<float, nb::ndim<2>> found) {
   nb::gil_scoped_release release;
   const Pairs pairs{directions.data(), colours.data(), weights.data()};
@@ -223,7 +235,8 @@ void bound_fit(Matrix directions, Matrix colours, Vector weights, Numbers starts
   });
 }
 
-void bound_show(Matrix means, Rows coefficients, Numbers rows, Vector eye, int degree, Array<float, nb::ndim<2>> colours) {
+void bound_show(Matrix means, Rows coefficients, Numbers rows, Vector eye, int degree,
+                Array<float, nb::ndim<2>> colours) {
   nb::gil_scoped_release release;
   const Coefficients all{coefficients.data(), coefficients.stride(0)};
   with_degree(degree, [&](auto of) {

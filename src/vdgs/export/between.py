@@ -15,6 +15,13 @@ NEIGHBOURS = 2
 LIKE = 0.7
 
 
+def rounds(training: Sequence[Camera]) -> tuple[Sequence[Camera], ...]:
+    """By which pictures colours are fitted again, round by round: from between the training cameras, then by those
+    themselves. Subsets that take turns get about as far as all of them twice, with half of the pictures (ordered
+    subsets: Hudson and Larkin, 1994; docs/export.md)."""
+    return tuple(cameras for cameras in (between(training), training) if cameras)
+
+
 def between(cameras: Sequence[Camera]) -> list[Camera]:
     """Cameras midway between neighbours, each with the orientation and the picture of one of them; fewer than
     `NEIGHBOURS` times as many as those that are given."""

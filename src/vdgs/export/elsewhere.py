@@ -27,7 +27,6 @@ from vdgs.executors.work import clear, remove
 from vdgs.export.baking import part_size
 from vdgs.export.formats.scene import Scene
 from vdgs.export.formats.spool import Spooled, opened, spooled, unflattened
-from vdgs.export.refit import REFITS
 from vdgs.export.saved import load_added, load_array, load_shown
 from vdgs.export.steps import COMPARE, FIT, FOLDER, MEND, SURVEY, BakingWork, Step
 from vdgs.memory.estimate import drawing_bytes
@@ -80,7 +79,8 @@ class BakedElsewhere:
         self, run: TrainedRun, asked: ExportRequest, work: BakingWork, wish: Wish, console: Console
     ) -> None:  # fmt: skip
         self._run, self._asked, self._work, self._wish, self._console = run, asked, work, wish, console
-        self.cameras = work.cameras
+        self.cameras = [camera for cameras in work.rounds for camera in cameras]
+        self._last = len(work.rounds)
 
     def pixels(self) -> Float[np.ndarray, " g"]:
         """How many pixels each Gaussian of the model makes of what the training cameras see."""
@@ -102,13 +102,13 @@ class BakedElsewhere:
         work = self._work
         if not work.kept_file.exists():
             write_array(work.kept_file, kept.astype(np.int64))
-        there = [number for number in range(REFITS + 1) if work.spool_file(number).exists()]
-        for number in range(max(there, default=-1) + 1, REFITS + 1):
+        there = [number for number in range(self._last + 1) if work.spool_file(number).exists()]
+        for number in range(max(there, default=-1) + 1, self._last + 1):
             for step in work.steps_of(number):
                 self._send(step)
             self._gather(number, len(kept))
             self._tidy(number)
-        file = work.spool_file(REFITS)
+        file = work.spool_file(self._last)
         if self._asked.refine > 0:  # which changes it: what pieces came to stays as it is
             file = Path(shutil.copyfile(file, file.with_name("refined.spool")))
         spool = opened(file, self._asked.sh_degree, writable=self._asked.refine > 0)
@@ -168,7 +168,7 @@ class BakedElsewhere:
         if step.kind in (SURVEY, COMPARE):
             gaussians = len(self._run.model.anchors) * self._run.model.anchors.offsets.shape[1]
             held = GAUSSIAN_BYTES * gaussians if step.kind is COMPARE else 0
-            return drawing_bytes(model, held, max(camera.width * camera.height for camera in self._work.cameras))
+            return drawing_bytes(model, held, max(camera.width * camera.height for camera in self.cameras))
         before = self._work.step(COMPARE, step.round) if step.kind is MEND else self._work.step(SURVEY)
         pairs = sum(file.stat().st_size for file in self._work.files(before)) // (12 if step.kind is MEND else 8)
         most = min(PARTS_AT_ONCE, len(step.items))

@@ -14,10 +14,10 @@ from rich.progress import Progress
 
 from vdgs.errors import VdgsError
 from vdgs.export.baking import Survey, bake, survey
-from vdgs.export.between import between
+from vdgs.export.between import rounds
 from vdgs.export.formats.scene import Scene
 from vdgs.export.formats.spool import Spooled, spooled
-from vdgs.export.refit import REFITS, Baked, refit
+from vdgs.export.refit import Baked, refit
 from vdgs.runs.opening import TrainedRun
 from vdgs.settings.requests import ExportRequest
 from vdgs.watching.interrupts import stop_if_asked
@@ -34,8 +34,9 @@ class BakedHere:
     def __init__(self, run: TrainedRun, asked: ExportRequest, console: Console) -> None:
         self._run, self._asked, self._console = run, asked, console
         training = [view.camera for view in run.capture.train_views]
-        #: By which pictures are compared: those of the photographs and others between them.
-        self.cameras = [*training, *between(training)]
+        self._rounds = rounds(training)
+        #: By which pictures are compared.
+        self.cameras = [camera for cameras in self._rounds for camera in cameras]
         self._seen: Survey | None = None
 
     def pixels(self) -> Float[np.ndarray, " g"]:
@@ -54,22 +55,23 @@ class BakedHere:
     @contextmanager
     def spool(self, kept: Int[np.ndarray, " m"]) -> Iterator[Spooled]:
         """These Gaussians in a temporary file beside the first output; `pixels` was asked before."""
-        assert self._seen is not None
-        seen, folder = self._seen, self._asked.to[0].parent
+        folder = self._asked.to[0].parent
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".baking-") as temporary:
             with bar_on(self._console) as bar:
                 try:
-                    spool = self._fitted(seen, kept, Path(temporary) / "spool", bar)
+                    spool = self._fitted(kept, Path(temporary) / "spool", bar)
                 except OSError as error:
                     raise VdgsError(
                         f"{folder}: cannot hold the scene ({error.strerror or error}). Nothing was written."
                     ) from error
-                self._improve(Baked(seen.model, kept, spool), bar)
+                self._improve(Baked(self._run.model, kept, spool), bar)
             yield spool
 
-    def _fitted(self, seen: Survey, kept: Int[np.ndarray, " m"], file: Path, bar: Progress) -> Spooled:
-        degree = self._asked.sh_degree
+    def _fitted(self, kept: Int[np.ndarray, " m"], file: Path, bar: Progress) -> Spooled:
+        """Gaussians as the training cameras saw them; what these saw is forgotten."""
+        assert self._seen is not None
+        seen, degree, self._seen = self._seen, self._asked.sh_degree, None
         task = bar.add_task("fitting Gaussians", total=len(kept))
 
         def after_part(done: int) -> None:
@@ -80,11 +82,11 @@ class BakedHere:
 
     def _improve(self, baked: Baked, bar: Progress) -> None:
         """Fit the colours again to what pictures lack."""
-        task = bar.add_task("comparing pictures", total=REFITS * len(self.cameras))
+        task = bar.add_task("comparing pictures", total=len(self.cameras))
 
         def after_view() -> None:
             stop_if_asked()
             bar.advance(task)
 
-        for _ in range(REFITS):
-            refit(baked, self.cameras, after_view)
+        for cameras in self._rounds:
+            refit(baked, cameras, after_view)

@@ -61,7 +61,7 @@ def _results(
         return in_order(_fitting(run, asked, work, kept), places)
     baked = Baked(run.model, kept, opened(work.spool_file(step.round - 1), asked.sh_degree))
     if step.kind is COMPARE:
-        return map(_comparing(work, baked), places)
+        return map(_comparing(work, step, baked), places)
     return in_order(_mending(work, step, baked), places)
 
 
@@ -94,9 +94,9 @@ def _fitting(run: TrainedRun, asked: ExportRequest, work: BakingWork, kept: np.n
     return do
 
 
-def _comparing(work: BakingWork, baked: Baked) -> Do:
+def _comparing(work: BakingWork, step: Step, baked: Baked) -> Do:
     def do(place: int) -> Callable[[Path], None]:
-        found = lacking(baked, work.cameras[place])
+        found = lacking(baked, work.cameras_of(step.round)[place])
         return lambda path: save_lacking(path, found)
 
     return do
@@ -106,7 +106,7 @@ def _mending(work: BakingWork, step: Step, baked: Baked) -> Do:
     views = [load_lacking(file) for file in work.files(work.step(COMPARE, step.round))]
 
     def do(place: int) -> Callable[[Path], None]:
-        found = added(baked, work.cameras, views, rows_of(baked, place))
+        found = added(baked, work.cameras_of(step.round), views, rows_of(baked, place))
         return lambda path: save_added(path, *found)
 
     return do

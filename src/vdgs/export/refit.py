@@ -29,9 +29,6 @@ from vdgs.kernels.types import Splats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import decode_view, draw
 
-#: How often colours are fitted again to what pictures lack (chosen on validation views, docs/export.md).
-REFITS = 2
-
 
 @dataclass(frozen=True, eq=False)
 class Lacking:

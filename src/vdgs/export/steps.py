@@ -4,7 +4,7 @@ Each step needs all of the one before. Pieces are numbered through all steps, so
 
     survey              training views      what each shows
     fit                 parts of anchors    their Gaussians
-    compare, then mend  views, then parts   what pictures lack; what is added to colours. REFITS times
+    compare, then mend  views, then parts   what pictures lack; what is added to colours. For each of the `rounds`
 
     RUN/baking/pieces/KEY/   of all pieces together (`executors.work`): pixels.npy and kept.npy, from the survey;
                              N.spool, the Gaussians after N rounds of fitting colours, the last of them alone
@@ -22,10 +22,9 @@ from vdgs.cameras import Camera
 from vdgs.executors.kinds import Kind
 from vdgs.executors.work import PieceWork, spans_of
 from vdgs.export.baking import part_count
-from vdgs.export.between import between
+from vdgs.export.between import rounds
 from vdgs.export.formats import registry
 from vdgs.export.frame import usual_crs
-from vdgs.export.refit import REFITS
 from vdgs.runs.opening import TrainedRun
 from vdgs.settings.requests import ExportRequest
 
@@ -58,15 +57,15 @@ class BakingWork:
     pieces: PieceWork
     steps: tuple[Step, ...]
     training: Sequence[Camera]
-    cameras: Sequence[Camera]
-    """By which pictures are compared: the training views and others between them."""
+    rounds: tuple[Sequence[Camera], ...]
+    """By which pictures are compared."""
 
     @staticmethod
     def of(run: TrainedRun, asked: ExportRequest) -> BakingWork:
         """What baking a run as it is asked for (`as_files_hold`) comes to, and what it depends on."""
         training = [view.camera for view in run.capture.train_views]
-        cameras = [*training, *between(training)]
-        steps, spans = _cut(len(training), len(cameras), part_count(run.model))
+        cameras = rounds(training)
+        steps, spans = _cut(len(training), [len(each) for each in cameras], part_count(run.model))
         output = Path(os.path.abspath(run.folder.path)) / FOLDER
         return BakingWork(PieceWork.of(output, _depends_on(run, asked), spans), steps, training, cameras)
 
@@ -83,6 +82,10 @@ class BakingWork:
     def files(self, step: Step) -> list[Path]:
         """What the items of a step leave, in their order."""
         return [self.pieces.file(item, ".npy") for item in step.items]
+
+    def cameras_of(self, round_: int) -> Sequence[Camera]:
+        """By which pictures are compared in a round, from 1 on."""
+        return self.rounds[round_ - 1]
 
     @property
     def pixels_file(self) -> Path:
@@ -103,10 +106,10 @@ def as_files_hold(asked: ExportRequest) -> ExportRequest:
     return asked
 
 
-def _cut(views: int, cameras: int, parts: int) -> tuple[tuple[Step, ...], list[range]]:
+def _cut(views: int, rounds: Sequence[int], parts: int) -> tuple[tuple[Step, ...], list[range]]:
     steps, spans, first = list[Step](), list[range](), 0
     order = [(SURVEY, 0, views), (FIT, 0, parts)]
-    order += [(kind, i, n) for i in range(1, REFITS + 1) for kind, n in ((COMPARE, cameras), (MEND, parts))]
+    order += [(kind, i, n) for i, seen in enumerate(rounds, 1) for kind, n in ((COMPARE, seen), (MEND, parts))]
     for kind, round_, items in order:
         own = spans_of(items, *(VIEWS_OF_PIECE if kind in (SURVEY, COMPARE) else PARTS_OF_PIECE))
         steps.append(Step(kind, round_, range(first, first + items), range(len(spans), len(spans) + len(own))))

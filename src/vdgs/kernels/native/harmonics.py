@@ -28,7 +28,7 @@ def fit_harmonics(
     directions: Float[Tensor, "p 3"], colours: Float[Tensor, "p 3"], weights: Float[Tensor, " p"],
     starts: Int64[Tensor, " m"], degree: int, ridge: float,
 ) -> Float[Tensor, "m f 3"]:  # fmt: skip
-    """As `reference.harmonics.fit_harmonics`, in single precision. Same bits for any number of threads."""
+    """As `reference.harmonics.fit_harmonics`. Same bits for any number of threads."""
     f = function_count(degree)
     check_runs(starts, len(weights))
     found = torch.empty(len(starts), 3 * f)
