@@ -40,8 +40,8 @@ class RunRequest:
     """Run folder; new, or the run to continue."""
     preset: PresetName = "paper"
     """`laptop`: a good result in minutes. `paper`: the paper's numbers (100 000 + 50 000 iterations a block; blocks
-    restart the coarse stage's rates), and our choices where it is silent: gaps filled, outliers left out, ground asked
-    to be opaque before a background of the mean colour, bounded sizes, cameras by `coverage` and each in its best
+    restart the coarse stage's rates), and our choices where it is silent: gaps filled, outliers left out, a background
+    of the mean colour, of random colours in training, bounded sizes, cameras by `coverage` and each in its best
     block, blocks topped up and drawn in their surroundings, a lower gate of compensated growth, g added to means, only
     visible anchors moved. `literal`: the paper's numbers and none of those choices."""
     redo: bool = False

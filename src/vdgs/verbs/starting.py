@@ -37,7 +37,7 @@ class CoarseArguments:
     """Run folder; new, or the run to continue."""
     preset: PresetName = "paper"
     """`laptop`: a good result in minutes on a CPU. `paper`: the paper's 100 000 iterations, and our choices where it is
-    silent: gaps filled, outliers left out, ground asked to be opaque before a background of the mean colour, bounded
+    silent: gaps filled, outliers left out, a background of the mean colour, of random colours in training, bounded
     sizes, only visible anchors moved. `literal`: none of those choices."""
     threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
