@@ -104,7 +104,7 @@ def _train(
             surroundings=Surroundings(surroundings, coarse.decoder),
             may_hold=holds(blocks, index, method.block), mobility=ramp(blocks, index, method.block),
             appearance_of=chosen, shares=shares, crops=crops,
-            ground=solid_cells_of_all(ground, [view.camera for view in views]),
+            ground=solid_cells_of_all(ground, [view.camera for view in views]) if config.loss.alpha_weight else None,
             **seldom_terms(capture, ground, views, config.seldom),
             largest=(lambda positions: largest_log_scales(positions, flown)) if config.anchors.bound_sizes else None,
         )  # fmt: skip

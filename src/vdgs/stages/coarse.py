@@ -87,7 +87,7 @@ def open_stage(
     stage = Stage(
         config, images, len(cameras), voxel, camera_height(capture), background=background,
         shares=shares_for(config, anchors, cameras), device=torch.device(device),
-        ground=solid_cells_of_all(ground, cameras),
+        ground=solid_cells_of_all(ground, cameras) if config.loss.alpha_weight else None,
         **seldom_terms(capture, ground, capture.train_views, config.seldom),
         largest=(lambda positions: largest_log_scales(positions, cameras)) if config.anchors.bound_sizes else None,
     )  # fmt: skip
