@@ -211,11 +211,11 @@ ASKED = {
 @pytest.mark.parametrize("name", ASKED)
 def test_what_is_asked_changes_training_and_a_weight_of_nothing_does_not(name):
     given = seldom_stage(ASKED[name])
-    asked = bits(run(begin(given), given, until=6))
-    plain = run(start(), plain_stage(), until=6)
+    asked = bits(run(begin(given), given, until=12))
+    plain = run(start(), plain_stage(), until=12)
     assert any(asked[tensor] != value for tensor, value in bits(plain).items() if tensor.startswith("anchors"))
     off = replace(given, config=CONFIG)
-    state = run(begin(off), off, until=6)
+    state = run(begin(off), off, until=12)
     assert all(bits(state)[tensor] == value for tensor, value in bits(plain).items() if tensor.startswith("anchors"))
 
 
