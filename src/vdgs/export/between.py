@@ -16,10 +16,9 @@ LIKE = 0.7
 
 
 def rounds(training: Sequence[Camera]) -> tuple[Sequence[Camera], ...]:
-    """By which pictures colours are fitted again, round by round: from between the training cameras, then by those
-    themselves. Subsets that take turns get about as far as all of them twice, with half of the pictures (ordered
-    subsets: Hudson and Larkin, 1994; docs/export.md)."""
-    return tuple(cameras for cameras in (between(training), training) if cameras)
+    """By which pictures colours are fitted again, round by round: by all, then by those of the training cameras alone,
+    which gets as far as all twice would (docs/export.md)."""
+    return [*training, *between(training)], training
 
 
 def between(cameras: Sequence[Camera]) -> list[Camera]:

@@ -79,8 +79,7 @@ class BakedElsewhere:
         self, run: TrainedRun, asked: ExportRequest, work: BakingWork, wish: Wish, console: Console
     ) -> None:  # fmt: skip
         self._run, self._asked, self._work, self._wish, self._console = run, asked, work, wish, console
-        self.cameras = [camera for cameras in work.rounds for camera in cameras]
-        self._last = len(work.rounds)
+        self.cameras, self._last = work.rounds[0], len(work.rounds)
 
     def pixels(self) -> Float[np.ndarray, " g"]:
         """How many pixels each Gaussian of the model makes of what the training cameras see."""

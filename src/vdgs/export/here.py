@@ -36,7 +36,7 @@ class BakedHere:
         training = [view.camera for view in run.capture.train_views]
         self._rounds = rounds(training)
         #: By which pictures are compared.
-        self.cameras = [camera for cameras in self._rounds for camera in cameras]
+        self.cameras = self._rounds[0]
         self._seen: Survey | None = None
 
     def pixels(self) -> Float[np.ndarray, " g"]:
@@ -82,7 +82,7 @@ class BakedHere:
 
     def _improve(self, baked: Baked, bar: Progress) -> None:
         """Fit the colours again to what pictures lack."""
-        task = bar.add_task("comparing pictures", total=len(self.cameras))
+        task = bar.add_task("comparing pictures", total=sum(map(len, self._rounds)))
 
         def after_view() -> None:
             stop_if_asked()
