@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int32, Int64
@@ -110,8 +111,21 @@ def move_anchors(
         slow.hold_back(anchors)
     if of_weights is not None:
         # A first bias that carries an appearance is made of other tensors: autograd knows of which.
-        torch.autograd.backward(weights.tensors(), of_weights)
+        _Given.apply(of_weights, *weights.tensors()).backward()
     return finite
+
+
+class _Given(torch.autograd.Function):
+    """A number whose gradients by tensors are given. (`torch.autograd.backward` with gradients imports sympy.)"""
+
+    @staticmethod
+    def forward(ctx: Any, gradients: Sequence[Tensor], *tensors: Tensor) -> Tensor:
+        ctx.gradients = gradients
+        return tensors[0].new_zeros(())
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> tuple[Tensor | None, ...]:
+        return None, *ctx.gradients
 
 
 #: Rows that coast at a time: so many gradients of zero are held.
