@@ -21,9 +21,11 @@ COARSE = (
     "--preset", "laptop", "--iterations", "60", "--anchors.offsets", "3", "--growth.levels", "0", "--save-every", "20",
 )  # fmt: skip
 CUT = ("--blocks", "2", "--assignment.min-cameras", "4")
-BLOCKS = ("--save-every", "20", "--block.iterations", "60", "--redo")
+BLOCKS = ("--save-every", "10", "--block.iterations", "30", "--redo")
 #: Where each block waits once, on its way or when it is continued there.
-MIDDLE = "*/blocks/0?/checkpoints/00000040.json"
+MIDDLE = "*/blocks/0?/checkpoints/00000020.json"
+#: Pixels so small that the map of `uncut` has four tiles, two for each piece.
+FINE = ("--gsd", "0.022")
 
 #: Figures that depend on the machine and on what else it does.
 TIMES = ("fps", "render_seconds", "seconds", "peak_memory_bytes")
@@ -33,13 +35,13 @@ SERVER = """
 import json, os, sys, warnings
 warnings.simplefilter("ignore")
 from ray.cluster_utils import Cluster
-own = {"object_store_memory": 80 << 20, "memory": 8 << 30, "include_dashboard": False}
-cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **own})
+own = {"object_store_memory": 80 << 20, "memory": 8 << 30}
+head = {"num_cpus": 0, "include_dashboard": False, "include_log_monitor": False, "no_monitor": True}
+cluster = Cluster(initialize_head=True, head_node_args={**own, **head})
 nodes = {}
 def tell(**facts):
     print("ANSWER", json.dumps(facts), flush=True)
 tell(address=cluster.address)
-own.pop("include_dashboard")
 for line in sys.stdin:
     verb, name, options = json.loads(line)
     if verb == "add":

@@ -9,7 +9,7 @@ import torch
 from rich.console import Console
 
 from cli_support import begun, do_tasks_here, vdgs, wait_until
-from cluster_support import alive, copy_run, evaluated
+from cluster_support import FINE, alive, copy_run, evaluated
 from vdgs import pipeline
 from vdgs.errors import RunError, Stopped
 from vdgs.export import baking, steps
@@ -24,9 +24,6 @@ from vdgs.settings.executors import ExecutorOptions
 from vdgs.settings.requests import RunRequest
 
 pytestmark = pytest.mark.xdist_group("pieces")  # one worker, which trains once
-
-#: Pixels so small that a map has four tiles, two for each piece.
-FINE = ("--gsd", "0.022")
 
 
 @pytest.fixture(scope="module")

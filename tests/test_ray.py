@@ -2,7 +2,6 @@
 
 import importlib.util
 import os
-import re
 import shutil
 import signal
 import sys
@@ -10,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from cli_support import begun, vdgs, wait_until
+from cli_support import begun, do_tasks_here, vdgs, wait_until
 from cluster_support import (
     BLOCKS,
+    FINE,
     MIDDLE,
     Cluster,
     alive,
@@ -20,9 +20,9 @@ from cluster_support import (
     copy_run,
     evaluated,
     make_run,
-    merge_run,
     models,
     parent_of,
+    piece_of,
     train_here,
 )  # fmt: skip
 from vdgs import cli
@@ -121,82 +121,62 @@ def test_a_driver_that_was_killed_finds_its_blocks_again_and_stops_them_when_ask
         assert done.returncode == 130, done.stderr + done.stdout
         assert "every block that was training is saved" in done.stderr
         assert not any(alive(process) for process in first.paused())
-    done = vdgs(*on_ray(run, cluster), environment=cluster.token)
+    done = vdgs("train", run, *BLOCKS, prepare=do_tasks_here)  # what was saved leads to the same models anywhere
     assert done.returncode == 0, done.stderr + done.stdout
     assert models(run) == models(local)
     for block in (0, 1):
-        assert "continuing at iteration 40" in (run / f"blocks/{block:02d}/output.log").read_text()
+        assert "continuing at iteration 20" in (run / f"blocks/{block:02d}/output.log").read_text()
 
 
-def test_views_are_measured_on_nodes_for_whatever_driver_lives(local, cluster, tmp_path):
-    """The driver is killed; the next finds the piece, and the worker that keeps it is killed."""
-    run = merge_run(local, tmp_path / "run")
-    here = copy_run(run, tmp_path / "here")
+def test_views_are_measured_on_nodes_for_whatever_driver_lives(uncut, cluster, tmp_path):
+    """Two pieces on two nodes. The driver is killed; the next finds them, and the worker that keeps one is killed."""
+    here, run = (copy_run(uncut, tmp_path / name / "run") for name in ("here", "there"))
     assert vdgs("eval", here).returncode == 0
     command = ("eval", run, "--executor", "ray", "--address", cluster.address)
-    with begun(*command, pause_at=("*/pieces/*/000001.npz", 1), environment=cluster.token) as first:
-        first.wait_until_paused(1)
+    with begun(*command, pause_at=("*/pieces/*/00000[13].npz", 1), environment=cluster.token) as first:
+        first.wait_until_paused(2)
         first.send_signal(signal.SIGKILL)
         first.finished()
+        pieces = {piece_of(process): process for process in first.paused()}
+        assert cluster.node_of(pieces[0]) != cluster.node_of(pieces[1])
         with begun(*command, environment=cluster.token) as second:
-            wait_until(lambda: "piece 00: is still at work" in second.printed())
-            os.kill(parent_of(first.paused()[0]), signal.SIGKILL)
+            wait_until(lambda: second.printed().count("is still at work") == 2)
+            os.kill(parent_of(pieces[0]), signal.SIGKILL)
             wait_until(lambda: "piece 00: crashed by the loss of its worker" in second.printed())
             first.go_on()
             done = second.finished()
     assert done.returncode == 0, done.stderr + done.stdout
-    assert evaluated(run / "evaluation") == evaluated(here / "evaluation")
+    assert "2 of 2 pieces done" in done.stdout
+    assert evaluated(run / "coarse/evaluation") == evaluated(here / "coarse/evaluation")
 
 
-def test_pieces_of_several_nodes_are_joined_to_the_files_of_one_process(uncut, cluster, tmp_path):
-    """Training views and tiles of a map: two pieces each, two nodes."""
+def test_tiles_of_several_nodes_are_joined_to_the_maps_of_one_process(uncut, cluster, tmp_path):
+    """Two pieces, two nodes."""
     pytest.importorskip("rasterio")
     here, there = (copy_run(uncut, tmp_path / name / "run") for name in ("here", "there"))
-    on_nodes = ("--executor", "ray", "--address", cluster.address)
-    for command in (("eval", "--views", "training"), ("map", "--gsd", "0.02")):
-        verb, *options = command
-        one = vdgs(verb, here, *options)
-        pieces = vdgs(verb, there, *options, *on_nodes, environment=cluster.token)
-        assert one.returncode == pieces.returncode == 0, one.stderr + pieces.stderr + pieces.stdout
-        assert re.search(r"([2-9]) of \1 pieces done", pieces.stdout)
-    for folder in ("coarse/evaluation_training", "maps"):
-        assert evaluated(there / folder) == evaluated(here / folder)
+    one = vdgs("map", here, *FINE)
+    pieces = vdgs(
+        "map", there, *FINE, "--executor", "ray", "--address", cluster.address, environment=cluster.token
+    )  # fmt: skip
+    assert one.returncode == pieces.returncode == 0, one.stderr + pieces.stderr + pieces.stdout
+    assert "2 of 2 pieces done" in pieces.stdout
+    assert evaluated(there / "maps") == evaluated(here / "maps")
 
 
-def test_a_node_that_joins_late_and_cannot_work_on_the_run_is_named_and_avoided(cut, local, cluster, tmp_path):
-    run, stranger = copy_run(cut, tmp_path / "run"), tmp_path / "stranger"
-    source = Path(cli.__file__).parent
-    shutil.copytree(source, stranger / "vdgs", ignore=shutil.ignore_patterns("*.so", "__pycache__"))
-    (stranger / "vdgs/of_another_version.py").touch()
-    # An installation that leads to its sources by a hook would lead there from that node too.
-    (stranger / "sitecustomize.py").write_text(
-        "import sys\nsys.meta_path[:] = [each for each in sys.meta_path if 'editable' not in type(each).__module__]\n"
-    )
-    for name in cluster.names[1:]:
-        cluster.remove(name)
-    with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
-        driver.wait_until_paused(1)
-        cluster.add("stranger", {"PYTHONPATH": str(stranger)})
-        wait_until(lambda: "cannot work on the run" in driver.printed())
-        driver.go_on()
-        done = driver.finished()
-    assert done.returncode == 0, done.stderr + done.stdout
-    assert models(run) == models(local)
-    assert done.stdout.count("crashed by a node that cannot work on the run") == 1
-    assert "not the same code" in done.stdout
-
-
-def test_a_block_for_which_a_node_has_no_memory_goes_to_a_larger_one_and_a_slow_node_is_waited_for(
+def test_nodes_that_join_late_are_avoided_where_they_cannot_work_or_have_no_memory_and_a_slow_one_is_waited_for(
     cut, local, cluster, tmp_path
 ):
-    """Ray itself ends the block on a node whose memory it takes for full; the other block stands still meanwhile."""
+    """One block stands still on the only node. The other goes to a node of another vdgs, which is named and avoided,
+    then to one whose memory Ray takes for full and that ends it itself, then to a larger one."""
     run = copy_run(cut, tmp_path / "run")
-    for name in list(cluster.names):
+    for name in cluster.names[1:]:
         cluster.remove(name)
-    cluster.add("slow")
+    stranger = another_vdgs(tmp_path / "stranger")
     with begun(*on_ray(run, cluster), "--memory-gb", "1", pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
         driver.wait_until_paused(1)
         (slow,) = driver.paused()
+        cluster.add("stranger", {"PYTHONPATH": str(stranger)})
+        wait_until(lambda: "crashed by a node that cannot work on the run" in driver.printed())
         full = {"RAY_memory_monitor_refresh_ms": "100", "RAY_memory_usage_threshold": "0.001"}
         cluster.add("small", full, memory=1 << 30)
         wait_until(lambda: "crashed by Ray, to free memory" in driver.printed())
@@ -209,4 +189,18 @@ def test_a_block_for_which_a_node_has_no_memory_goes_to_a_larger_one_and_a_slow_
         done = driver.finished()
     assert done.returncode == 0, done.stderr + done.stdout
     assert models(run) == models(local)
+    assert done.stdout.count("crashed by a node that cannot work on the run") == 1
+    assert "not the same code" in done.stdout
     assert "(out of memory; it asks for 1.50 GB now)" in done.stdout
+
+
+def another_vdgs(folder: Path) -> Path:
+    """A folder to import a vdgs from that differs by one file."""
+    source = Path(cli.__file__).parent
+    shutil.copytree(source, folder / "vdgs", ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    (folder / "vdgs/of_another_version.py").touch()
+    # An installation that leads to its sources by a hook would lead there from that node too.
+    (folder / "sitecustomize.py").write_text(
+        "import sys\nsys.meta_path[:] = [each for each in sys.meta_path if 'editable' not in type(each).__module__]\n"
+    )
+    return folder
