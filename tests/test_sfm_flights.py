@@ -7,7 +7,6 @@ import io
 import os
 import shutil
 import signal
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from rich.console import Console
 pytest.importorskip("embreex")
 import pycolmap
 
-from sfm_support import ORIGIN, Flight, fly, grid, write_photograph
+from sfm_support import ORIGIN, Flight, copy_folder, fly, grid, write_photograph
 from vdgs.cameras import Camera
 from vdgs.captures.geodesy import enu_from_geodetic
 from vdgs.captures.loading import load_capture
@@ -29,7 +28,6 @@ from vdgs.settings.presets import PRESETS
 from vdgs.settings.requests import RunRequest
 from vdgs.settings.sfm import SfmOptions, SfmRequest
 from vdgs.sfm import features, mapping, matching, writing
-from vdgs.sfm import reconstruct as reconstructing
 from vdgs.sfm.reconstruct import reconstruct
 from vdgs.sfm.work import Work, call
 from vdgs.watching.interrupts import stop_requests
@@ -41,33 +39,14 @@ def console() -> Console:
     return Console(file=io.StringIO(), width=500)
 
 
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory) -> Flight:
-    return fly(tmp_path_factory.mktemp("flown") / "card", grid(3, 3, 9.0))
+@pytest.fixture
+def flight(nine) -> Flight:
+    return nine
 
 
-@pytest.fixture(scope="module")
-def begun(flight, tmp_path_factory) -> dict[str, Path]:
-    """What the folder of a capture held when each step began, but for the first."""
-    folder = tmp_path_factory.mktemp("begun")
-    output = folder / "capture"
-    with pytest.MonkeyPatch.context() as patch:
-        for step, name in (("matching", "_matches"), ("mapping", "_models"), ("writing", "_write")):
-            patch.setattr(reconstructing, name, after_copying(getattr(reconstructing, name), output, folder / step))
-        whole_capture(output, flight, reconstruct(SfmRequest((flight.folder,), output, threads=1), console()))
-    return {step: folder / step for step in ("matching", "mapping", "writing")}
-
-
-def after_copying(function: Callable, of: Path, to: Path) -> Callable:
-    def copied(*arguments):
-        copy_folder(of, to)
-        return function(*arguments)
-
-    return copied
-
-
-def copy_folder(of: Path, to: Path) -> None:
-    shutil.copytree(of, to, symlinks=True, ignore=shutil.ignore_patterns(".lock"))
+@pytest.fixture
+def begun(nine_begun) -> dict[str, Path]:
+    return nine_begun
 
 
 def pixels_of(file: Path) -> np.ndarray:
