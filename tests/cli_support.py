@@ -5,9 +5,10 @@
         command.wait_until_paused()
         command.send_signal(signal.SIGKILL)
 
-One server for each worker of the tests imports the package once; every command is forked from it. What a command starts
-itself (the processes of blocks) is started as always, unless it is asked to do that itself (`do_tasks_here`).
-`entry_point` is a whole `python -m vdgs.cli`, `python` any code in such a process.
+One server for each worker of the tests imports the package once; every command is forked from it, and so are the
+processes that it starts itself, such as those of blocks (`forking`), unless it is asked to start them as people's do
+(`start_tasks`) or to do in its own what they would (`do_tasks_here`). `entry_point` is a whole `python -m vdgs.cli`,
+`python` any code in such a process.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from forking import fork_tasks
 from pausing import Pause, pause_where_asked
 
 if TYPE_CHECKING:
@@ -37,10 +39,10 @@ PATIENCE_SECONDS = 900.0
 #: Seconds between two looks at what is waited for.
 GLANCE_SECONDS = 0.01
 
-#: What the server imports; the last two are what the cut and the first gradient import when they come.
+#: What the server imports, as far as it is there; the last ones are what commands import when they need it.
 IMPORTED = [
-    "vdgs.verbs", "vdgs.pipeline", "vdgs.films.film", "vdgs.bench.bench", "sklearn.cluster",
-    "torch.fx.experimental.symbolic_shapes",
+    "vdgs.verbs", "vdgs.pipeline", "vdgs.films.film", "vdgs.bench.bench", "vdgs.export.exporting", "sklearn.cluster",
+    "rasterio",
 ]  # fmt: skip
 # Only Linux forks safely what has imported this much.
 _PROCESSES = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
@@ -249,6 +251,7 @@ def _run(main: Callable[[], None], stdout: str, stderr: str, environment: dict[s
 
 
 def _vdgs(arguments: list[str], prepare: Callable[[], None] | None) -> None:
+    fork_tasks()
     if prepare is not None:
         prepare()
     from vdgs.cli import main

@@ -4,8 +4,11 @@ The whole suite runs on all cores (pytest-xdist, up to four workers); single fil
 Modules whose fixtures are expensive are marked as one group each (`xdist_group`): one worker runs them.
 """
 
+from __future__ import annotations
+
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -18,6 +21,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 import pytest
 from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
+
+if TYPE_CHECKING:
+    from sfm_support import Flight
 
 PACKAGE = Path(__file__).parents[1] / "src" / "vdgs"
 #: Memory is what limits their number on machines of many cores (about 1 GB each).
@@ -57,15 +63,19 @@ def pytest_collection_finish(session: pytest.Session) -> None:
                 )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def compiled_code(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("code")
+    """Where CUDA kernels that tests compile are kept, so that NVRTC runs once for all workers (that what is kept is
+    never wrong: test_cuda_compiling.py)."""
+    own = tmp_path_factory.getbasetemp()
+    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "compiled"
+    folder.mkdir(exist_ok=True)
+    return folder
 
 
 @pytest.fixture
 def compiled_once(compiled_code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """CUDA kernels that a module's tests compile are kept for it, so that NVRTC runs once (that what is kept is never
-    wrong: test_cuda_compiling.py)."""
+    """Compiled kernels are found again."""
     from vdgs.kernels.cuda import cache
 
     monkeypatch.setenv(cache.VARIABLE, str(compiled_code))
@@ -84,6 +94,22 @@ def uncut(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = vdgs("coarse", folder / "capture", "--output", folder / "coarse", *COARSE, "--test-every", "4")
     assert done.returncode == 0, done.stderr + done.stdout
     return folder / "coarse"
+
+
+@pytest.fixture(scope="session")
+def nine(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    """Nine photographs of a flight. Not to be changed."""
+    from sfm_support import fly, grid
+
+    return fly(tmp_path_factory.mktemp("nine") / "card", grid(3, 3, 9.0))
+
+
+@pytest.fixture(scope="session")
+def nine_begun(nine: Flight, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """What the folder of their capture holds when each step begins. Not to be changed: `sfm_support.copy_folder`."""
+    from sfm_support import folders_of_steps
+
+    return folders_of_steps(nine, tmp_path_factory.mktemp("begun"))
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

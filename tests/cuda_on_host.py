@@ -7,7 +7,9 @@ import os
 import re
 import shutil
 import subprocess
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -33,6 +35,19 @@ def build_on_host(source: str, folder: Path, text: str | None = None, counted: b
     `text` is compiled instead of the source's own. `counted`: what it reads and writes can be counted
     (cuda_traffic.py).
     """
+    if text is None and not counted:
+        return _library_of(source)
+    return ctypes.CDLL(str(_built(source, folder, text, counted)))
+
+
+@cache
+def _library_of(source: str) -> ctypes.CDLL:
+    """As it stands: compiled once for all tests of this process."""
+    with TemporaryDirectory() as folder:  # a library that is loaded needs its file no more
+        return ctypes.CDLL(str(_built(source, Path(folder))))
+
+
+def _built(source: str, folder: Path, text: str | None = None, counted: bool = False) -> Path:
     text = text or read_source(source)
     kernels = re.findall(r'extern "C" __global__ void(?: __launch_bounds__\([\w, ]+\))?\s+(\w+)\(', text)
     assert kernels, f"no kernel in {source}"
@@ -45,7 +60,7 @@ def build_on_host(source: str, folder: Path, text: str | None = None, counted: b
     _run_compiler(*watched, "-I", str(HERE), "-I", str(SHARED), "-c", str(folder / "host.cpp"), "-o", str(built))
     counting = [str(HERE / "cuda_traffic.cpp")] if counted else []
     _run_compiler("-shared", str(built), *counting, "-o", str(library))
-    return ctypes.CDLL(str(library))
+    return library
 
 
 def _run_compiler(*options: str) -> None:

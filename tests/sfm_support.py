@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import io
+import shutil
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
+from rich.console import Console
 
 from vdgs.cameras import Camera
 from vdgs.captures.geodesy import geodetic_from_enu
+from vdgs.settings.sfm import SfmRequest
 from vdgs.synth.flight import look_from
 from vdgs.synth.lighting import sky_map
 from vdgs.synth.photography import photograph
@@ -64,6 +69,30 @@ def fly(folder: Path, cameras: Sequence[Camera], extent: float = 60.0) -> Flight
         pixels = photograph(town, tracer, sky, camera, 1, np.ones(3))
         write_photograph(folder / name, pixels, k, camera.position)
     return flight
+
+
+def folders_of_steps(flight: Flight, folder: Path) -> dict[str, Path]:
+    """Folders as those of a capture of a flight are when each step of its reconstruction begins, but for the first."""
+    from vdgs.sfm import reconstruct as reconstructing
+
+    output = folder / "capture"
+    with pytest.MonkeyPatch.context() as patch:
+        for step, name in (("matching", "_matches"), ("mapping", "_models"), ("writing", "_write")):
+            patch.setattr(reconstructing, name, _after_copying(getattr(reconstructing, name), output, folder / step))
+        reconstructing.reconstruct(SfmRequest((flight.folder,), output, threads=1), Console(file=io.StringIO()))
+    return {step: folder / step for step in ("matching", "mapping", "writing")}
+
+
+def _after_copying(function: Callable, of: Path, to: Path) -> Callable:
+    def copied(*arguments):
+        copy_folder(of, to)
+        return function(*arguments)
+
+    return copied
+
+
+def copy_folder(of: Path, to: Path) -> None:
+    shutil.copytree(of, to, symlinks=True, ignore=shutil.ignore_patterns(".lock"))
 
 
 def sightings(cameras: Sequence[Camera], points: np.ndarray, extent: float = 60.0) -> list[dict[int, np.ndarray]]:

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from cli_support import begun, is_free, wait_until
+from cli_support import begun, is_free, vdgs, wait_until
+from forking import start_tasks
 from vdgs.bench import bench
 from vdgs.bench.bench import BenchSettings, run_bench
 from vdgs.bench.grids import bounds_of
@@ -37,12 +38,13 @@ def benched(tmp_path_factory) -> Path:
     pytest.importorskip("embreex")
     output = tmp_path_factory.mktemp("bench") / "out"
     command = ("bench", "toy", "--output", output, *SMALL)
-    with begun(*command, pause_at=("*/runs/*/coarse/log.jsonl", 1)) as process:
+    with begun(*command, pause_at=("*/runs/*/coarse/log.jsonl", 1), prepare=start_tasks) as process:
         process.wait_until_paused()  # the first run begins to train
         process.send_signal(signal.SIGKILL)  # without a word
         process.finished()
     wait_until(lambda: all(is_free(run) for run in output.glob("runs/*/*/*")))  # its processes notice, save and end
-    run_bench(settings(output), Console(file=io.StringIO()))
+    done = vdgs(*command)
+    assert done.returncode == 0, done.stderr + done.stdout
     return output
 
 

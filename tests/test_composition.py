@@ -36,7 +36,7 @@ def whole_run(capture: Path, run: Path, *device: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory) -> tuple[Path, Path]:
+def runs(tmp_path_factory, compiled_code) -> tuple[Path, Path]:
     """By the native set, and on the card."""
     folder = tmp_path_factory.mktemp("composed")
     drivers = build(folder / "kernels")
@@ -44,7 +44,7 @@ def runs(tmp_path_factory) -> tuple[Path, Path]:
     native, card = folder / "native", folder / "card"
     whole_run(folder / "capture", native)
     with pytest.MonkeyPatch.context() as patch:
-        install(drivers, folder / "code", patch, "cuda", "gsplat")
+        install(drivers, compiled_code, patch, "cuda", "gsplat")
         patch.setattr(devices, "_no_card", lambda index: "")
         with pretended_card():
             whole_run(folder / "capture", card, "--device", "cuda")

@@ -74,7 +74,7 @@ class Counted:
 
 
 @pytest.fixture(scope="module")
-def counted(tmp_path_factory) -> Counted:
+def counted(tmp_path_factory, compiled_code) -> Counted:
     folder = tmp_path_factory.mktemp("traffic")
     traffic: dict[str, list[Traffic]] = {}
 
@@ -87,7 +87,7 @@ def counted(tmp_path_factory) -> Counted:
         return made
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(cache.VARIABLE, str(folder / "code"))
+        patch.setenv(cache.VARIABLE, str(compiled_code))
         source, opaque = count(DECODE, decoding)
         positions, log_scales = anchors(2048, seed=1)
         rows = count(CULL, lambda program: cull(positions, log_scales, CAMERAS[0], program=program))

@@ -37,8 +37,8 @@ def drivers(tmp_path_factory):
     return build(tmp_path_factory.mktemp("kernels"))
 
 
-def test_all_of_it_runs_and_agrees(gpu, drivers, tmp_path, monkeypatch, capsys):
-    install(drivers, tmp_path / "code", monkeypatch, "cuda", "")
+def test_all_of_it_runs_and_agrees(gpu, drivers, compiled_code, tmp_path, monkeypatch, capsys):
+    install(drivers, compiled_code, monkeypatch, "cuda", "")
     monkeypatch.setattr(devices, "_no_card", lambda index: "")
     monkeypatch.setattr(gpu, "TOWN_DB", 3.0)  # after eight iterations, less says nothing
     write_colmap(tmp_path / "capture", tiny_scene(columns=3, rows=2, width=32, height=24, points=80))

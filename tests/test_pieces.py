@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from cli_support import begun, do_tasks_here, vdgs, wait_until
 from cluster_support import alive, copy_run, evaluated, merge_run, train_here
+from forking import start_tasks
 from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.by_block import BlockMetrics, SeamMetrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
@@ -213,7 +214,8 @@ def test_cameras_scored_in_pieces_are_assigned_as_by_one_process(tmp_path, uncut
     one, run = copy_run(uncut, tmp_path / "one"), copy_run(uncut, tmp_path / "run")
     cut = ("--blocks", "3", "--assignment.min-cameras", "3")
     assert vdgs("partition", one, *cut).returncode == 0
-    with begun("partition", run, *cut, "--jobs", "2", pause_at=("*/pieces/*/000001.npz", 1)) as first:
+    command = ("partition", run, *cut, "--jobs", "2")
+    with begun(*command, pause_at=("*/pieces/*/000001.npz", 1), prepare=start_tasks) as first:
         first.wait_until_paused(1)
         pattern = "partition/pieces/*/00/status.json"
         wait_until(lambda: [json.loads(file.read_text())["state"] for file in run.glob(pattern)] == ["done"])
@@ -221,7 +223,7 @@ def test_cameras_scored_in_pieces_are_assigned_as_by_one_process(tmp_path, uncut
         first.finished()
         (piece,) = first.paused()
         wait_until(lambda: not alive(piece))
-    with begun("partition", run, *cut, "--jobs", "2", pause_at=("*/pieces/*/000001.npz", 1)) as second:
+    with begun(*command, pause_at=("*/pieces/*/000001.npz", 1)) as second:
         second.wait_until_paused(1)
         second.kill_paused()
         done = second.finished()

@@ -289,18 +289,29 @@ def test_ctrl_c_between_stages_stops_the_run_and_the_same_command_continues(capt
     assert "next: open" in status.stdout
 
 
+def time_few_steps() -> None:
+    """Let a plan be made of fewer steps than take seconds."""
+    from vdgs import planning
+
+    planning.TIMED_SECONDS = 0.0
+
+
 def test_a_dry_run_says_what_it_takes_and_writes_nothing(capture, copied, tmp_path):
     before = moments(copied)
     for output, done in ((copied, True), (tmp_path / "new", False)):
-        planned = vdgs("run", capture, "--output", output, *SETTINGS, "--dry-run")
+        planned = vdgs("run", capture, "--output", output, *SETTINGS, "--dry-run", prepare=time_few_steps)
         assert planned.returncode == 0, planned.stderr
         assert f"{ITERATIONS} iterations" in planned.stdout
         assert f"2 blocks: about {BLOCK_ITERATIONS} iterations each, 2 at once" in planned.stdout
         assert planned.stdout.count("done already") == 2 * done
-    changed = vdgs("run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0", "--dry-run")
+    changed = vdgs(
+        "run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0", "--dry-run", prepare=time_few_steps
+    )
     assert "changed --lambda-vis: 1.0 -> 0.0" in changed.stdout
     assert changed.stdout.count("done already") == 1
-    shrunk = vdgs("run", capture, "--output", copied, *SETTINGS, "--downscale", "2", "--dry-run")
+    shrunk = vdgs(
+        "run", capture, "--output", copied, *SETTINGS, "--downscale", "2", "--dry-run", prepare=time_few_steps
+    )
     assert "changed --downscale: 1.0 -> 2.0" in shrunk.stdout, shrunk.stderr
     assert "done already" not in shrunk.stdout
     assert changed_files(copied, before) == set()

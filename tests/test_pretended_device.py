@@ -67,15 +67,10 @@ def drivers(tmp_path_factory):
     return build(tmp_path_factory.mktemp("composition"))
 
 
-@pytest.fixture(scope="module")
-def code(tmp_path_factory):
-    return tmp_path_factory.mktemp("code")
-
-
 @pytest.fixture(params=["gsplat", "cuda"])
-def rasteriser(request, drivers, code, monkeypatch) -> str:
+def rasteriser(request, drivers, compiled_code, monkeypatch) -> str:
     """With each of the rasterisers that may draw on a card."""
-    install(drivers, code, monkeypatch, "cuda", request.param)
+    install(drivers, compiled_code, monkeypatch, "cuda", request.param)
     return request.param
 
 
@@ -89,11 +84,11 @@ def test_a_step_on_another_device_makes_the_numbers_of_the_processor(monkeypatch
         torch.testing.assert_close(found[name], tensor, rtol=1e-3, atol=1e-5)
 
 
-def test_steps_have_the_same_bits_whichever_block_comes_first(monkeypatch, drivers, code):
+def test_steps_have_the_same_bits_whichever_block_comes_first(monkeypatch, drivers, compiled_code):
     """With the own rasteriser: splats stand in another order, among frozen surroundings too."""
     found = []
     for order in ORDERS[:3]:
-        install(drivers, code, monkeypatch, "cuda", "cuda")  # anew: tables are kept for a card
+        install(drivers, compiled_code, monkeypatch, "cuda", "cuda")  # anew: tables are kept for a card
         for driver in drivers.values():
             monkeypatch.setattr(driver, "order", order)
         with pretended_card():

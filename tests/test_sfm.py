@@ -19,7 +19,7 @@ from rich.console import Console
 pytest.importorskip("embreex")
 import pycolmap
 
-from sfm_support import FOCAL, ORIGIN, Flight, fly, grid, write_photograph
+from sfm_support import FOCAL, ORIGIN, Flight, write_photograph
 from vdgs.captures.alignment import Similarity
 from vdgs.captures.geodesy import enu_from_geodetic
 from vdgs.captures.loading import load_capture
@@ -50,9 +50,10 @@ def console() -> Console:
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory) -> Flight:
+def flight(nine, tmp_path_factory) -> Flight:
     """Nine photographs; one that shows nothing, one that is cut off, and a text beside them."""
-    flown = fly(tmp_path_factory.mktemp("flight") / "card", grid(3, 3, 9.0))
+    flown = Flight(tmp_path_factory.mktemp("flight") / "card", nine.cameras)
+    shutil.copytree(nine.folder, flown.folder)
     grey = np.full((300, 400, 3), 128, np.uint8)
     write_photograph(flown.folder / "grey.jpg", grey, 50, np.array([0.0, 3.0, 45.0]))
     (flown.folder / "cut.jpg").write_bytes((flown.folder / flown.names[0]).read_bytes()[:9000])

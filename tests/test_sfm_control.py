@@ -16,7 +16,7 @@ pytest.importorskip("embreex")
 pytest.importorskip("pyproj")
 import pyproj
 
-from sfm_support import ALTITUDE_M, HEIGHT, ORIGIN, WIDTH, Flight, fly, grid, sightings, write_photograph
+from sfm_support import ALTITUDE_M, HEIGHT, ORIGIN, WIDTH, Flight, copy_folder, sightings, write_photograph
 from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import facts_rows, read_reconstruction, survey_table
@@ -40,8 +40,8 @@ def console() -> Console:
 
 
 @pytest.fixture(scope="module")
-def flight(tmp_path_factory) -> Flight:
-    return fly(tmp_path_factory.mktemp("surveyed") / "card", grid(3, 3, 9.0))
+def flight(nine) -> Flight:
+    return nine
 
 
 @pytest.fixture(scope="module")
@@ -50,9 +50,10 @@ def points(flight) -> list[dict[int, np.ndarray]]:
 
 
 @pytest.fixture(scope="module")
-def made(flight, tmp_path_factory) -> Path:
+def made(flight, nine_begun, tmp_path_factory) -> Path:
     """Placed by GPS; its features, matches and model are kept."""
     output = tmp_path_factory.mktemp("made") / "capture"
+    copy_folder(nine_begun["writing"], output)
     reconstruct(SfmRequest((flight.folder,), output, threads=1, keep_work=True), console())
     return output
 

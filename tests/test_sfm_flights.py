@@ -17,7 +17,7 @@ from rich.console import Console
 pytest.importorskip("embreex")
 import pycolmap
 
-from sfm_support import ORIGIN, Flight, fly, grid, write_photograph
+from sfm_support import ORIGIN, Flight, copy_folder, fly, grid, write_photograph
 from vdgs.cameras import Camera
 from vdgs.captures.geodesy import enu_from_geodetic
 from vdgs.captures.loading import load_capture
@@ -39,9 +39,14 @@ def console() -> Console:
     return Console(file=io.StringIO(), width=500)
 
 
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory) -> Flight:
-    return fly(tmp_path_factory.mktemp("flown") / "card", grid(3, 3, 9.0))
+@pytest.fixture
+def flight(nine) -> Flight:
+    return nine
+
+
+@pytest.fixture
+def begun(nine_begun) -> dict[str, Path]:
+    return nine_begun
 
 
 def pixels_of(file: Path) -> np.ndarray:
@@ -168,13 +173,16 @@ STEPS = {
 }
 
 
-@pytest.mark.parametrize(("room", "name", "after"), STEPS.values(), ids=STEPS)
+@pytest.mark.parametrize("step", STEPS)
 def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
-    flight, tmp_path, monkeypatch, room, name, after
+    flight, begun, tmp_path, monkeypatch, step
 ):
     monkeypatch.setattr(matching, "AT_ONCE", 4)
     monkeypatch.setattr(mapping, "LEAST_BETWEEN", 2)
+    room, name, after = STEPS[step]
     output, stop, function = tmp_path / "capture", Stopper(after), getattr(room, name)
+    if step in begun:
+        copy_folder(begun[step], output)
     request = SfmRequest((flight.folder,), output, threads=1)
 
     def then_stopped(*arguments, **named):
@@ -188,7 +196,7 @@ def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
             reconstruct(request, console())
     with pytest.raises(CaptureError, match="is not finished"):
         load_capture(output)
-    begun, extracted, matched = [], [], []
+    mapped, extracted, matched = [], [], []
 
     def counted(called, *arguments, **named):
         if called is pycolmap.extract_features:
@@ -196,7 +204,7 @@ def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
         if called is pycolmap.match_image_pairs:
             matched.append(named["pairing_options"].match_list_path)
         if called is pycolmap.incremental_mapping:
-            begun.append(named["input_path"])
+            mapped.append(named["input_path"])
         return call(called, *arguments, **named)
 
     for each in (features, matching, mapping):
@@ -205,13 +213,12 @@ def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
     facts = reconstruct(request, console())
     whole_capture(output, flight, facts)
     assert all(path.stat().st_mtime_ns == when for path, when in written.items())
-    steps = list(STEPS)
-    here = steps.index(next(step for step, (r, n, _) in STEPS.items() if (r, n) == (room, name)))
+    here = list(STEPS).index(step)
     assert len(extracted) == (3 if here == 0 else 0)  # the six of three calls are kept
     assert bool(matched) == (here <= 1)
-    assert bool(begun) == (here <= 2)
+    assert bool(mapped) == (here <= 2)
     if here == 2:  # goes on from what it had
-        assert int(Path(begun[0]).name) >= 4
+        assert int(Path(mapped[0]).name) >= 4
     if here == 3:
         assert len(written) >= 8
 
@@ -234,8 +241,9 @@ def test_only_whole_snapshots_are_gone_on_from_and_the_largest_of_them(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_another_focal_length_begins_mapping_anew(flight, tmp_path, monkeypatch):
+def test_another_focal_length_begins_mapping_anew(flight, begun, tmp_path, monkeypatch):
     output, stop = tmp_path / "capture", Stopper(5)
+    copy_folder(begun["mapping"], output)
     monkeypatch.setattr(mapping, "LEAST_BETWEEN", 2)
     keep = mapping.keep_snapshots
     with monkeypatch.context() as patch:
@@ -255,8 +263,11 @@ def test_another_focal_length_begins_mapping_anew(flight, tmp_path, monkeypatch)
 # ---------------------------------------------------------------------------------------------- full disks
 
 
-def test_a_disk_that_fills_while_photographs_are_written_is_said_and_nothing_is_lost(flight, tmp_path, monkeypatch):
+def test_a_disk_that_fills_while_photographs_are_written_is_said_and_nothing_is_lost(
+    flight, begun, tmp_path, monkeypatch
+):
     output, written = tmp_path / "capture", []
+    copy_folder(begun["writing"], output)
     request = SfmRequest((flight.folder,), output, threads=1)
     write = Path.write_bytes
 
@@ -277,9 +288,11 @@ def test_a_disk_that_fills_while_photographs_are_written_is_said_and_nothing_is_
     whole_capture(output, flight, reconstruct(request, console()))
 
 
-@pytest.mark.parametrize("room", [features, matching], ids=["features", "matching"])
-def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight, tmp_path, monkeypatch, room):
-    output = tmp_path / "capture"
+@pytest.mark.parametrize("step", ["features", "matching"])
+def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight, begun, tmp_path, monkeypatch, step):
+    output, room = tmp_path / "capture", STEPS[step][0]
+    if step in begun:
+        copy_folder(begun[step], output)
     request = SfmRequest((flight.folder,), output, threads=1)
     monkeypatch.setattr(matching, "AT_ONCE", 4)
 
