@@ -20,7 +20,7 @@ from vdgs.export.formats.scene import Scene
 from vdgs.export.formats.spool import spooled
 from vdgs.export.refining import refine
 from vdgs.export.refit import Baked, refit
-from vdgs.export.shapes import ellipsoids, logarithms
+from vdgs.kernels.reference.ellipsoids import logarithms
 from vdgs.kernels.spherical_harmonics import function_count
 from vdgs.kernels.types import DecoderWeights, HeadWeights
 from vdgs.model.anchor_model import AnchorModel, Part
@@ -221,18 +221,3 @@ def test_cameras_between_are_midway_and_look_alike():
         assert min(np.abs(camera.position - each).max() for each in midway) < 1e-9
         assert max(float(camera.forward @ each.forward) for each in VIEWS) == pytest.approx(1.0)
     assert between(VIEWS[:1]) == []
-
-
-def test_the_mean_of_ellipsoids_minds_neither_the_order_nor_the_signs_of_axes():
-    generator = torch.Generator().manual_seed(0)
-    scales, turns = torch.randn(400, 3, generator=generator), torch.randn(400, 4, generator=generator)
-    logarithm = logarithms(scales, turns)
-    named = ellipsoids(logarithm)
-    torch.testing.assert_close(logarithms(*named), logarithm, atol=1e-5, rtol=0)
-    torch.testing.assert_close(named[0].sort(1).values, scales.sort(1).values, atol=1e-5, rtol=0)
-    torch.testing.assert_close(named[1].norm(dim=1), torch.ones(400))
-    # The same ellipsoids with axes named anew are the same logarithms, so they have the same mean.
-    quarter = torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0])  # about x: y becomes z
-    w, x, y, z = turns.unbind(1)
-    anew = torch.stack([w - x, w + x, y + z, z - y], 1) * quarter[0]
-    torch.testing.assert_close(logarithms(scales[:, [0, 2, 1]], -anew), logarithm, atol=1e-4, rtol=0)

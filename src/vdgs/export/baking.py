@@ -21,7 +21,6 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.export.shapes import ellipsoids, logarithms
 from vdgs.export.working import in_order, view_by_view
 from vdgs.kernels import choose
 from vdgs.model.anchor_model import AnchorModel
@@ -181,13 +180,12 @@ def fitted(seen: Seen, wanted: Int[np.ndarray, " m"], degree: int) -> Gaussians:
     """The Gaussians of the given numbers: ascending, close together, each shown by some view."""
     pairs = _gathered(seen, wanted)
     anchors, k = seen.model.anchors, seen.model.anchors.offsets.shape[1]
-    coefficients = choose(pairs.colours.device).fit_harmonics(
-        pairs.directions, pairs.colours, pairs.pixels, torch.from_numpy(pairs.starts), degree, RIDGE
-    )
-    opacities = _means(pairs.opacities[:, None], pairs)[:, 0].clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    kernels, starts = choose(pairs.colours.device), torch.from_numpy(pairs.starts)
+    coefficients = kernels.fit_harmonics(pairs.directions, pairs.colours, pairs.pixels, starts, degree, RIDGE)
+    log_scales, quaternions = kernels.mean_ellipsoids(pairs.log_scales, pairs.quaternions, pairs.pixels, starts)
+    opacities = _means(pairs.opacities, pairs).clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     rows = torch.from_numpy(wanted // k)
     means = places(anchors.select(rows.to(anchors.positions.device))).cpu()
-    log_scales, quaternions = ellipsoids(_means(logarithms(pairs.log_scales, pairs.quaternions), pairs))
     return Gaussians(
         means=means[torch.arange(len(wanted)), torch.from_numpy(wanted % k)],
         log_scales=log_scales,
@@ -198,9 +196,8 @@ def fitted(seen: Seen, wanted: Int[np.ndarray, " m"], degree: int) -> Gaussians:
     )
 
 
-def _means(values: Float[Tensor, "p d"], pairs: _Pairs) -> Float[Tensor, "m d"]:
+def _means(values: Float[Tensor, " p"], pairs: _Pairs) -> Float[Tensor, " m"]:
     """The mean of each Gaussian's values, by its pixels in each view."""
     pixels = pairs.pixels.numpy()
     total = np.add.reduceat(pixels, pairs.starts)
-    columns = [np.add.reduceat(pixels * column, pairs.starts) / total for column in values.numpy().T]
-    return torch.from_numpy(np.stack(columns, axis=1))
+    return torch.from_numpy(np.add.reduceat(pixels * values.numpy(), pairs.starts) / total)

@@ -63,7 +63,7 @@ class Baked:
         rows, splats = decode_view(self.model, camera)
         rows, k = rows.cpu(), self.model.anchors.offsets.shape[1]
         source = splats.source.long().cpu()
-        of_these = self.chosen[rows[source // k] * k + source % k].to(splats.means_px.device)
+        of_these = self.chosen[rows[source // k] * k + source % k].nonzero()[:, 0].to(splats.means_px.device)
         shown = Splats(*(getattr(splats, field.name)[of_these] for field in fields(Splats)))
         picture = draw(shown, camera, shown.means_px.new_tensor(self.model.background)).image
         return picture.cpu(), self.of_anchors(rows.numpy())

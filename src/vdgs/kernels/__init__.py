@@ -27,6 +27,7 @@ Names and dimensions, fixed once for all files in this folder:
                  in place
        harmonic_colours(means [m,3], coefficients [n,c], rows [m], eye [3], degree) -> colours [m,3]
        fit_harmonics(directions [p,3], colours [p,3], weights [p], starts [m], degree, ridge) -> coefficients [m,f,3]
+       mean_ellipsoids(log_scales [p,3], quaternions [p,4], weights [p], starts [m]) -> the same of the means [m,...]
        count_visibility(points [n,3], cameras) -> int32 [n];  mark_visible(points [n,3], camera) -> bool [n]
        cell_keys, cell_centres, group_cells, group_max, contains, morton_order: the lattice of growth
 

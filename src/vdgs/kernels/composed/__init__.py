@@ -23,6 +23,7 @@ from vdgs.kernels.reference import (
     group_max,
     harmonic_colours,
     mark_visible,
+    mean_ellipsoids,
     morton_order,
     project,
 )
@@ -43,6 +44,7 @@ __all__ = [
     "group_max",
     "harmonic_colours",
     "mark_visible",
+    "mean_ellipsoids",
     "morton_order",
     "photometric_loss",
     "project",

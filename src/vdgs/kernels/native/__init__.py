@@ -5,6 +5,7 @@ from vdgs.kernels.native.cells import cell_centres, cell_keys, contains, group_c
 from vdgs.kernels.native.cull import cull
 from vdgs.kernels.native.decode import decode, decode_to_train
 from vdgs.kernels.native.decode_adam import decode_backward_adam
+from vdgs.kernels.native.ellipsoids import mean_ellipsoids
 from vdgs.kernels.native.harmonics import fit_harmonics, harmonic_colours
 from vdgs.kernels.native.loss import photometric_loss
 from vdgs.kernels.native.project import project
@@ -28,6 +29,7 @@ __all__ = [
     "group_max",
     "harmonic_colours",
     "mark_visible",
+    "mean_ellipsoids",
     "morton_order",
     "photometric_loss",
     "project",

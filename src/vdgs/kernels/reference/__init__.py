@@ -5,6 +5,7 @@ from vdgs.kernels.reference.cells import cell_centres, cell_keys, contains, grou
 from vdgs.kernels.reference.cull import cull
 from vdgs.kernels.reference.decode import decode, decode_to_train
 from vdgs.kernels.reference.decode_adam import decode_backward_adam
+from vdgs.kernels.reference.ellipsoids import mean_ellipsoids
 from vdgs.kernels.reference.harmonics import fit_harmonics, harmonic_colours
 from vdgs.kernels.reference.loss import photometric_loss
 from vdgs.kernels.reference.project import project
@@ -28,6 +29,7 @@ __all__ = [
     "group_max",
     "harmonic_colours",
     "mark_visible",
+    "mean_ellipsoids",
     "morton_order",
     "photometric_loss",
     "project",

@@ -10,15 +10,33 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
+from vdgs.kernels.reference.harmonics import check_runs
 from vdgs.kernels.rotations import rotation_matrices
 
 #: The six numbers of a symmetric matrix.
 UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 #: Rounds of Jacobi's method: each squares what is left beside the diagonal, at the end.
 SWEEPS = 5
+
+
+def mean_ellipsoids(
+    log_scales: Float[Tensor, "p 3"], quaternions: Float[Tensor, "p 4"], weights: Float[Tensor, " p"],
+    starts: Int64[Tensor, " m"],
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 4"]]:  # fmt: skip
+    """Logarithms of the scales and unit quaternions, wxyz, of the mean of each Gaussian, whose pairs begin at `starts`.
+    The axes come in any order. Weights are positive. Raises ValueError unless each has a pair and the first begins with
+    the first pair."""
+    check_runs(starts, len(weights))
+    if not len(starts):
+        return log_scales.new_empty(0, 3), quaternions.new_empty(0, 4)
+    runs, shares = starts.numpy(), weights.double().numpy()
+    total = np.add.reduceat(shares, runs)
+    columns = logarithms(log_scales, quaternions).numpy().T
+    means = [np.add.reduceat(shares * column, runs) / total for column in columns]
+    return ellipsoids(torch.from_numpy(np.stack(means, axis=1)))
 
 
 def logarithms(log_scales: Float[Tensor, "p 3"], quaternions: Float[Tensor, "p 4"]) -> Float[Tensor, "p 6"]:
