@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from vdgs.cameras import Camera
 
-#: Each camera is paired with so many of the nearest that look its way.
+#: Each camera is paired with so many of the nearest that look its way, as long as there are fewer pairs than cameras.
 NEIGHBOURS = 2
 #: That is: whose directions are at most about 45 degrees apart (cosine).
 LIKE = 0.7
@@ -22,17 +23,26 @@ def rounds(training: Sequence[Camera]) -> tuple[Sequence[Camera], ...]:
 
 
 def between(cameras: Sequence[Camera]) -> list[Camera]:
-    """Cameras midway between neighbours, each with the orientation and the picture of one of them; fewer than
-    `NEIGHBOURS` times as many as those that are given."""
+    """Cameras midway between neighbours, each with the orientation and the picture of one of them: all cameras with
+    their nearest first, then with the next; as many as are given at most."""
     places = np.array([camera.position for camera in cameras])
     forward = np.array([camera.forward for camera in cameras])
-    pairs = set[tuple[int, int]]()
-    for i in range(len(cameras)):
-        apart = np.where(forward @ forward[i] > LIKE, np.linalg.norm(places - places[i], axis=1), np.inf)
-        apart[i] = np.inf
-        nearest = np.argsort(apart, kind="stable")[:NEIGHBOURS]
-        pairs |= {(min(i, int(j)), max(i, int(j))) for j in nearest if np.isfinite(apart[j])}
-    return [_moved(cameras[i], (places[i] + places[j]) / 2) for i, j in sorted(pairs)]
+    nearest = [_alike(places, forward, i) for i in range(len(cameras))]
+    pairs = dict[tuple[int, int], None]()  # in this order
+    for rank in range(NEIGHBOURS):
+        for i, others in enumerate(nearest):
+            if rank < len(others):
+                pairs[min(i, others[rank]), max(i, others[rank])] = None
+    chosen = sorted(list(pairs)[: len(cameras)])
+    return [_moved(cameras[i], (places[i] + places[j]) / 2) for i, j in chosen]
+
+
+def _alike(places: Float[np.ndarray, "n 3"], forward: Float[np.ndarray, "n 3"], i: int) -> list[int]:
+    """The nearest others that look the way of a camera, nearest first."""
+    apart = np.where(forward @ forward[i] > LIKE, np.linalg.norm(places - places[i], axis=1), np.inf)
+    apart[i] = np.inf
+    order = np.argsort(apart, kind="stable")[:NEIGHBOURS]
+    return [int(j) for j in order if np.isfinite(apart[j])]
 
 
 def _moved(camera: Camera, position: np.ndarray) -> Camera:

@@ -74,10 +74,11 @@ def refit(baked: Baked, cameras: Sequence[Camera], after_view: Callable[[], None
     views = []
     for view in view_by_view(lambda camera: lacking(baked, camera), cameras, baked.model.anchors.positions.device):
         views.append(view)
+        baked.spool.let_go()
         after_view()
     parts = [rows_of(baked, number) for number in range(part_count(baked.model))]
     for _ in in_order(lambda rows: baked.spool.add_colours(*added(baked, cameras, views, rows)), parts):
-        pass
+        baked.spool.let_go()
 
 
 def rows_of(baked: Baked, number: int) -> range:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import mmap
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +27,8 @@ class Spooled:
     means: np.ndarray
     table: np.ndarray
     shapes: dict[str, tuple[int, ...]]
+    #: The table's pages, where what is written into them reaches the file.
+    pages: mmap.mmap | None = None
 
     def rows(self, rows: np.ndarray) -> Gaussians:
         """The Gaussians of the given rows (indices), in their order."""
@@ -53,6 +56,11 @@ class Spooled:
         if len(rows):
             self.table[rows, -added[0].numel() :] += added.reshape(len(added), -1).numpy()
 
+    def let_go(self) -> None:
+        """Leave to the system which pages of the file lie in memory: they do not count as this process' own then."""
+        if self.pages is not None and hasattr(mmap, "MADV_DONTNEED"):
+            self.pages.madvise(mmap.MADV_DONTNEED)
+
     def replace(self, rows: np.ndarray, gaussians: Gaussians) -> None:
         """Write Gaussians in place of those of the given rows."""
         for first in range(0, len(rows), ROWS):
@@ -75,8 +83,9 @@ def spooled(scene: Scene, file: Path, turn: np.ndarray | None = None) -> Spooled
             flat(piece).tofile(handle)
             means[done : done + len(piece)] = piece.means.numpy()
             done += len(piece)
-    width = sum(int(np.prod(shape)) for shape in shapes.values())
-    return Spooled(means, np.memmap(file, np.float32, "r+", shape=(scene.count, width)), shapes)
+    with file.open("r+b") as handle:
+        pages = mmap.mmap(handle.fileno(), 0)
+    return Spooled(means, np.frombuffer(pages, np.float32).reshape(scene.count, -1), shapes, pages)
 
 
 def opened(file: Path, degree: int, writable: bool = False) -> Spooled:
