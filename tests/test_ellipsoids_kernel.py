@@ -53,9 +53,7 @@ def test_of_alike_ellipsoids_and_axes_the_mean_is_each(kernels, scales):
     quaternions = torch.randn(1, 4, generator=torch.Generator().manual_seed(1)).expand(3, 4)
     for turned in (quaternions, torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4)):
         found = kernels.mean_ellipsoids(log_scales, turned, torch.tensor([1e-3, 1.0, 1e3]), torch.tensor([0]))
-        torch.testing.assert_close(
-            logarithms(*found), logarithms(log_scales[:1], turned[:1]), atol=1e-5, rtol=1e-5
-        )
+        torch.testing.assert_close(logarithms(*found), logarithms(log_scales[:1], turned[:1]), atol=1e-5, rtol=1e-5)
 
 
 @BOTH

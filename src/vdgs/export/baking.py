@@ -146,6 +146,8 @@ def _gathered(seen: Seen, wanted: Int[np.ndarray, " m"]) -> _Pairs:
     numbers = torch.from_numpy(wanted)
     for camera, shown in zip(seen.cameras, seen.shown, strict=True):
         low, high = np.searchsorted(shown.gaussians.numpy(), [wanted[0], wanted[-1] + 1])
+        if low == high:
+            continue
         gaussians, pixels = shown.gaussians[low:high].long(), shown.pixels[low:high]
         place = torch.searchsorted(numbers, gaussians).clamp(max=len(wanted) - 1)
         inside = numbers[place] == gaussians

@@ -59,6 +59,7 @@ class _Baked:
         for first in range(0, len(rows), ROWS):
             stop_if_asked()
             yield self.spool.rows(rows[first : first + ROWS])
+            self.spool.let_go()
 
 
 def page_of(run: TrainedRun, most_bytes: int) -> Page:

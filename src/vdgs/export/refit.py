@@ -29,6 +29,9 @@ from vdgs.kernels.types import Splats
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import decode_view, draw
 
+#: After so many views or parts the pages of the spool are let go.
+LET_GO = 16
+
 
 @dataclass(frozen=True, eq=False)
 class Lacking:
@@ -64,7 +67,9 @@ class Baked:
         rows, k = rows.cpu(), self.model.anchors.offsets.shape[1]
         source = splats.source.long().cpu()
         of_these = self.chosen[rows[source // k] * k + source % k].nonzero()[:, 0].to(splats.means_px.device)
-        shown = Splats(*(getattr(splats, field.name)[of_these] for field in fields(Splats)))
+        shown: Splats = splats
+        if len(of_these) < len(source):
+            shown = Splats(*(getattr(splats, field.name)[of_these] for field in fields(Splats)))
         picture = draw(shown, camera, shown.means_px.new_tensor(self.model.background)).image
         return picture.cpu(), self.of_anchors(rows.numpy())
 
@@ -74,11 +79,14 @@ def refit(baked: Baked, cameras: Sequence[Camera], after_view: Callable[[], None
     views = []
     for view in view_by_view(lambda camera: lacking(baked, camera), cameras, baked.model.anchors.positions.device):
         views.append(view)
-        baked.spool.let_go()
+        if len(views) % LET_GO == 0:
+            baked.spool.let_go()
         after_view()
     parts = [rows_of(baked, number) for number in range(part_count(baked.model))]
-    for _ in in_order(lambda rows: baked.spool.add_colours(*added(baked, cameras, views, rows)), parts):
-        baked.spool.let_go()
+    done = in_order(lambda rows: baked.spool.add_colours(*added(baked, cameras, views, rows)), parts)
+    for number, _ in enumerate(done):
+        if number % LET_GO == 0:
+            baked.spool.let_go()
 
 
 def rows_of(baked: Baked, number: int) -> range:

@@ -57,7 +57,8 @@ class Spooled:
             self.table[rows, -added[0].numel() :] += added.reshape(len(added), -1).numpy()
 
     def let_go(self) -> None:
-        """Leave to the system which pages of the file lie in memory: they do not count as this process' own then."""
+        """Leave to the system which pages of the file lie in memory. They do not count as this process' own then, and
+        are there again when they are asked for. Called now and then by who looks at all Gaussians."""
         if self.pages is not None and hasattr(mmap, "MADV_DONTNEED"):
             self.pages.madvise(mmap.MADV_DONTNEED)
 
