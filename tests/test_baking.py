@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from merging_support import camera_above, model_at
 from vdgs.cameras import Camera
 from vdgs.export import baking
 from vdgs.export.baking import Survey, bake, survey
-from vdgs.export.between import between
+from vdgs.export.between import between, endless, rounds
 from vdgs.export.formats.scene import Scene
 from vdgs.export.formats.spool import spooled
 from vdgs.export.refining import refine
@@ -172,12 +172,12 @@ GRID = [camera_above(x, y, tilt_deg=tilt) for x in (-2, 0, 2) for y in (-2, 0, 2
 def test_colours_stand_in_for_opacities_and_shapes_that_change(tmp_path, degree):
     seen = survey(steep(model_at(scattered())), GRID)
     shown = on_disk(seen, np.flatnonzero(seen.pixels > 0), tmp_path, degree)
-    errors, others = [error(shown, GRID)], [error(shown, between(GRID))]
+    errors, others = [error(shown, GRID)], [error(shown, between(GRID, 9))]
     opacities = shown.spool.rows(np.arange(9)).logits
-    for _ in range(2):
-        refit(shown, [*GRID, *between(GRID)])
+    for number in range(2):
+        refit(shown, [*GRID, *between(GRID, number)])
         errors.append(error(shown, GRID))
-        others.append(error(shown, between(GRID)))
+        others.append(error(shown, between(GRID, 9)))
     assert errors == sorted(errors, reverse=True)
     assert others == sorted(others, reverse=True)
     if degree:
@@ -206,18 +206,34 @@ def test_refining_comes_nearer_and_ends_when_its_time_is_over(tmp_path):
     before, means = error(shown, GRID), np.array(shown.spool.means)
     ticks = iter(range(1000))
     passed: list[float] = []
-    assert refine(shown, GRID, 80.0, passed.append, clock=lambda: next(ticks)) == 79
+    assert refine(shown, endless(GRID), 80.0, passed.append, clock=lambda: next(ticks)) == 79
     assert passed == list(range(1, 80))
     assert error(shown, GRID) < 0.9 * before
     assert np.array_equal(shown.spool.rows(np.arange(len(means))).means.numpy(), means)
 
 
-def test_cameras_between_are_midway_and_look_alike():
+def test_cameras_between_lie_among_neighbours_that_look_alike_and_are_never_the_same():
     turned = camera_above(0.0, 0.0, tilt_deg=80.0)
-    found = between([*VIEWS, turned])
-    assert 2 <= len(found) <= 2 * len(VIEWS)
-    midway = [(a.position + b.position) / 2 for a, b in combinations(VIEWS, 2)]
-    for camera in found:
-        assert min(np.abs(camera.position - each).max() for each in midway) < 1e-9
-        assert max(float(camera.forward @ each.forward) for each in VIEWS) == pytest.approx(1.0)
-    assert between(VIEWS[:1]) == []
+    cameras = [*GRID, turned]
+    found = [*between(cameras, 0), *between(cameras, 1)]
+    assert len(found) == 2 * len(GRID)  # nobody looks as that one does
+    assert len({camera.position.tobytes() for camera in found}) == len(found)
+    for camera, own in zip(found, [*GRID, *GRID], strict=True):
+        assert np.array_equal(camera.camera_from_world[:3, :3], own.camera_from_world[:3, :3])
+        alike = np.array([each.position for each in GRID if own.forward @ each.forward > 0.7])
+        assert (camera.position >= alike.min(0) - 1e-9).all()
+        assert (camera.position <= alike.max(0) + 1e-9).all()
+    assert between(VIEWS[:1], 0) == []
+    assert [each.position.tolist() for each in between(VIEWS, 3)] == [
+        each.position.tolist() for each in between(VIEWS, 3)
+    ]
+
+
+def test_cameras_to_refine_by_never_end_nor_come_again_but_for_those_of_photographs():
+    shown = list(islice(endless(GRID), 4 * len(GRID)))
+    places = [camera.position.tobytes() for camera in shown]
+    known = {camera.position.tobytes() for camera in GRID}
+    of_rounds = {camera.position.tobytes() for cameras in rounds(GRID) for camera in cameras} - known
+    others = [place for place in places if place not in known]
+    assert len(others) == len(set(others)) == 2 * len(GRID)
+    assert not of_rounds & set(others)

@@ -2,39 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 from jaxtyping import Float
 
 from vdgs.cameras import Camera
 
-#: Each camera is paired with so many of the nearest that look its way, as long as there are fewer pairs than cameras.
-NEIGHBOURS = 2
+#: A camera moves among so many of the nearest that look its way.
+NEIGHBOURS = 3
 #: That is: whose directions are at most about 45 degrees apart (cosine).
 LIKE = 0.7
+#: So many times colours are fitted again.
+ROUNDS = 2
 
 
 def rounds(training: Sequence[Camera]) -> tuple[Sequence[Camera], ...]:
-    """By which pictures colours are fitted again, round by round: by all, then by those of the training cameras alone,
-    which gets as far as all twice would (docs/export.md)."""
-    return [*training, *between(training)], training
+    """By which pictures colours are fitted again, round by round: by those of the training cameras, and of others
+    between them that no round has had before. Where only midway between neighbours is looked again and again, what
+    suits those places is learnt by heart (docs/export.md)."""
+    return tuple([*training, *between(training, number)] for number in range(ROUNDS))
 
 
-def between(cameras: Sequence[Camera]) -> list[Camera]:
-    """Cameras midway between neighbours, each with the orientation and the picture of one of them: all cameras with
-    their nearest first, then with the next; as many as are given at most."""
+def endless(training: Sequence[Camera]) -> Iterator[Camera]:
+    """The training cameras and others between them, in random order, and so on: the others are never the same, nor any
+    of `rounds`."""
+    for number in count(ROUNDS):
+        cameras = [*training, *between(training, number)]
+        for i in np.random.default_rng(number).permutation(len(cameras)):
+            yield cameras[i]
+
+
+def between(cameras: Sequence[Camera], seed: int) -> list[Camera]:
+    """Each camera that has neighbours somewhere between itself and these: in their mean by random weights, all equally
+    likely, with its own orientation and picture."""
     places = np.array([camera.position for camera in cameras])
     forward = np.array([camera.forward for camera in cameras])
-    nearest = [_alike(places, forward, i) for i in range(len(cameras))]
-    pairs = dict[tuple[int, int], None]()  # in this order
-    for rank in range(NEIGHBOURS):
-        for i, others in enumerate(nearest):
-            if rank < len(others):
-                pairs[min(i, others[rank]), max(i, others[rank])] = None
-    chosen = sorted(list(pairs)[: len(cameras)])
-    return [_moved(cameras[i], (places[i] + places[j]) / 2) for i, j in chosen]
+    generator = np.random.default_rng(seed)
+    found = []
+    for i, camera in enumerate(cameras):
+        weights = generator.dirichlet(np.ones(NEIGHBOURS + 1))
+        if len(around := [i, *_alike(places, forward, i)]) > 1:
+            own = weights[: len(around)] / weights[: len(around)].sum()
+            found.append(_moved(camera, own @ places[around]))
+    return found
 
 
 def _alike(places: Float[np.ndarray, "n 3"], forward: Float[np.ndarray, "n 3"], i: int) -> list[int]:
@@ -45,7 +58,7 @@ def _alike(places: Float[np.ndarray, "n 3"], forward: Float[np.ndarray, "n 3"], 
     return [int(j) for j in order if np.isfinite(apart[j])]
 
 
-def _moved(camera: Camera, position: np.ndarray) -> Camera:
+def _moved(camera: Camera, position: Float[np.ndarray, "3"]) -> Camera:
     matrix = camera.camera_from_world.copy()
     matrix[:3, 3] = -matrix[:3, :3] @ position
     return replace(camera, camera_from_world=matrix)

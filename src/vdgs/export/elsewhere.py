@@ -79,7 +79,7 @@ class BakedElsewhere:
         self, run: TrainedRun, asked: ExportRequest, work: BakingWork, wish: Wish, console: Console
     ) -> None:  # fmt: skip
         self._run, self._asked, self._work, self._wish, self._console = run, asked, work, wish, console
-        self.cameras, self._last = work.rounds[0], len(work.rounds)
+        self.training, self._last = work.training, len(work.rounds)
 
     def pixels(self) -> Float[np.ndarray, " g"]:
         """How many pixels each Gaussian of the model makes of what the training cameras see."""
@@ -167,7 +167,7 @@ class BakedElsewhere:
         if step.kind in (SURVEY, COMPARE):
             gaussians = len(self._run.model.anchors) * self._run.model.anchors.offsets.shape[1]
             held = GAUSSIAN_BYTES * gaussians if step.kind is COMPARE else 0
-            return drawing_bytes(model, held, max(camera.width * camera.height for camera in self.cameras))
+            return drawing_bytes(model, held, max(camera.width * camera.height for camera in self.training))
         before = self._work.step(COMPARE, step.round) if step.kind is MEND else self._work.step(SURVEY)
         pairs = sum(file.stat().st_size for file in self._work.files(before)) // (12 if step.kind is MEND else 8)
         most = min(PARTS_AT_ONCE, len(step.items))

@@ -18,6 +18,7 @@ from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
 from vdgs.captures.overview import overview
 from vdgs.errors import VdgsError
 from vdgs.executors.errand import Wish
+from vdgs.export.between import endless
 from vdgs.export.elsewhere import BakedElsewhere, baked_elsewhere, forget_pieces
 from vdgs.export.formats import registry
 from vdgs.export.formats.scene import ROWS, Page, Scene
@@ -110,7 +111,7 @@ def export_run(asked: ExportRequest, console: Console, wish: Wish | None = None)
         )
         del pixels
         with baker.spool(kept) as spool:
-            _refined(Baked(run.model, kept, spool), baker.cameras, asked.refine, console)
+            _refined(Baked(run.model, kept, spool), baker.training, asked.refine, console)
             baked = _Baked(spool, asked.sh_degree, page_of(run, int(asked.html_mb * 1e6)))
             seconds = time.monotonic() - began
             console.print(f"baked in {seconds:.1f} s", highlight=False)
@@ -134,7 +135,7 @@ def _baker(
     return nullcontext(BakedHere(run, asked, console))
 
 
-def _refined(baked: Baked, cameras: Sequence[Camera], seconds: float, console: Console) -> None:
+def _refined(baked: Baked, training: Sequence[Camera], seconds: float, console: Console) -> None:
     """Move all that is baked for so many seconds, by this process' clock."""
     if seconds <= 0:
         return
@@ -145,7 +146,7 @@ def _refined(baked: Baked, cameras: Sequence[Camera], seconds: float, console: C
             stop_if_asked()
             bar.update(task, completed=passed)
 
-        refine(baked, cameras, seconds, after_step)
+        refine(baked, endless(training), seconds, after_step)
 
 
 def _check_names(paths: tuple[Path, ...]) -> None:

@@ -33,23 +33,21 @@ class BakedHere:
 
     def __init__(self, run: TrainedRun, asked: ExportRequest, console: Console) -> None:
         self._run, self._asked, self._console = run, asked, console
-        training = [view.camera for view in run.capture.train_views]
-        self._rounds = rounds(training)
+        self.training = [view.camera for view in run.capture.train_views]
         #: By which pictures are compared.
-        self.cameras = self._rounds[0]
+        self._rounds = rounds(self.training)
         self._seen: Survey | None = None
 
     def pixels(self) -> Float[np.ndarray, " g"]:
         """How many pixels each Gaussian of the model makes of what the training cameras see."""
-        training = [view.camera for view in self._run.capture.train_views]
         with bar_on(self._console) as bar:
-            task = bar.add_task("what the training cameras see", total=len(training))
+            task = bar.add_task("what the training cameras see", total=len(self.training))
 
             def after_view() -> None:
                 stop_if_asked()
                 bar.advance(task)
 
-            self._seen = survey(self._run.model, training, after_view)
+            self._seen = survey(self._run.model, self.training, after_view)
         return self._seen.pixels
 
     @contextmanager

@@ -7,7 +7,7 @@ times (0.7 kB for each Gaussian of degree 3), and gains what is left.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -17,7 +17,6 @@ from vdgs.export.refit import Baked
 from vdgs.kernels import choose
 from vdgs.kernels.types import AdamState
 from vdgs.model.gaussians import Gaussians, draw_gaussians
-from vdgs.training.schedule import view_at
 
 #: Learning rates: half of what trains Gaussians from nothing (`comparators.gaussians`), for these start near the end.
 RATES = {"dc": 1.25e-3, "rest": 6e-5, "logits": 0.025, "log_scales": 2.5e-3, "quaternions": 5e-4}
@@ -25,12 +24,12 @@ RATES = {"dc": 1.25e-3, "rest": 6e-5, "logits": 0.025, "log_scales": 2.5e-3, "qu
 
 def refine(
     baked: Baked,
-    cameras: Sequence[Camera],
+    cameras: Iterator[Camera],
     seconds: float,
     after_step: Callable[[float], None] = lambda passed: None,
     clock: Callable[[], float] = time.monotonic,
 ) -> int:
-    """Move the Gaussians on the disk for so long; returns in how many steps of one view each.
+    """Move the Gaussians on the disk for so long; returns in how many steps, each by the picture of the next camera.
 
     `after_step` is told how many seconds have passed.
     """
@@ -44,7 +43,7 @@ def refine(
     updates = torch.zeros(len(every), dtype=torch.int32)
     began, steps = clock(), 0
     while (passed := clock() - began) < seconds:
-        _step(baked, gaussians, cameras[view_at(steps, len(cameras), 0)], states, updates)
+        _step(baked, gaussians, next(cameras), states, updates)
         steps += 1
         after_step(passed)
     baked.spool.replace(every, gaussians)
