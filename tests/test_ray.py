@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cli_support import begun, do_tasks_here, vdgs, wait_until
+from cli_support import begun, do_tasks_here, python, vdgs, wait_until
 from cluster_support import (
     BLOCKS,
     FINE,
@@ -62,6 +62,19 @@ def another_code() -> None:
     from vdgs.executors import fitness
 
     fitness.code_identity = lambda: "of this machine"  # type: ignore[assignment]
+
+
+def test_a_run_starts_a_ray_of_its_own_for_each_errand():
+    """One after the other, in one process, as `vdgs run --executor ray` does without an address."""
+    done = python(
+        """
+from vdgs.executors.on_ray import connected, nodes
+for _ in range(2):
+    with connected(None):
+        print(len(nodes()), "node")
+"""
+    )
+    assert done.stdout.splitlines() == ["1 node", "1 node"], done.stderr
 
 
 def test_nodes_that_cannot_work_on_a_run_are_named_before_anything_starts(cut, cluster, tmp_path):

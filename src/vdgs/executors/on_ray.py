@@ -16,6 +16,7 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from vdgs.errors import VdgsError
@@ -58,7 +59,7 @@ def connected(address: str | None) -> Iterator[None]:
         own = {"include_dashboard": False, "object_store_memory": OBJECT_BYTES}
         variables["RAY_worker_niceness"] = "0"  # as tasks have it that are processes of this machine
         # Ray listens on all addresses: let in who has the token, which is nobody else.
-        variables |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        variables |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _token()}
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -70,6 +71,12 @@ def connected(address: str | None) -> Iterator[None]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@cache
+def _token() -> str:
+    """What opens the Rays of this process: the same for all, for Ray reads it once in the life of a process."""
+    return secrets.token_hex(32)
 
 
 def refuse_unreachable(address: str | None) -> None:
