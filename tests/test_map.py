@@ -21,7 +21,8 @@ from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
 from vdgs.errors import VdgsError
 from vdgs.maps import mapping, tiles
-from vdgs.maps.grid import Grid, extent_of, grid_over, ground_sampling
+from vdgs.maps.geotiff import CACHE_BYTES, bounded_cache
+from vdgs.maps.grid import TILE_PX, Grid, extent_of, grid_over, ground_sampling
 from vdgs.maps.overhead import Overhead
 from vdgs.maps.pictures import hillshade, round_length
 from vdgs.maps.sharpening import Sharpener
@@ -351,3 +352,9 @@ def test_detail_comes_from_the_photographs_where_they_see_the_place(house, tmp_p
     detail = pattern(np.stack(np.meshgrid(x, y), axis=-1))
     assert np.corrcoef(gained[ground], detail[ground])[0, 1] > 0.7
     assert np.abs(gained[~ground]).mean() < 0.35 * np.abs(gained[ground]).mean()
+
+
+def test_gdal_may_keep_megabytes_of_a_map_and_not_bytes():
+    """With less than a row of tiles, each row of a preview decodes them again: minutes for a small map."""
+    with bounded_cache():
+        assert rasterio.env.get_gdal_config("GDAL_CACHEMAX") == CACHE_BYTES > 100 * TILE_PX * TILE_PX * 4

@@ -14,8 +14,8 @@ from vdgs.errors import VdgsError
 from vdgs.maps.grid import TILE_PX, Grid
 from vdgs.placing.placement import Placement
 
-#: What GDAL may keep of files in memory.
-_CACHE_MB = 128
+#: What GDAL may keep of files in memory. In bytes, as rasterio takes it, where GDAL itself would take 128 for megabytes.
+CACHE_BYTES = 128 << 20
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ def require_rasterio() -> Any:
 
 
 def bounded_cache() -> Any:
-    """A context in which GDAL keeps no more than `_CACHE_MB` of files in memory, whatever the size of the machine."""
-    return require_rasterio().Env(GDAL_CACHEMAX=_CACHE_MB)
+    """A context in which GDAL keeps no more than `CACHE_BYTES` of files in memory, whatever the size of the machine."""
+    return require_rasterio().Env(GDAL_CACHEMAX=CACHE_BYTES)
 
 
 def crs_of(placement: Placement) -> Any:
