@@ -14,7 +14,7 @@ from vdgs.errors import VdgsError
 from vdgs.maps.grid import TILE_PX, Grid
 from vdgs.placing.placement import Placement
 
-#: What GDAL may keep of files in memory. In bytes, as rasterio takes it, where GDAL itself would take 128 for megabytes.
+#: What GDAL may keep of files in memory: in bytes, as rasterio takes it; GDAL itself would take 128 for megabytes.
 CACHE_BYTES = 128 << 20
 
 
