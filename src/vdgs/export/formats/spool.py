@@ -36,7 +36,7 @@ class Spooled:
 
     def ellipsoids(self, rows: np.ndarray) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Means [r, 3], log-scales [r, 3], quaternions [r, 4] and logits [r] of the given rows, in their order."""
-        columns = torch.from_numpy(np.array(self.table[:, :COEFFICIENTS][rows]))
+        columns = torch.from_numpy(self.table)[:, :COEFFICIENTS].index_select(0, torch.from_numpy(rows))
         means, log_scales, quaternions, logits = (each.contiguous() for each in columns.split([3, 3, 4, 1], 1))
         return means, log_scales, quaternions, logits[:, 0]
 
