@@ -119,8 +119,7 @@ def _plan(capture: Capture, method: MethodConfig, asked: RunRequest) -> Plan:
     factors = sorted({factor for _, factor in (*config.resolutions, *method.block.resolutions)})
     with ImageCache(capture.train_views, image_budget(asked.watching), downscales=tuple(factors)) as images:
         stage, anchors = open_stage(capture, config, images, asked.device)
-        state = start(anchors, stage)
-        need = need_of(state, stage)
+        need = need_of(start(anchors, stage), stage)
         timed = {}
         for factor in factors:
             at_size = replace(stage, config=replace(config, resolutions=((0.0, factor),)))
