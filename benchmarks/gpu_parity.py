@@ -19,6 +19,7 @@ from step import scene
 from vdgs.kernels import cuda, gsplat
 from vdgs.kernels.gsplat.rasterise import GsplatUnavailable
 from vdgs.kernels.operations import Operations
+from vdgs.kernels.reference.ellipsoids import logarithms
 from vdgs.kernels.types import AdamState, AnchorSplats, DecoderWeights, SplatGradients, Splats, Statistics
 from vdgs.model.decoder import Decoder
 
@@ -258,6 +259,14 @@ def fit_harmonics(kernels: Operations, place: Place) -> Results:
     return {"coefficients": kernels.fit_harmonics(directions, place.random(pairs, 3, seed=2), weights, starts, 3, 1e-3)}
 
 
+def mean_ellipsoids(kernels: Operations, place: Place) -> Results:
+    """Three pairs of each Gaussian. As logarithms: where two axes are alike, rounding names them."""
+    pairs = 3 * (len(place.anchors) // 3)
+    shapes = place.random(pairs, 3), place.random(pairs, 4, seed=2)
+    starts = torch.arange(0, pairs, 3).to(place.device)
+    return {"means": logarithms(*kernels.mean_ellipsoids(*shapes, place.random(pairs).abs() + 0.1, starts))}
+
+
 def member(rows: Tensor, count: int) -> Tensor:
     """Which of so many are among the rows."""
     found = torch.zeros(count, dtype=torch.bool).to(rows.device)
@@ -271,7 +280,7 @@ CASES: dict[str, Callable[[Operations, Place], Results]] = {
     for case in (
         adam_rows, add_view_statistics, cell_centres, cell_keys, contains, count_visibility, cull, decode,
         decode_to_train, decode_backward_adam, fit_harmonics, group_cells, group_max, harmonic_colours, mark_visible,
-        morton_order, photometric_loss, project, rasterise, rasterise_vjp,
+        mean_ellipsoids, morton_order, photometric_loss, project, rasterise, rasterise_vjp,
     )
 }  # fmt: skip
 

@@ -8,7 +8,6 @@ would blow up. Dimensions: p ellipsoids, m means.
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
@@ -32,11 +31,12 @@ def mean_ellipsoids(
     check_runs(starts, len(weights))
     if not len(starts):
         return log_scales.new_empty(0, 3), quaternions.new_empty(0, 4)
-    runs, shares = starts.numpy(), weights.double().numpy()
-    total = np.add.reduceat(shares, runs)
-    columns = logarithms(log_scales, quaternions).numpy().T
-    means = [np.add.reduceat(shares * column, runs) / total for column in columns]
-    return ellipsoids(torch.from_numpy(np.stack(means, axis=1)))
+    counts = torch.diff(starts, append=starts.new_tensor([len(weights)]))
+    gaussian = torch.arange(len(starts), device=starts.device).repeat_interleave(counts)
+    shares = weights.double()[:, None]
+    sums = shares.new_zeros(len(starts), 7)
+    sums.index_add_(0, gaussian, torch.cat([shares * logarithms(log_scales, quaternions), shares], 1))
+    return ellipsoids(sums[:, :6] / sums[:, 6:])
 
 
 def logarithms(log_scales: Float[Tensor, "p 3"], quaternions: Float[Tensor, "p 4"]) -> Float[Tensor, "p 6"]:
@@ -51,34 +51,34 @@ def ellipsoids(logarithm: Float[Tensor, "m 6"]) -> tuple[Float[Tensor, "m 3"], F
 
     Jacobi's method (Golub and Van Loan, Matrix Computations, 8.5), of all matrices at once.
     """
-    values = logarithm.double().numpy()
-    a = np.empty((3, 3, len(values)))
-    for (i, j), column in zip(UPPER, values.T, strict=True):
+    columns = logarithm.double().unbind(1)
+    a = logarithm.new_empty(3, 3, len(logarithm), dtype=torch.float64)
+    for (i, j), column in zip(UPPER, columns, strict=True):
         a[i, j] = a[j, i] = column
-    q = np.zeros((4, len(values)))
+    q = torch.zeros_like(a[0, 0]).repeat(4, 1)
     q[0] = 1.0
     for _ in range(SWEEPS):
         for i, j in ((0, 1), (1, 2), (2, 0)):
             half = _turn(a, i, j)
-            q = _times(q, np.cos(half), 3 - i - j, np.sin(half))
-    return torch.from_numpy(a[range(3), range(3)].T.astype(np.float32)), torch.from_numpy(q.T.astype(np.float32))
+            q = _times(q, half.cos(), 3 - i - j, half.sin())
+    return torch.stack([a[i, i] for i in range(3)], 1).float(), q.T.float().contiguous()
 
 
-def _turn(a: Float[np.ndarray, "3 3 m"], i: int, j: int) -> Float[np.ndarray, " m"]:
+def _turn(a: Float[Tensor, "3 3 m"], i: int, j: int) -> Float[Tensor, " m"]:
     """Turn the axes i and j, which follow each other, so that a[i, j] becomes 0; returns half of the angles."""
     apart = a[i, i] - a[j, j]
     # The smaller of the two angles that do it, at most 45 degrees: axes keep their names where they can.
-    angle = 0.5 * np.arctan2(2 * a[i, j] * np.copysign(1.0, apart), np.abs(apart))
-    c, s = np.cos(angle), np.sin(angle)
+    angle = 0.5 * torch.atan2(2 * a[i, j] * torch.ones_like(apart).copysign(apart), apart.abs())
+    c, s = angle.cos(), angle.sin()
     a[i], a[j] = c * a[i] + s * a[j], c * a[j] - s * a[i]
     a[:, i], a[:, j] = c * a[:, i] + s * a[:, j], c * a[:, j] - s * a[:, i]
     return angle / 2
 
 
-def _times(q: Float[np.ndarray, "4 m"], w: np.ndarray, axis: int, v: np.ndarray) -> Float[np.ndarray, "4 m"]:
+def _times(q: Float[Tensor, "4 m"], w: Tensor, axis: int, v: Tensor) -> Float[Tensor, "4 m"]:
     """The products of quaternions with (w, v along one axis)."""
     after, last = 1 + (axis + 1) % 3, 1 + (axis + 2) % 3
-    product = np.empty_like(q)
+    product = torch.empty_like(q)
     product[0] = q[0] * w - q[1 + axis] * v
     product[1 + axis] = q[1 + axis] * w + q[0] * v
     product[after] = q[after] * w + q[last] * v
