@@ -177,6 +177,11 @@ def rasterise_vjp(kernels: Operations, place: Place) -> Results:
     return {"image": raster.image, "alpha": raster.alpha} | named
 
 
+def shares(kernels: Operations, place: Place) -> Results:
+    wanted = place.random(place.height, place.width, 3).sigmoid()
+    return kernels.shares(place.splats(), place.background, place.width, place.height, wanted)._asdict()
+
+
 def photometric_loss(kernels: Operations, place: Place) -> Results:
     image = place.random(place.height, place.width, 3).sigmoid().requires_grad_(True)
     found = kernels.photometric_loss(image, place.target, place.mask)
@@ -281,6 +286,7 @@ CASES: dict[str, Callable[[Operations, Place], Results]] = {
         adam_rows, add_view_statistics, cell_centres, cell_keys, contains, count_visibility, cull, decode,
         decode_to_train, decode_backward_adam, fit_harmonics, group_cells, group_max, harmonic_colours, mark_visible,
         mean_ellipsoids, morton_order, photometric_loss, project, rasterise, rasterise_vjp,
+        shares,
     )
 }  # fmt: skip
 

@@ -179,7 +179,7 @@ def test_doctor_says_what_there_is(monkeypatch: pytest.MonkeyPatch, tmp_path):
     assert lines["CUDA kernels"].value.endswith("1 entries")
     assert lines["on cpu: native"].value == f"all {len(operations.OPERATIONS)} operations"
     assert lines["on cuda: cuda"].value == (
-        "add_view_statistics, cull, decode, decode_backward_adam, decode_to_train, photometric_loss"
+        "add_view_statistics, cull, decode, decode_backward_adam, decode_to_train, photometric_loss, shares"
     )
     assert lines["on cuda: gsplat or cuda"].value == "rasterise, rasterise_vjp"
     assert "adam_rows" in lines["on cuda: reference"].value

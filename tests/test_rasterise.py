@@ -15,11 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from native_choice import on_threads
 from rasterise_scenes import Scene, make_scene, splats_of
 from vdgs.kernels import constants
 from vdgs.kernels.native.module import load, supported
-from vdgs.kernels.native.rasterise import rasterise
+from vdgs.kernels.native.rasterise import rasterise, shares
 from vdgs.kernels.reference.rasterise import rasterise as reference
+from vdgs.kernels.reference.shares import shares as twin
 from vdgs.kernels.types import Raster, Splats
 
 ISAS = supported()
@@ -104,6 +106,34 @@ def test_picture_and_gradients_equal_the_reference(name: str, isa: str) -> None:
     for a, e in zip(scene.tensors, exact_gradients, strict=True):
         # A mean or conic is known to 6e-8; a splat seen edge-on multiplies that.
         assert_close(a.grad, e, 2e-3 if name == "edge-on" else 5e-5)
+
+
+@pytest.mark.parametrize("isa", ISAS)
+@pytest.mark.parametrize("name", SCENES)
+def test_shares_are_what_each_splat_makes_of_the_picture_and_of_what_it_lacks(name: str, isa: str) -> None:
+    scene, exact = SCENES[name].to(torch.float32), SCENES[name].to(torch.float64)
+    wanted = torch.rand(scene.height, scene.width, 3, generator=torch.Generator().manual_seed(3))
+    size, module = (scene.width, scene.height), load(isa)
+    splats, background = splats_of(tuple(tensor.detach() for tensor in scene.tensors))
+    expected = twin(*splats_of(tuple(tensor.detach() for tensor in exact.tensors)), *size, wanted.double())
+    found = shares(splats, background, *size, wanted, module=module)
+    assert_close(found.pixels, expected.pixels, 5e-5)
+    assert_close(found.missing, expected.missing, 5e-5)
+    alone = shares(splats, background, *size, module=module)
+    assert torch.equal(alone.pixels, found.pixels)
+    assert not alone.missing.any()
+
+
+@pytest.mark.parametrize("threads", [1, 3, 8])
+def test_shares_have_the_same_bits_for_any_number_of_threads(threads: int) -> None:
+    scene = make_scene(3000, 200, 150, seed=4).to(torch.float32)
+    splats, background = splats_of(tuple(tensor.detach() for tensor in scene.tensors))
+    wanted = torch.rand(150, 200, 3, generator=torch.Generator().manual_seed(0))
+    expected = shares(splats, background, 200, 150, wanted)
+    with on_threads(threads):
+        again = shares(splats, background, 200, 150, wanted)
+    assert torch.equal(again.pixels, expected.pixels)
+    assert torch.equal(again.missing, expected.missing)
 
 
 @settings(max_examples=25)

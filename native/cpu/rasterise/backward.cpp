@@ -139,14 +139,7 @@ void backward_tiles(Frame& frame, const float background[3], const PictureGradie
   constexpr int kTilesPerTask = 4;
   const int tiles = frame.grid.tiles();
   frame.background_sums.reserve(3 * static_cast<size_t>(tiles));
-  const size_t stride = static_cast<size_t>(n_sums(frame.with_depth));
-  size_t entries = 0;
-  for (int s = 0; s < frame.n_slabs; ++s) entries += frame.slabs[s]->n_entries;
-  float* sums = frame.work.reserve(entries * stride);
-  for (int s = 0; s < frame.n_slabs; ++s) {
-    frame.slabs[s]->sums = sums;
-    sums += frame.slabs[s]->n_entries * stride;
-  }
+  room_for_sums(frame, static_cast<size_t>(n_sums(frame.with_depth)));
   const auto gradients = frame.with_depth ? tile_gradients<true> : tile_gradients<false>;
   parallel_for((tiles + kTilesPerTask - 1) / kTilesPerTask, [&](int64_t task) {
     const int begin = static_cast<int>(task) * kTilesPerTask;

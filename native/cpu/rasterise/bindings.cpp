@@ -88,6 +88,11 @@ void py_backward(std::shared_ptr<Frame> frame, const nb::tuple& background, std:
   backward(*frame, back, in, out);
 }
 
+void py_shares(std::shared_ptr<Frame> frame, Floats lacking, MutableFloats pixels, MutableFloats missing) {
+  const nb::gil_scoped_release released;
+  shares(*frame, lacking.data(), pixels.data(), missing.data());
+}
+
 nb::dict seconds(const Frame& frame) {
   static const char* const names[] = {"cull", "select", "bin", "scatter", "forward", "backward", "reduce"};
   nb::dict out;
@@ -124,5 +129,7 @@ VDGS_BIND(rasterise) {
   m.def("rasterise_backward", &py_backward, nb::arg("frame"), nb::arg("background"), nb::arg("image").none(),
         nb::arg("alpha").none(), nb::arg("depth").none(), nb::arg("means"), nb::arg("conics"),
         nb::arg("colours"), nb::arg("opacities"), nb::arg("depths").none(), nb::arg("background_gradient"));
+  m.def("rasterise_shares", &py_shares, nb::arg("frame"), nb::arg("lacking"), nb::arg("pixels"),
+        nb::arg("missing"));
   m.def("drop_idle_frames", &drop_idle_frames, "Gives the memory of frames that are not in use back.");
 }

@@ -87,7 +87,7 @@ struct Slab {
   Buffer<uint32_t> entries;     // [n_entries] which record
   Buffer<uint16_t> touched;     // [n_entries] blocks in which the entry contributed
   Buffer<uint32_t> visited;     // [tiles] entries looked at before the tile was finished
-  float* sums = nullptr;        // [n_entries, n_sums] of the backward pass, where touched; in Frame::work
+  float* sums = nullptr;        // [n_entries, n_sums or kShares] of a way back, where touched; in Frame::work
 };
 
 // The pixels of one tile, block by block.
@@ -171,5 +171,12 @@ void forward_tiles(Frame& frame, Slab& slab, bool last, const float background[3
                    bool counting);
 void backward_tiles(Frame& frame, const float background[3], const PictureGradients& in);
 void reduce_gradients(Frame& frame, const SplatGradients& out);
+void share_tiles(Frame& frame, const float* lacking);
+void reduce_shares(Frame& frame, float* pixels, float* missing);
+
+// Gives every slab room for so many sums of each of its entries.
+void room_for_sums(Frame& frame, size_t stride);
+// Sums of share_tiles: weight, weight times what is lacking of red, green and blue.
+constexpr size_t kShares = 4;
 
 }  // namespace vdgs::raster

@@ -92,6 +92,15 @@ void backward(Frame& frame, const float background[3], const PictureGradients& i
   frame.seconds[kReduce] = watch.lap();
 }
 
+void shares(Frame& frame, const float* lacking, float* pixels, float* missing) {
+  const std::lock_guard<std::mutex> lock(frame.mutex);
+  Stopwatch watch;
+  share_tiles(frame, lacking);
+  frame.seconds[kBackward] = watch.lap();
+  reduce_shares(frame, pixels, missing);
+  frame.seconds[kReduce] = watch.lap();
+}
+
 size_t Frame::bytes() const {
   size_t total =
       work.bytes() + transmittance.bytes() + stop.bytes() + unfinished.bytes() + median_depth.bytes();

@@ -16,6 +16,7 @@
 //   bin       the entries of each tile, in the order of depth                    bin.cpp
 //   forward   per tile: sixteen blocks of 4 x 4 pixels, one vector each          forward.cpp
 //   backward  per tile, back to front; ten sums per entry                        backward.cpp
+//   shares    or front to back, what the entries make of a picture: four sums    shares.cpp
 //   reduce    the entries of a splat added up, in a fixed order                  reduce.cpp
 //
 // No atomics on numbers anywhere: the same input gives the same bits for any number of threads.
@@ -67,5 +68,9 @@ void forward(Frame& frame, const Splats& splats, const float background[3], int 
 
 // May be called more than once for one forward pass, but not at the same time.
 void backward(Frame& frame, const float background[3], const PictureGradients& in, const SplatGradients& out);
+
+// In place of the backward pass, where derivatives by colours suffice. Of each splat the sum of its weights
+// over the pixels [n], and that of weight times `lacking` [h, w, 3] there [n, 3]; zero for splats that were not drawn.
+void shares(Frame& frame, const float* lacking, float* pixels, float* missing);
 
 }  // namespace vdgs::raster

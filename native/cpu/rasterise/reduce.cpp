@@ -1,4 +1,4 @@
-// Gradients of the splats from the sums of their entries, added in a fixed order.
+// Gradients and shares of the splats from the sums of their entries, added in a fixed order.
 #include "cpu/rasterise/frame.h"
 #include "simd/simd.h"
 #include "cpu/sums.h"
@@ -22,9 +22,8 @@ alignas(64) constexpr float kZeros[32] = {};
 
 // Adds up the entries of every splat of a part, front to back, as they lie in the tiles. The total takes the
 // place of the splat's first entry; part.scratch says of each pick where that is.
-template <bool with_depth>
+template <size_t kStride>
 void add_entries(const Slab& slab, SlabPart& part) {
-  constexpr size_t kStride = n_sums(with_depth);
   constexpr uint32_t kAhead = 24;
   const uint32_t *first = part.first.data(), *where = part.where.data();
   const uint32_t n_entries = static_cast<uint32_t>(part.n_entries);
@@ -71,43 +70,76 @@ VDGS_INLINE void write_gradients(const Record& r, const float* sum, int64_t i, c
   if (out.depths) out.depths[i] = sum[kSumDepth];
 }
 
-void write_part(const Slab& slab, const SlabPart& part, size_t stride, const SplatGradients& out) {
-  constexpr size_t kAhead = 16;
-  const size_t count = static_cast<size_t>(part.count);
-  const auto total = [&](size_t k) {
-    const uint32_t place = part.scratch[k].pick;
-    return place == kNowhere ? kZeros : slab.sums + place * stride;
-  };
-  for (size_t k = 0; k < count; ++k) {
-    if (k + kAhead < count) {
-      __builtin_prefetch(total(k + kAhead));
-      __builtin_prefetch(total(k + kAhead) + stride - 1);
-    }
-    const Record& record = slab.records[static_cast<size_t>(part.begin) + k];
-    if (record.columns != kNoTiles) write_gradients(record, total(k), part.splat[k], out);
-  }
-}
-
-}  // namespace
-
-void reduce_gradients(Frame& frame, const SplatGradients& out) {
-  parallel_parts(frame.n_splats, n_parts(frame.n_splats, 16384),
-                 [&](int, int64_t begin, int64_t end) { clear(out, begin, end); });
-  const auto add = frame.with_depth ? add_entries<true> : add_entries<false>;
+// Adds up what the entries of all splats came to, and calls write(record, total, i) for each splat i that was drawn.
+template <size_t kStride, class Write>
+void reduce(Frame& frame, const Write& write) {
   for (int s = 0; s < frame.n_slabs; ++s) {
     Slab& slab = *frame.slabs[s];
     parallel_for(slab.n_parts, [&](int64_t p) {
       SlabPart& part = *slab.parts[p];
-      add(slab, part);
-      write_part(slab, part, static_cast<size_t>(n_sums(frame.with_depth)), out);
+      add_entries<kStride>(slab, part);
+      constexpr size_t kAhead = 16;
+      const size_t count = static_cast<size_t>(part.count);
+      const auto total = [&](size_t k) {
+        const uint32_t place = part.scratch[k].pick;
+        return place == kNowhere ? kZeros : slab.sums + place * kStride;
+      };
+      for (size_t k = 0; k < count; ++k) {
+        if (k + kAhead < count) {
+          __builtin_prefetch(total(k + kAhead));
+          __builtin_prefetch(total(k + kAhead) + kStride - 1);
+        }
+        const Record& record = slab.records[static_cast<size_t>(part.begin) + k];
+        if (record.columns != kNoTiles) write(record, total(k), static_cast<int64_t>(part.splat[k]));
+      }
     });
   }
+}
+
+// Calls clear(begin, end) for the splats, part by part.
+template <class Clear>
+void clear_all(const Frame& frame, const Clear& clear) {
+  parallel_parts(frame.n_splats, n_parts(frame.n_splats, 16384),
+                 [&](int, int64_t begin, int64_t end) { clear(begin, end); });
+}
+
+}  // namespace
+
+void room_for_sums(Frame& frame, size_t stride) {
+  size_t entries = 0;
+  for (int s = 0; s < frame.n_slabs; ++s) entries += frame.slabs[s]->n_entries;
+  float* sums = frame.work.reserve(entries * stride);
+  for (int s = 0; s < frame.n_slabs; ++s) {
+    frame.slabs[s]->sums = sums;
+    sums += frame.slabs[s]->n_entries * stride;
+  }
+}
+
+void reduce_gradients(Frame& frame, const SplatGradients& out) {
+  clear_all(frame, [&](int64_t begin, int64_t end) { clear(out, begin, end); });
+  const auto write = [&](const Record& r, const float* sum, int64_t i) { write_gradients(r, sum, i, out); };
+  if (frame.with_depth)
+    reduce<n_sums(true)>(frame, write);
+  else
+    reduce<n_sums(false)>(frame, write);
   for (size_t c = 0; c < 3; ++c) {
     double sum = 0;
     for (size_t tile = 0; tile < static_cast<size_t>(frame.grid.tiles()); ++tile)
       sum += static_cast<double>(frame.background_sums[3 * tile + c]);
     out.background[c] = static_cast<float>(sum);
   }
+}
+
+void reduce_shares(Frame& frame, float* pixels, float* missing) {
+  clear_all(frame, [&](int64_t begin, int64_t end) {
+    const size_t n = static_cast<size_t>(end - begin);
+    std::memset(pixels + begin, 0, 4 * n);
+    std::memset(missing + 3 * begin, 0, 12 * n);
+  });
+  reduce<kShares>(frame, [&](const Record&, const float* sum, int64_t i) {
+    pixels[i] = sum[0];
+    for (int64_t c = 0; c < 3; ++c) missing[3 * i + c] = sum[1 + c];
+  });
 }
 
 }  // namespace vdgs::raster

@@ -7,12 +7,41 @@ iterations, one photograph each (blocks that draw parts of photographs: as many 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Literal
 
-from vdgs.bench.definitions import COARSE_ONLY, EXPLICIT, Budget, Change, Method
+from vdgs.bench.changes import (
+    FACTORIAL_CAMERAS,
+    as_printed,
+    best_seen,
+    coarse_alone,
+    coarse_alone_averaged,
+    coarse_as_long,
+    coarse_compensated,
+    densely,
+    explicit_gaussians,
+    factorial,
+    full,
+    in_blocks,
+    in_blocks_each_as_long,
+    in_whole_photographs,
+    partitioned_by,
+    with_assignment,
+    with_beta_g,
+    with_block,
+    with_cap,
+    with_compensation_of_sums,
+    with_gamma,
+    with_lambda_vis,
+    with_literal_gate,
+    with_longer_blocks,
+    with_printed_compensation,
+    with_t_low,
+    without_anchor_generation,
+    without_blocking,
+    without_blocking_as_long,
+)
+from vdgs.bench.definitions import COARSE_ONLY, EXPLICIT, Change, Method
 from vdgs.comparators.gaussians.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS
-from vdgs.settings.method import CompensationConfig, MergeConfig, MethodConfig, PartitionStrategy
 
 LAMBDA_VIS = (0.0, 0.5, 1.0, 1.3)
 T_LOW = (0.05, 0.15, 0.20, 0.30)
@@ -20,181 +49,9 @@ T_LOW = (0.05, 0.15, 0.20, 0.30)
 BETA_G = (0.1, 0.5, 1.5, 2.0, 3.0)
 GAMMA = (0.80, 0.90, 0.95)
 BLOCKS = (1, 2, 4, 8, 16)
-
-
-def full(config: MethodConfig, _budget: Budget) -> MethodConfig:
-    return config
-
-
-def coarse_alone(config: MethodConfig, budget: Budget) -> MethodConfig:
-    """All iterations in the coarse stage."""
-    return replace(config, training=replace(config.training, iterations=budget.total))
-
-
-def coarse_alone_averaged(config: MethodConfig, budget: Budget) -> MethodConfig:
-    """All iterations in the coarse stage, which ends with a mean of models as blocks do."""
-    alone = coarse_alone(config, budget)
-    return replace(alone, training=replace(alone.training, average=config.block.average))
-
-
-def coarse_as_long(config: MethodConfig, budget: Budget) -> MethodConfig:
-    """The coarse stage as long as one process takes when every block has its own: coarse + one block's iterations."""
-    return replace(config, training=replace(config.training, iterations=budget.coarse + budget.per_block))
-
-
-def without_blocking(config: MethodConfig, budget: Budget) -> MethodConfig:
-    """One block of the whole scene, trained as long as all blocks together, with compensated growth."""
-    one = budget.shared_by(1)
-    return replace(
-        config,
-        partition=replace(config.partition, blocking=False, blocks=1),
-        block=replace(config.block, iterations=one.per_block),
-    )
-
-
-def without_blocking_as_long(config: MethodConfig, budget: Budget) -> MethodConfig:
-    """One block of the whole scene, trained as long as one of several: as much time, if those are trained at once."""
-    one = without_blocking(config, budget)
-    return replace(one, block=replace(one.block, iterations=budget.per_block))
-
-
-def without_anchor_generation(config: MethodConfig, _budget: Budget) -> MethodConfig:
-    """Blocks grow anchors as the coarse stage does."""
-    return _compensated(config, enabled=False)
-
-
-def as_printed(config: MethodConfig, _budget: Budget) -> MethodConfig:
-    """What the paper says of blocks, in place of the preset's own choices: frozen decoder, every photograph used alike
-    and at its full size, the coarse stage's rates again, the last model and no mean, cameras above a share of 0.45, its
-    compensation. Where it is silent, as the preset `paper`."""
-    plain, scene = MethodConfig(), config.block
-    return replace(
-        config,
-        assignment=replace(config.assignment, threshold=plain.assignment.threshold),
-        block=replace(
-            plain.block,
-            iterations=scene.iterations,
-            scale_iterations=scene.scale_iterations,
-            growth=scene.growth,
-            max_anchors_total=scene.max_anchors_total,
-        ),
-    )
-
-
-def with_printed_compensation(config: MethodConfig, **values: float) -> MethodConfig:
-    """The paper's compensation, with other values where they are given."""
-    printed = replace(CompensationConfig(), **values)  # type: ignore[arg-type]
-    return replace(config, block=replace(config.block, compensation=printed))
-
-
-def in_whole_photographs(change: Change) -> Change:
-    """A method whose blocks draw whole photographs, so that each makes exactly as many iterations."""
-    return lambda config, budget: change(replace(config, block=replace(config.block, crop="off")), budget)
-
-
-def with_compensation_of_sums(config: MethodConfig, _budget: Budget) -> MethodConfig:
-    """The paper's compensation, added to the sums of gradients and not to their means."""
-    printed = with_printed_compensation(config)
-    return _compensated(printed, added_to="sum")
-
-
-def densely(change: Change) -> Change:
-    """A method whose Adam moves all anchors in every step, as Scaffold-GS and 3DGS do."""
-
-    def dense(config: MethodConfig, budget: Budget) -> MethodConfig:
-        changed = change(config, budget)
-        return replace(changed, training=replace(changed.training, adam="dense"))
-
-    return dense
-
-
-def best_seen(change: Change) -> Change:
-    """Blocks merged by which of them sees a place most (the paper: "based on visibility coverage")."""
-    return lambda config, budget: replace(change(config, budget), merge=MergeConfig(rule="best_seen"))
-
-
-def with_longer_blocks(factor: int) -> Change:
-    """Blocks that train so many times as long."""
-    return lambda config, budget: replace(config, block=replace(config.block, iterations=factor * budget.per_block))
-
-
-def with_block(**values: object) -> Change:
-    """The full method with other settings of block training."""
-    return lambda config, _: replace(config, block=replace(config.block, **values))  # type: ignore[arg-type]
-
-
-def with_assignment(**values: object) -> Change:
-    """The full method with other settings of the assignment of cameras."""
-    return lambda config, _: replace(config, assignment=replace(config.assignment, **values))  # type: ignore[arg-type]
-
-
-def in_blocks(count: int) -> Change:
-    """The same total of block iterations shared by `count` blocks."""
-
-    def change(config: MethodConfig, budget: Budget) -> MethodConfig:
-        if count == 1:
-            return without_blocking(config, budget)
-        return replace(
-            config,
-            partition=replace(config.partition, blocks=count),
-            block=replace(config.block, iterations=budget.shared_by(count).per_block),
-        )
-
-    return change
-
-
-def with_lambda_vis(value: float) -> Change:
-    return lambda config, _: replace(config, partition=replace(config.partition, lambda_vis=value))
-
-
-def with_t_low(value: float) -> Change:
-    """A fixed T_low, as in the paper: never the quantile that the preset `laptop` takes instead."""
-    return lambda config, _: with_printed_compensation(config, t_low=value)
-
-
-def with_beta_g(value: float) -> Change:
-    return lambda config, _: with_printed_compensation(config, beta_g=value)
-
-
-def with_gamma(value: float) -> Change:
-    return lambda config, _: with_printed_compensation(config, gamma=value)
-
-
-def with_literal_gate(config: MethodConfig, _budget: Budget) -> MethodConfig:
-    """Offsets of low visibility are judged after as many draws as the others."""
-    return _compensated(config, gate="literal")
-
-
-def with_cap(thresholds: float) -> Change:
-    """The cache g grows to so many thresholds of growth at most."""
-    return lambda config, _: _compensated(config, cap=thresholds * config.block.growth.threshold)
-
-
-def partitioned_by(strategy: PartitionStrategy) -> Change:
-    """Another partition; growth is plain, since compensation is what VDGS adds."""
-
-    def change(config: MethodConfig, budget: Budget) -> MethodConfig:
-        plain = without_anchor_generation(config, budget)
-        return replace(plain, partition=replace(plain.partition, strategy=strategy))
-
-    return change
-
-
-def explicit_gaussians(background: Literal["mean", "black"]) -> Change:
-    """3DGS, told by what it has in common with our coarse stage: iterations, seed, background and the limit of anchors
-    (`explicit.gaussians_config` makes its settings of these)."""
-
-    def change(config: MethodConfig, budget: Budget) -> MethodConfig:
-        alone = coarse_alone(config, budget)
-        loss = replace(alone.training.loss, background=background)
-        return replace(alone, training=replace(alone.training, loss=loss))
-
-    return change
-
-
-def _compensated(config: MethodConfig, **values: float | bool | str) -> MethodConfig:
-    changed: CompensationConfig = replace(config.block.compensation, **values)  # type: ignore[arg-type]
-    return replace(config, block=replace(config.block, compensation=changed))
+#: Of the factorial: a cut by place alone, or by place and visibility; what g is added to (None: plain growth); T_low.
+FACTORIAL_VIS, FACTORIAL_T_LOW = (0.0, 1.0), (0.2, 0.3)
+FACTORIAL_ADDED: tuple[Literal["mean", "sum"] | None, ...] = (None, "mean", "sum")
 
 
 def _sweep(
@@ -293,6 +150,25 @@ _OTHERS = [
     ),
 ]  # fmt: skip
 _BLOCKS = [Method(f"blocks-{count}", f"{count} block{'s' * (count > 1)}", in_blocks(count)) for count in BLOCKS]
+_EACH_AS_LONG = [
+    Method("each-2", "2 blocks, each as long", in_blocks_each_as_long(2), less="iterations: 2 blocks in place of 4"),
+    *(
+        Method(f"each-{count}", f"{count} blocks, each as long", in_blocks_each_as_long(count),
+               more=f"iterations: {count} blocks in place of 4")
+        for count in (8, 16)
+    ),
+]  # fmt: skip
+_COARSE_COMPENSATED = [
+    Method(
+        f"coarse-compensated-{added_to}",
+        f"coarse stage, compensation as printed, {added_to}s",
+        coarse_compensated(added_to),
+        COARSE_ONLY,
+        less="iterations of the coarse stage only",
+        differs="to be read against `coarse`",
+    )
+    for added_to in ("mean", "sum")
+]
 _LONGER = [
     Method(
         f"longer-{factor}", f"VDGS (full), blocks {factor} times as long", with_longer_blocks(factor),
@@ -365,7 +241,29 @@ _SWEEPS = [
     *_sweep("gamma", "γ", GAMMA, with_gamma, _AS_PRINTED),
 ]
 
+
+def _cell(lambda_vis: float, added_to: Literal["mean", "sum"] | None, t_low: float) -> Method:
+    name = f"cell-{lambda_vis:g}-" + ("off" if added_to is None else f"{added_to}-{t_low:g}")
+    grown = "plain growth" if added_to is None else f"compensation of {added_to}s, T_low = {t_low:g}"
+    return Method(
+        name, f"λ_vis = {lambda_vis:g}, {grown}", factorial(lambda_vis, added_to, t_low),
+        differs=f"each block has the {FACTORIAL_CAMERAS} cameras that show it best; β_g = 2, γ = 0.9",
+    )  # fmt: skip
+
+
+_FACTORIAL = [
+    _cell(lambda_vis, added_to, t_low)
+    for lambda_vis in FACTORIAL_VIS
+    for added_to in FACTORIAL_ADDED
+    for t_low in (FACTORIAL_T_LOW if added_to else FACTORIAL_T_LOW[:1])
+]
+
+#: The cells of the factorial.
+FACTORIAL = tuple(method.name for method in _FACTORIAL)
 #: Every method by name.
 METHODS: dict[str, Method] = {
-    method.name: method for method in _ABLATIONS + _OTHERS + _BLOCKS + _LONGER + _CHOICES + _SWEEPS
+    method.name: method
+    for method in (
+        _ABLATIONS + _OTHERS + _BLOCKS + _EACH_AS_LONG + _COARSE_COMPENSATED + _LONGER + _CHOICES + _SWEEPS + _FACTORIAL
+    )
 }

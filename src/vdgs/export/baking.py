@@ -21,7 +21,7 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.export.working import in_order, view_by_view
+from vdgs.export.working import in_order, sorted_runs, view_by_view
 from vdgs.kernels import choose
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.gaussians import Gaussians
@@ -69,8 +69,7 @@ def survey(model: AnchorModel, cameras: Sequence[Camera], after_view: Callable[[
     cameras."""
     if not cameras:
         raise ValueError("baking needs the training cameras")
-    k = model.anchors.offsets.shape[1]
-    pixels, shown = np.zeros(len(model.anchors) * k, np.float32), []
+    pixels, shown = np.zeros(gaussian_count(model), np.float32), []
     for view in view_by_view(lambda camera: shown_in(model, camera), cameras, model.anchors.positions.device):
         pixels[view.gaussians.numpy()] += view.pixels.numpy()
         shown.append(view)
@@ -84,12 +83,17 @@ def shown_in(model: AnchorModel, camera: Camera) -> Shown:
     k = model.anchors.offsets.shape[1]
     rows, splats = decode_view(model, camera)
     kernels = choose(rows.device)
-    _, pullback = kernels.rasterise_vjp(splats, splats.means_px.new_zeros(3), camera.width, camera.height)
-    pixels = pullback(splats.means_px.new_ones(camera.height, camera.width, 3)).colours[:, 0]
+    pixels = kernels.shares(splats, splats.means_px.new_zeros(3), camera.width, camera.height).pixels
     source = splats.source.long()
-    gaussians = rows[source // k] * k + source % k
-    kept = pixels >= LEAST_PIXELS
-    return Shown(gaussians[kept].to("cpu", torch.int32), pixels[kept].cpu())
+    kept = (pixels >= LEAST_PIXELS).nonzero()[:, 0]
+    source = source.index_select(0, kept)
+    gaussians = rows.index_select(0, source // k) * k + source % k
+    return Shown(gaussians.to("cpu", torch.int32), pixels.index_select(0, kept).cpu())
+
+
+def gaussian_count(model: AnchorModel) -> int:
+    """How many Gaussians the anchors of a model spawn."""
+    return len(model.anchors) * model.anchors.offsets.shape[1]
 
 
 def part_count(model: AnchorModel) -> int:
@@ -143,20 +147,23 @@ class _Pairs:
 def _gathered(seen: Seen, wanted: Int[np.ndarray, " m"]) -> _Pairs:
     """How the cameras see the wanted Gaussians, which lie close together in number."""
     columns: list[tuple[Tensor, ...]] = []
-    numbers = torch.from_numpy(wanted)
+    first, last = int(wanted[0]), int(wanted[-1])
+    place_of = torch.full((last - first + 1,), -1, dtype=torch.int32)
+    place_of[torch.from_numpy(wanted - first)] = torch.arange(len(wanted), dtype=torch.int32)
     for camera, shown in zip(seen.cameras, seen.shown, strict=True):
-        low, high = np.searchsorted(shown.gaussians.numpy(), [wanted[0], wanted[-1] + 1])
+        low, high = np.searchsorted(shown.gaussians.numpy(), [first, last + 1])
         if low == high:
             continue
-        gaussians, pixels = shown.gaussians[low:high].long(), shown.pixels[low:high]
-        place = torch.searchsorted(numbers, gaussians).clamp(max=len(wanted) - 1)
-        inside = numbers[place] == gaussians
-        if inside.any():
-            columns.append((place[inside], pixels[inside], *_seen_from(seen.model, gaussians[inside], camera)))
+        gaussians, pixels = shown.gaussians[low:high], shown.pixels[low:high]
+        place = place_of.index_select(0, gaussians - first)
+        inside = (place >= 0).nonzero()[:, 0]
+        if len(inside):
+            as_seen = _seen_from(seen.model, gaussians.index_select(0, inside).long(), camera)
+            columns.append((place.index_select(0, inside), pixels.index_select(0, inside), *as_seen))
     place, *rest = (torch.cat(column) for column in zip(*columns, strict=True))
-    order = place.sort(stable=True)
-    starts = np.searchsorted(order.values.numpy(), np.arange(len(wanted)))
-    return _Pairs(starts, *(column[order.indices] for column in rest))
+    order, counts = sorted_runs(place, 0, len(wanted))
+    starts = (counts.cumsum(0) - counts).numpy()
+    return _Pairs(starts, *(column.index_select(0, order) for column in rest))
 
 
 def _seen_from(model: AnchorModel, gaussians: Tensor, camera: Camera) -> tuple[Tensor, ...]:
@@ -170,11 +177,14 @@ def _seen_from(model: AnchorModel, gaussians: Tensor, camera: Camera) -> tuple[T
         low, high = torch.searchsorted(rows, rows.new_tensor([first, last])).tolist()
         if low < high:
             pieces.append(spawned(anchors, rows[low:high], decoder.for_image(None), camera))
+    # Rows of all k Gaussians of an anchor, in one column.
+    spread = place * k + offset
     opacities, colours, scales, quaternions = (
-        torch.cat([getattr(piece, name) for piece in pieces]).cpu()[place, offset]
+        torch.cat([getattr(piece, name) for piece in pieces]).flatten(0, 1).cpu().index_select(0, spread)
         for name in ("opacities", "colours", "scales", "quaternions")
     )
-    rays = places(anchors.select(rows)).cpu()[place, offset] - torch.from_numpy(camera.position.astype(np.float32))
+    means = places(anchors.select(rows)).flatten(0, 1).cpu().index_select(0, spread)
+    rays = means - torch.from_numpy(camera.position.astype(np.float32))
     return torch.nn.functional.normalize(rays, dim=1), colours, opacities, scales.log(), quaternions
 
 
@@ -187,9 +197,10 @@ def fitted(seen: Seen, wanted: Int[np.ndarray, " m"], degree: int) -> Gaussians:
     log_scales, quaternions = kernels.mean_ellipsoids(pairs.log_scales, pairs.quaternions, pairs.pixels, starts)
     opacities = _means(pairs.opacities, pairs).clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     rows = torch.from_numpy(wanted // k)
-    means = places(anchors.select(rows.to(anchors.positions.device))).cpu()
+    rows, place = torch.unique_consecutive(rows, return_inverse=True)
+    means = places(anchors.select(rows.to(anchors.positions.device))).flatten(0, 1).cpu()
     return Gaussians(
-        means=means[torch.arange(len(wanted)), torch.from_numpy(wanted % k)],
+        means=means.index_select(0, place * k + torch.from_numpy(wanted % k)),
         log_scales=log_scales,
         quaternions=quaternions,
         logits=opacities.logit(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import count
 
 import numpy as np
@@ -15,29 +15,51 @@ from vdgs.cameras import Camera
 NEIGHBOURS = 3
 #: That is: whose directions are at most about 45 degrees apart (cosine).
 LIKE = 0.7
-#: So many times colours are fitted again.
-ROUNDS = 2
+#: So many times colours are fitted again, and how often where anchors spawn more Gaussians than that.
+ROUNDS, ROUNDS_OF_MANY, MANY_GAUSSIANS = 6, 2, 4_000_000
+#: No seed of `rounds` reaches here.
+BEYOND_ROUNDS = 1000
+#: How much farther than to what pictures lack colours go in rounds between the first and the last: over-relaxation,
+#: which converges below 2. Chosen at places that no round has (docs/export.md).
+FARTHER = 1.8
 
 
-def rounds(training: Sequence[Camera]) -> tuple[Sequence[Camera], ...]:
-    """By which pictures colours are fitted again, round by round: by those of the training cameras, and of others
-    between them that no round has had before. Where only midway between neighbours is looked again and again, what
-    suits those places is learnt by heart (docs/export.md)."""
-    return tuple([*training, *between(training, number)] for number in range(ROUNDS))
+@dataclass(frozen=True)
+class Round:
+    """By which pictures colours are fitted again, and how far they go of the way to what these lack."""
+
+    cameras: Sequence[Camera]
+    step: float
+
+
+def round_count(asked: int | None, gaussians: int) -> int:
+    """How many rounds, for so many Gaussians that the anchors of a model spawn."""
+    if asked is not None:
+        return asked
+    return ROUNDS if gaussians <= MANY_GAUSSIANS else ROUNDS_OF_MANY
+
+
+def rounds(training: Sequence[Camera], count: int) -> tuple[Round, ...]:
+    """Rounds at cameras between the training ones, others in each, for where the same places are looked at again and
+    again, what suits them is learnt by heart; the last one at those of the photographs too."""
+    inner = tuple(
+        Round(between(training, number, alone=True), FARTHER if number else 1.0) for number in range(count - 1)
+    )
+    return (*inner, Round([*training, *between(training, count - 1)], 1.0)) if count else ()
 
 
 def endless(training: Sequence[Camera]) -> Iterator[Camera]:
     """The training cameras and others between them, in random order, and so on: the others are never the same, nor any
     of `rounds`."""
-    for number in count(ROUNDS):
+    for number in count(BEYOND_ROUNDS):
         cameras = [*training, *between(training, number)]
         for i in np.random.default_rng(number).permutation(len(cameras)):
             yield cameras[i]
 
 
-def between(cameras: Sequence[Camera], seed: int) -> list[Camera]:
+def between(cameras: Sequence[Camera], seed: int, alone: bool = False) -> list[Camera]:
     """Each camera that has neighbours somewhere between itself and these: in their mean by random weights, all equally
-    likely, with its own orientation and picture."""
+    likely, with its own orientation and picture. With `alone` also those that have none, where they are."""
     places = np.array([camera.position for camera in cameras])
     forward = np.array([camera.forward for camera in cameras])
     generator = np.random.default_rng(seed)
@@ -47,6 +69,8 @@ def between(cameras: Sequence[Camera], seed: int) -> list[Camera]:
         if len(around := [i, *_alike(places, forward, i)]) > 1:
             own = weights[: len(around)] / weights[: len(around)].sum()
             found.append(_moved(camera, own @ places[around]))
+        elif alone:
+            found.append(camera)
     return found
 
 

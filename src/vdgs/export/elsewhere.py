@@ -24,7 +24,7 @@ from vdgs.executors.errand import Errand, Wish
 from vdgs.executors.fitness import Question, photographs_of
 from vdgs.executors.placement import Share
 from vdgs.executors.work import clear, remove
-from vdgs.export.baking import part_size
+from vdgs.export.baking import gaussian_count, part_size
 from vdgs.export.formats.scene import Scene
 from vdgs.export.formats.spool import Spooled, opened, spooled, unflattened
 from vdgs.export.saved import load_added, load_array, load_shown
@@ -86,8 +86,7 @@ class BakedElsewhere:
         if not self._work.pixels_file.exists():
             step = self._work.step(SURVEY)
             self._send(step)
-            anchors = self._run.model.anchors
-            pixels = np.zeros(len(anchors) * anchors.offsets.shape[1], np.float32)
+            pixels = np.zeros(gaussian_count(self._run.model), np.float32)
             for file in self._work.files(step):  # in the order of one process: sums have its bits
                 stop_if_asked()
                 view = load_shown(file)
@@ -165,8 +164,7 @@ class BakedElsewhere:
         """Memory by estimate."""
         model = self._run.model_path.stat().st_size
         if step.kind in (SURVEY, COMPARE):
-            gaussians = len(self._run.model.anchors) * self._run.model.anchors.offsets.shape[1]
-            held = GAUSSIAN_BYTES * gaussians if step.kind is COMPARE else 0
+            held = GAUSSIAN_BYTES * gaussian_count(self._run.model) if step.kind is COMPARE else 0
             return drawing_bytes(model, held, max(camera.width * camera.height for camera in self.training))
         before = self._work.step(COMPARE, step.round) if step.kind is MEND else self._work.step(SURVEY)
         pairs = sum(file.stat().st_size for file in self._work.files(before)) // (12 if step.kind is MEND else 8)
@@ -177,6 +175,7 @@ class BakedElsewhere:
         """As it was asked for, so that a piece finds the same work; floats with all their digits."""
         asked = self._asked
         given = [word for path in asked.to for word in ("--to", os.path.abspath(path))]
+        given += [] if asked.rounds is None else ["--rounds", str(asked.rounds)]
         given += [] if asked.block is None else ["--block", str(asked.block)]
         given += [] if asked.bbox is None else ["--bbox", *map(repr, asked.bbox)]
         given += [] if asked.crs is None else ["--crs", asked.crs]

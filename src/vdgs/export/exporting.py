@@ -18,7 +18,8 @@ from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
 from vdgs.captures.overview import overview
 from vdgs.errors import VdgsError
 from vdgs.executors.errand import Wish
-from vdgs.export.between import endless
+from vdgs.export.baking import gaussian_count
+from vdgs.export.between import endless, round_count
 from vdgs.export.elsewhere import BakedElsewhere, baked_elsewhere, forget_pieces
 from vdgs.export.formats import registry
 from vdgs.export.formats.scene import ROWS, Page, Scene
@@ -114,11 +115,12 @@ def export_run(asked: ExportRequest, console: Console, wish: Wish | None = None)
             _refined(Baked(run.model, kept, spool), baker.training, asked.refine, console)
             baked = _Baked(spool, asked.sh_degree, page_of(run, int(asked.html_mb * 1e6)))
             seconds = time.monotonic() - began
-            console.print(f"baked in {seconds:.1f} s", highlight=False)
+            rounds = round_count(asked.rounds, gaussian_count(run.model))
+            console.print(f"baked in {seconds:.1f} s, colours fitted again in {rounds} rounds", highlight=False)
             files = [_write(path, baked.scene(frames[path], rows[path]), console) for path in asked.to]
             losses = _losses(run, frames, baked, asked, console)
     record = jsonable({
-        "model": run.name, "key": run.key, "gaussians": len(kept), "sh_degree": asked.sh_degree,
+        "model": run.name, "key": run.key, "gaussians": len(kept), "sh_degree": asked.sh_degree, "rounds": rounds,
         "seconds_to_bake": seconds, "seconds_to_refine": asked.refine, "files": files, "losses": losses,
     })  # fmt: skip
     write_json(run.folder.path / RECORD, record)

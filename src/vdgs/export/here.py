@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from vdgs.errors import VdgsError
-from vdgs.export.baking import Survey, bake, survey
-from vdgs.export.between import rounds
+from vdgs.export.baking import Survey, bake, gaussian_count, survey
+from vdgs.export.between import round_count, rounds
 from vdgs.export.formats.scene import Scene
 from vdgs.export.formats.spool import Spooled, spooled
 from vdgs.export.refit import Baked, refit
@@ -34,8 +34,7 @@ class BakedHere:
     def __init__(self, run: TrainedRun, asked: ExportRequest, console: Console) -> None:
         self._run, self._asked, self._console = run, asked, console
         self.training = [view.camera for view in run.capture.train_views]
-        #: By which pictures are compared.
-        self._rounds = rounds(self.training)
+        self._rounds = rounds(self.training, round_count(asked.rounds, gaussian_count(run.model)))
         self._seen: Survey | None = None
 
     def pixels(self) -> Float[np.ndarray, " g"]:
@@ -80,11 +79,11 @@ class BakedHere:
 
     def _improve(self, baked: Baked, bar: Progress) -> None:
         """Fit the colours again to what pictures lack."""
-        task = bar.add_task("comparing pictures", total=sum(map(len, self._rounds)))
+        task = bar.add_task("comparing pictures", total=sum(len(each.cameras) for each in self._rounds))
 
         def after_view() -> None:
             stop_if_asked()
             bar.advance(task)
 
-        for cameras in self._rounds:
-            refit(baked, cameras, after_view)
+        for round_ in self._rounds:
+            refit(baked, round_, after_view)

@@ -21,8 +21,8 @@ from typing import Any
 from vdgs.cameras import Camera
 from vdgs.executors.kinds import Kind
 from vdgs.executors.work import PieceWork, spans_of
-from vdgs.export.baking import part_count
-from vdgs.export.between import rounds
+from vdgs.export.baking import gaussian_count, part_count
+from vdgs.export.between import Round, round_count, rounds
 from vdgs.export.formats import registry
 from vdgs.export.frame import usual_crs
 from vdgs.runs.opening import TrainedRun
@@ -57,17 +57,16 @@ class BakingWork:
     pieces: PieceWork
     steps: tuple[Step, ...]
     training: Sequence[Camera]
-    rounds: tuple[Sequence[Camera], ...]
-    """By which pictures are compared."""
+    rounds: tuple[Round, ...]
 
     @staticmethod
     def of(run: TrainedRun, asked: ExportRequest) -> BakingWork:
         """What baking a run as it is asked for (`as_files_hold`) comes to, and what it depends on."""
         training = [view.camera for view in run.capture.train_views]
-        cameras = rounds(training)
-        steps, spans = _cut(len(training), [len(each) for each in cameras], part_count(run.model))
+        planned = rounds(training, round_count(asked.rounds, gaussian_count(run.model)))
+        steps, spans = _cut(len(training), [len(each.cameras) for each in planned], part_count(run.model))
         output = Path(os.path.abspath(run.folder.path)) / FOLDER
-        return BakingWork(PieceWork.of(output, _depends_on(run, asked), spans), steps, training, cameras)
+        return BakingWork(PieceWork.of(output, _depends_on(run, asked), spans), steps, training, planned)
 
     def steps_of(self, round_: int) -> list[Step]:
         """From what comes before the Gaussians of a round to them; before the first, what views show is known."""
@@ -83,9 +82,9 @@ class BakingWork:
         """What the items of a step leave, in their order."""
         return [self.pieces.file(item, ".npy") for item in step.items]
 
-    def cameras_of(self, round_: int) -> Sequence[Camera]:
-        """By which pictures are compared in a round, from 1 on."""
-        return self.rounds[round_ - 1]
+    def round(self, number: int) -> Round:
+        """From 1 on."""
+        return self.rounds[number - 1]
 
     @property
     def pixels_file(self) -> Path:
@@ -119,7 +118,8 @@ def _cut(views: int, rounds: Sequence[int], parts: int) -> tuple[tuple[Step, ...
 
 
 def _depends_on(run: TrainedRun, asked: ExportRequest) -> list[Any]:
-    """The model, the degree, and what chooses among its Gaussians."""
+    """The model, the degree, how often colours are fitted, and what chooses among its Gaussians."""
     crs = None if asked.bbox is None else asked.crs or usual_crs(run.capture.ground, asked.to[0])
     box = None if asked.bbox is None else list(asked.bbox)
-    return [run.name, run.key, run.status.model, asked.sh_degree, asked.block, box, crs, asked.max_gaussians]
+    count = round_count(asked.rounds, gaussian_count(run.model))
+    return [run.name, run.key, run.status.model, asked.sh_degree, count, asked.block, box, crs, asked.max_gaussians]

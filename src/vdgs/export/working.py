@@ -8,7 +8,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
+import numpy as np
 import torch
+from jaxtyping import Int, Int64
+from torch import Tensor
 
 from vdgs.kernels import threads
 
@@ -16,6 +19,18 @@ P = TypeVar("P")
 R = TypeVar("R")
 #: Beyond so many threads memory would grow more than speed.
 MOST = 8
+
+
+def sorted_runs(numbers: Int[Tensor, " p"], first: int, count: int) -> tuple[Int64[Tensor, " p"], Int64[Tensor, " m"]]:
+    """How pairs whose Gaussians are given, of `count` from `first` on, are brought into the order of these, keeping
+    their own among those of each; and how many pairs each of the `count` has.
+
+    numpy sorts 16 bits by their digits, five times as fast as torch sorts 64.
+    """
+    small = np.uint16 if count <= 2**16 else np.uint32
+    keys = (numbers.numpy() - first).astype(small)
+    order = torch.from_numpy(np.argsort(keys, kind="stable"))
+    return order, torch.from_numpy(np.bincount(keys, minlength=count))
 
 
 def in_order(work: Callable[[P], R], parts: Iterable[P]) -> Iterator[R]:

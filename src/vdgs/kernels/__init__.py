@@ -21,6 +21,7 @@ Names and dimensions, fixed once for all files in this folder:
     d  rasterise(means_px [m,2], conics [m,3], colours [m,3], opacities [m], depths [m],
                  background [3], width, height) -> Raster(image [h,w,3], alpha [h,w], depth [h,w], median_depth [h,w])
        rasterise_vjp(the same) -> Raster, and the function that takes gradients of it back to the splats
+       shares(the same, wanted [h,w,3]) -> Shares(pixels [m], missing [m,3])
     d  photometric_loss(image [h,w,3], target uint8 [h,w,3], mask) -> Photometric(loss, l1, ssim)
        adam_rows(parameter [n,...], rows [v], gradient [v,...], moments, ...) -> finite; in place
        add_view_statistics(visible [v], inside [v], source [m], opacities [m], gradient_px [m,2], ..., sums)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         Projected,
         Raster,
         RasterPullback,
+        Shares,
         SplatGradients,
         Splats,
         Statistics,
@@ -77,6 +78,10 @@ class Operations(Protocol):
     def rasterise_vjp(
         self, splats: Splats, background: Tensor, width: int, height: int, *, depth: bool = False
     ) -> tuple[Raster, RasterPullback]: ...
+
+    def shares(
+        self, splats: Splats, background: Tensor, width: int, height: int, wanted: Tensor | None = None
+    ) -> Shares: ...
 
     def photometric_loss(
         self, image: Tensor, target: Tensor, mask: Tensor | None = None, *, ssim_weight: float = 0.2
@@ -143,6 +148,7 @@ ON_A_CARD: dict[str, tuple[str, ...]] = dict.fromkeys(OPERATIONS, ("reference",)
     "photometric_loss": ("cuda",),
     "rasterise": ("gsplat", "cuda"),
     "rasterise_vjp": ("gsplat", "cuda"),
+    "shares": ("cuda",),
 }
 
 #: Whether all that has been run on a card. Until it is, `--device auto` takes the processor.

@@ -219,6 +219,15 @@ class Raster(NamedTuple):
     median_depth: Float[Tensor, "h w"] | None = None
 
 
+class Shares(NamedTuple):
+    """What each splat makes of a picture."""
+
+    #: How many pixels: the sum of its weights over them.
+    pixels: Float[Tensor, " m"]
+    #: The sum of weight times what the picture lacks there.
+    missing: Float[Tensor, "m 3"]
+
+
 class RasterGradients(NamedTuple):
     """Derivatives of a loss by what a picture was drawn from."""
 

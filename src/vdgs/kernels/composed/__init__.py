@@ -11,6 +11,7 @@ from vdgs.kernels.cuda import (
     decode_backward_adam,
     decode_to_train,
     photometric_loss,
+    shares,
 )
 from vdgs.kernels.reference import (
     adam_rows,
@@ -50,4 +51,5 @@ __all__ = [
     "project",
     "rasterise",
     "rasterise_vjp",
+    "shares",
 ]

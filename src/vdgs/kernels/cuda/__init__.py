@@ -7,7 +7,7 @@ from vdgs.kernels.cuda.cull import cull
 from vdgs.kernels.cuda.decode import decode, decode_to_train
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.loss import photometric_loss
-from vdgs.kernels.cuda.rasterise import rasterise, rasterise_vjp
+from vdgs.kernels.cuda.rasterise import rasterise, rasterise_vjp, shares
 from vdgs.kernels.cuda.statistics import add_view_statistics
 
 __all__ = [
@@ -19,4 +19,5 @@ __all__ = [
     "photometric_loss",
     "rasterise",
     "rasterise_vjp",
+    "shares",
 ]

@@ -12,8 +12,9 @@ from torch import Tensor
 from vdgs.kernels.checking import check_splats
 from vdgs.kernels.cuda.launching import Argument, Program
 from vdgs.kernels.differentiable import differentiable
+from vdgs.kernels.reference.shares import shares_by
 from vdgs.kernels.runs import Runs
-from vdgs.kernels.types import OrderedSplats, Raster, RasterGradients, RasterPullback, Splats
+from vdgs.kernels.types import OrderedSplats, Raster, RasterGradients, RasterPullback, Shares, Splats
 
 #: Side of a tile, threads of a block and sums of an entry: kTile, kThreads and kSums of the source.
 TILE_PX, THREADS, SUMS = 16, 256, 10
@@ -50,6 +51,17 @@ def rasterise_vjp(
 ) -> tuple[Raster, RasterPullback]:
     """`rasterise` without autograd: the picture, and the way back from it, which reads the splats again."""
     return _draw((*splats.tensors, background), _runs_of(splats), width, height, depth, program)
+
+
+def shares(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    wanted: Float[Tensor, "h w 3"] | None = None,
+) -> Shares:
+    """As `reference.shares.shares`, by the whole way back."""
+    return shares_by(rasterise_vjp, splats, background, width, height, wanted)
 
 
 def _runs_of(splats: Splats) -> Runs | None:

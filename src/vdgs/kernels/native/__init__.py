@@ -9,7 +9,7 @@ from vdgs.kernels.native.ellipsoids import mean_ellipsoids
 from vdgs.kernels.native.harmonics import fit_harmonics, harmonic_colours
 from vdgs.kernels.native.loss import photometric_loss
 from vdgs.kernels.native.project import project
-from vdgs.kernels.native.rasterise import rasterise, rasterise_vjp
+from vdgs.kernels.native.rasterise import rasterise, rasterise_vjp, shares
 from vdgs.kernels.native.statistics import add_view_statistics
 from vdgs.kernels.native.visibility import count_visibility, mark_visible
 
@@ -35,4 +35,5 @@ __all__ = [
     "project",
     "rasterise",
     "rasterise_vjp",
+    "shares",
 ]

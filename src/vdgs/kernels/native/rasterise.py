@@ -12,7 +12,7 @@ from torch import Tensor
 from vdgs.kernels.checking import check_splats
 from vdgs.kernels.differentiable import differentiable
 from vdgs.kernels.native import module as native_module
-from vdgs.kernels.types import Raster, RasterGradients, RasterPullback, Splats
+from vdgs.kernels.types import Raster, RasterGradients, RasterPullback, Shares, Splats
 
 
 def rasterise(
@@ -56,9 +56,25 @@ def rasterise_vjp(
     return _draw((*splats.tensors, background), width, height, depth, module)
 
 
-def _draw(
-    tensors: tuple[Tensor, ...], width: int, height: int, depth: bool, module: Any
-) -> tuple[Raster, RasterPullback]:
+def shares(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    wanted: Float[Tensor, "h w 3"] | None = None,
+    *,
+    module: Any = None,
+) -> Shares:
+    """As `reference.shares.shares`: front to back a second time, four sums for each splat of a tile where the way back
+    of `rasterise` makes ten. The same bits for any number of threads."""
+    raster, pullback = _draw((*splats.tensors, background), width, height, False, module)
+    lacking = torch.zeros_like(raster.image) if wanted is None else wanted - raster.image
+    found = Shares(torch.empty(pullback.count), torch.empty(pullback.count, 3))
+    pullback.module.rasterise_shares(pullback.frame, lacking.contiguous().numpy(), *(t.numpy() for t in found))
+    return found
+
+
+def _draw(tensors: tuple[Tensor, ...], width: int, height: int, depth: bool, module: Any) -> tuple[Raster, _Pullback]:
     """The picture of means_px, conics, colours, opacities, depths before a background, and the way back."""
     _check(tensors, width, height)
     module = module or native_module.native()

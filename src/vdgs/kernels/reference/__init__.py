@@ -10,6 +10,7 @@ from vdgs.kernels.reference.harmonics import fit_harmonics, harmonic_colours
 from vdgs.kernels.reference.loss import photometric_loss
 from vdgs.kernels.reference.project import project
 from vdgs.kernels.reference.rasterise import rasterise, rasterise_vjp
+from vdgs.kernels.reference.shares import shares
 from vdgs.kernels.reference.statistics import add_view_statistics
 from vdgs.kernels.reference.visibility import count_visibility, mark_visible
 
@@ -35,4 +36,5 @@ __all__ = [
     "project",
     "rasterise",
     "rasterise_vjp",
+    "shares",
 ]

@@ -1,0 +1,219 @@
+"""What methods change about the settings of the full method: a function from settings to settings for each.
+
+All but 3DGS share the anchor model, the loss and the block training of this package.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+from vdgs.bench.definitions import Budget, Change
+from vdgs.settings.method import CompensationConfig, MergeConfig, MethodConfig, PartitionStrategy
+
+#: So many cameras has each block of the factorial: those that show it best.
+FACTORIAL_CAMERAS = 160
+
+
+def full(config: MethodConfig, _budget: Budget) -> MethodConfig:
+    return config
+
+
+def coarse_alone(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """All iterations in the coarse stage."""
+    return replace(config, training=replace(config.training, iterations=budget.total))
+
+
+def coarse_alone_averaged(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """All iterations in the coarse stage, which ends with a mean of models as blocks do."""
+    alone = coarse_alone(config, budget)
+    return replace(alone, training=replace(alone.training, average=config.block.average))
+
+
+def coarse_as_long(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """The coarse stage as long as one process takes when every block has its own: coarse + one block's iterations."""
+    return replace(config, training=replace(config.training, iterations=budget.coarse + budget.per_block))
+
+
+def without_blocking(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """One block of the whole scene, trained as long as all blocks together, with compensated growth."""
+    one = budget.shared_by(1)
+    return replace(
+        config,
+        partition=replace(config.partition, blocking=False, blocks=1),
+        block=replace(config.block, iterations=one.per_block),
+    )
+
+
+def without_blocking_as_long(config: MethodConfig, budget: Budget) -> MethodConfig:
+    """One block of the whole scene, trained as long as one of several: as much time, if those are trained at once."""
+    one = without_blocking(config, budget)
+    return replace(one, block=replace(one.block, iterations=budget.per_block))
+
+
+def without_anchor_generation(config: MethodConfig, _budget: Budget) -> MethodConfig:
+    """Blocks grow anchors as the coarse stage does."""
+    return compensated(config, enabled=False)
+
+
+def as_printed(config: MethodConfig, _budget: Budget) -> MethodConfig:
+    """What the paper says of blocks, in place of the preset's own choices: frozen decoder, every photograph used alike
+    and at its full size, the coarse stage's rates again, the last model and no mean, cameras above a share of 0.45, its
+    compensation. Where it is silent, as the preset `paper`."""
+    plain, scene = MethodConfig(), config.block
+    return replace(
+        config,
+        assignment=replace(config.assignment, threshold=plain.assignment.threshold),
+        block=replace(
+            plain.block,
+            iterations=scene.iterations,
+            scale_iterations=scene.scale_iterations,
+            growth=scene.growth,
+            max_anchors_total=scene.max_anchors_total,
+        ),
+    )
+
+
+def with_printed_compensation(config: MethodConfig, **values: float) -> MethodConfig:
+    """The paper's compensation, with other values where they are given."""
+    printed = replace(CompensationConfig(), **values)  # type: ignore[arg-type]
+    return replace(config, block=replace(config.block, compensation=printed))
+
+
+def in_whole_photographs(change: Change) -> Change:
+    """A method whose blocks draw whole photographs, so that each makes exactly as many iterations."""
+    return lambda config, budget: change(replace(config, block=replace(config.block, crop="off")), budget)
+
+
+def with_compensation_of_sums(config: MethodConfig, _budget: Budget) -> MethodConfig:
+    """The paper's compensation, added to the sums of gradients and not to their means."""
+    printed = with_printed_compensation(config)
+    return compensated(printed, added_to="sum")
+
+
+def densely(change: Change) -> Change:
+    """A method whose Adam moves all anchors in every step, as Scaffold-GS and 3DGS do."""
+
+    def dense(config: MethodConfig, budget: Budget) -> MethodConfig:
+        changed = change(config, budget)
+        return replace(changed, training=replace(changed.training, adam="dense"))
+
+    return dense
+
+
+def best_seen(change: Change) -> Change:
+    """Blocks merged by which of them sees a place most (the paper: "based on visibility coverage")."""
+    return lambda config, budget: replace(change(config, budget), merge=MergeConfig(rule="best_seen"))
+
+
+def with_longer_blocks(factor: int) -> Change:
+    """Blocks that train so many times as long."""
+    return lambda config, budget: replace(config, block=replace(config.block, iterations=factor * budget.per_block))
+
+
+def with_block(**values: object) -> Change:
+    """The full method with other settings of block training."""
+    return lambda config, _: replace(config, block=replace(config.block, **values))  # type: ignore[arg-type]
+
+
+def with_assignment(**values: object) -> Change:
+    """The full method with other settings of the assignment of cameras."""
+    return lambda config, _: replace(config, assignment=replace(config.assignment, **values))  # type: ignore[arg-type]
+
+
+def in_blocks(count: int) -> Change:
+    """The same total of block iterations shared by `count` blocks."""
+
+    def change(config: MethodConfig, budget: Budget) -> MethodConfig:
+        if count == 1:
+            return without_blocking(config, budget)
+        return replace(
+            config,
+            partition=replace(config.partition, blocks=count),
+            block=replace(config.block, iterations=budget.shared_by(count).per_block),
+        )
+
+    return change
+
+
+def in_blocks_each_as_long(count: int) -> Change:
+    """`count` blocks, each of which trains as long as one of the full method: more blocks, more work in all."""
+    return lambda config, _: replace(config, partition=replace(config.partition, blocks=count))
+
+
+def coarse_compensated(added_to: Literal["mean", "sum"]) -> Change:
+    """The coarse stage alone, grown with the paper's compensation (its Table III counts one block so)."""
+
+    def change(config: MethodConfig, _budget: Budget) -> MethodConfig:
+        return replace(config, training=replace(config.training, compensation=CompensationConfig(added_to=added_to)))
+
+    return change
+
+
+def factorial(lambda_vis: float, added_to: Literal["mean", "sum"] | None, t_low: float) -> Change:
+    """One cell of the factorial: all blocks have equally many cameras, and all of compensation but `added_to` and T_low
+    is the paper's."""
+
+    def change(config: MethodConfig, budget: Budget) -> MethodConfig:
+        printed = with_printed_compensation(with_lambda_vis(lambda_vis)(config, budget), t_low=t_low)
+        equal = replace(printed.assignment, threshold=1.0, best_block=False, min_cameras=FACTORIAL_CAMERAS)
+        changed = replace(printed, assignment=equal)
+        if added_to is None:
+            return compensated(changed, enabled=False)
+        return compensated(changed, added_to=added_to)
+
+    return change
+
+
+def with_lambda_vis(value: float) -> Change:
+    return lambda config, _: replace(config, partition=replace(config.partition, lambda_vis=value))
+
+
+def with_t_low(value: float) -> Change:
+    """A fixed T_low, as in the paper: never the quantile that the preset `laptop` takes instead."""
+    return lambda config, _: with_printed_compensation(config, t_low=value)
+
+
+def with_beta_g(value: float) -> Change:
+    return lambda config, _: with_printed_compensation(config, beta_g=value)
+
+
+def with_gamma(value: float) -> Change:
+    return lambda config, _: with_printed_compensation(config, gamma=value)
+
+
+def with_literal_gate(config: MethodConfig, _budget: Budget) -> MethodConfig:
+    """Offsets of low visibility are judged after as many draws as the others."""
+    return compensated(config, gate="literal")
+
+
+def with_cap(thresholds: float) -> Change:
+    """The cache g grows to so many thresholds of growth at most."""
+    return lambda config, _: compensated(config, cap=thresholds * config.block.growth.threshold)
+
+
+def partitioned_by(strategy: PartitionStrategy) -> Change:
+    """Another partition; growth is plain, since compensation is what VDGS adds."""
+
+    def change(config: MethodConfig, budget: Budget) -> MethodConfig:
+        plain = without_anchor_generation(config, budget)
+        return replace(plain, partition=replace(plain.partition, strategy=strategy))
+
+    return change
+
+
+def explicit_gaussians(background: Literal["mean", "black"]) -> Change:
+    """3DGS, told by what it has in common with our coarse stage: iterations, seed, background and the limit of anchors
+    (`explicit.gaussians_config` makes its settings of these)."""
+
+    def change(config: MethodConfig, budget: Budget) -> MethodConfig:
+        alone = coarse_alone(config, budget)
+        loss = replace(alone.training.loss, background=background)
+        return replace(alone, training=replace(alone.training, loss=loss))
+
+    return change
+
+
+def compensated(config: MethodConfig, **values: float | bool | str) -> MethodConfig:
+    changed: CompensationConfig = replace(config.block.compensation, **values)  # type: ignore[arg-type]
+    return replace(config, block=replace(config.block, compensation=changed))
