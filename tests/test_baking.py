@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from merging_support import camera_above, model_at
 from vdgs.cameras import Camera
@@ -219,7 +220,8 @@ def test_cameras_between_lie_among_neighbours_that_look_alike_and_are_never_the_
     assert len(found) == 2 * len(GRID)  # nobody looks as that one does
     assert len({camera.position.tobytes() for camera in found}) == len(found)
     for camera, own in zip(found, [*GRID, *GRID], strict=True):
-        assert np.array_equal(camera.camera_from_world[:3, :3], own.camera_from_world[:3, :3])
+        turn = Rotation.from_matrix(camera.camera_from_world[:3, :3] @ own.camera_from_world[:3, :3].T)
+        assert 0 < turn.magnitude() <= 3**0.5 * 0.5 * np.arctan(own.width / 2 / own.fx)
         alike = np.array([each.position for each in GRID if own.forward @ each.forward > 0.7])
         assert (camera.position >= alike.min(0) - 1e-9).all()
         assert (camera.position <= alike.max(0) + 1e-9).all()
@@ -236,7 +238,7 @@ def test_rounds_look_from_between_and_the_last_one_at_the_photographs_too():
     known = {camera.position.tobytes() for camera in GRID}
     assert [len(each.cameras) for each in planned] == [len(cameras)] * 3 + [len(cameras) + len(GRID)]
     for each in planned[:3]:
-        assert cameras[-1] in each.cameras
+        assert each.cameras[-1].position == pytest.approx(cameras[-1].position)
         assert not known & {camera.position.tobytes() for camera in each.cameras[:-1]}
     assert list(planned[3].cameras[: len(cameras)]) == cameras
     assert [each.step for each in planned] == [1.0, FARTHER, FARTHER, 1.0]

@@ -136,9 +136,11 @@ def in_blocks(count: int) -> Change:
     return change
 
 
-def in_blocks_each_as_long(count: int) -> Change:
-    """`count` blocks, each of which trains as long as one of the full method: more blocks, more work in all."""
-    return lambda config, _: replace(config, partition=replace(config.partition, blocks=count))
+def times_as_many_blocks(factor: float) -> Change:
+    """`factor` times as many blocks, each of which trains as long as one of the full method."""
+    return lambda config, budget: replace(
+        config, partition=replace(config.partition, blocks=max(1, round(factor * budget.blocks)))
+    )
 
 
 def coarse_compensated(added_to: Literal["mean", "sum"]) -> Change:

@@ -22,9 +22,9 @@ from vdgs.bench.changes import (
     factorial,
     full,
     in_blocks,
-    in_blocks_each_as_long,
     in_whole_photographs,
     partitioned_by,
+    times_as_many_blocks,
     with_assignment,
     with_beta_g,
     with_block,
@@ -151,11 +151,12 @@ _OTHERS = [
 ]  # fmt: skip
 _BLOCKS = [Method(f"blocks-{count}", f"{count} block{'s' * (count > 1)}", in_blocks(count)) for count in BLOCKS]
 _EACH_AS_LONG = [
-    Method("each-2", "2 blocks, each as long", in_blocks_each_as_long(2), less="iterations: 2 blocks in place of 4"),
+    Method("each-half", "half as many blocks, each as long", times_as_many_blocks(0.5),
+           less="iterations: of blocks half as many"),
     *(
-        Method(f"each-{count}", f"{count} blocks, each as long", in_blocks_each_as_long(count),
-               more=f"iterations: {count} blocks in place of 4")
-        for count in (8, 16)
+        Method(f"each-{factor}-times", f"{factor} times as many blocks, each as long", times_as_many_blocks(factor),
+               more=f"iterations: of blocks {factor} times as many")
+        for factor in (2, 4)
     ),
 ]  # fmt: skip
 _COARSE_COMPENSATED = [

@@ -62,7 +62,7 @@ TABLES: dict[str, Table] = {
         ),
         Table(
             "table3-each", "Table III: number of blocks, each trained as long",
-            ("coarse", "no-blocking-as-long", "each-2", "full", "each-8", "each-16"), REGIME,
+            ("coarse", "no-blocking-as-long", "each-half", "full", "each-2-times", "each-4-times"), REGIME,
         ),
         Table(
             "factorial", "Factorial: cut by visibility × compensation × T_low, equally many cameras", FACTORIAL, REGIME,

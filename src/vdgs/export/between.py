@@ -8,6 +8,7 @@ from itertools import count
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from vdgs.cameras import Camera
 
@@ -15,6 +16,9 @@ from vdgs.cameras import Camera
 NEIGHBOURS = 3
 #: That is: whose directions are at most about 45 degrees apart (cosine).
 LIKE = 0.7
+#: They are turned about each axis by up to this share of half of what a picture's width holds, so as to look at what no
+#: photograph nearby shows too: seen from afar alone, it would take any colour (docs/export.md).
+TURNED = 0.5
 #: So many times colours are fitted again, and how often where anchors spawn more Gaussians than that.
 ROUNDS, ROUNDS_OF_MANY, MANY_GAUSSIANS = 6, 2, 4_000_000
 #: No seed of `rounds` reaches here.
@@ -58,19 +62,19 @@ def endless(training: Sequence[Camera]) -> Iterator[Camera]:
 
 
 def between(cameras: Sequence[Camera], seed: int, alone: bool = False) -> list[Camera]:
-    """Each camera that has neighbours somewhere between itself and these: in their mean by random weights, all equally
-    likely, with its own orientation and picture. With `alone` also those that have none, where they are."""
+    """Each camera that has neighbours somewhere between itself and these, in their mean by random weights, all equally
+    likely, and turned a little. With `alone` also those that have none, turned where they are."""
     places = np.array([camera.position for camera in cameras])
     forward = np.array([camera.forward for camera in cameras])
     generator = np.random.default_rng(seed)
     found = []
     for i, camera in enumerate(cameras):
         weights = generator.dirichlet(np.ones(NEIGHBOURS + 1))
-        if len(around := [i, *_alike(places, forward, i)]) > 1:
+        angles = generator.uniform(-1, 1, 3) * TURNED * np.arctan(camera.width / 2 / camera.fx)
+        around = [i, *_alike(places, forward, i)]
+        if len(around) > 1 or alone:
             own = weights[: len(around)] / weights[: len(around)].sum()
-            found.append(_moved(camera, own @ places[around]))
-        elif alone:
-            found.append(camera)
+            found.append(_moved(camera, own @ places[around], Rotation.from_euler("xyz", angles).as_matrix()))
     return found
 
 
@@ -82,7 +86,8 @@ def _alike(places: Float[np.ndarray, "n 3"], forward: Float[np.ndarray, "n 3"], 
     return [int(j) for j in order if np.isfinite(apart[j])]
 
 
-def _moved(camera: Camera, position: Float[np.ndarray, "3"]) -> Camera:
-    matrix = camera.camera_from_world.copy()
+def _moved(camera: Camera, position: Float[np.ndarray, "3"], turn: Float[np.ndarray, "3 3"]) -> Camera:
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn @ camera.camera_from_world[:3, :3]
     matrix[:3, 3] = -matrix[:3, :3] @ position
     return replace(camera, camera_from_world=matrix)
