@@ -16,7 +16,7 @@ from merging_support import camera_above, model_at
 from vdgs.cameras import Camera
 from vdgs.export import baking
 from vdgs.export.baking import Survey, bake, survey
-from vdgs.export.between import FARTHER, Round, between, endless, round_count, rounds
+from vdgs.export.between import between, endless, round_count, rounds
 from vdgs.export.formats.scene import Scene
 from vdgs.export.formats.spool import spooled
 from vdgs.export.refining import refine
@@ -176,7 +176,7 @@ def test_colours_stand_in_for_opacities_and_shapes_that_change(tmp_path, degree)
     errors, others = [error(shown, GRID)], [error(shown, between(GRID, 9))]
     opacities = shown.spool.rows(np.arange(9)).logits
     for number in range(2):
-        refit(shown, Round([*GRID, *between(GRID, number)], 1.0))
+        refit(shown, [*GRID, *between(GRID, number)])
         errors.append(error(shown, GRID))
         others.append(error(shown, between(GRID, 9)))
     assert errors == sorted(errors, reverse=True)
@@ -193,7 +193,7 @@ def test_a_part_of_a_scene_is_compared_with_that_part(tmp_path):
     part = np.flatnonzero((seen.pixels > 0) & (np.arange(len(seen.pixels)) < len(seen.pixels) // 3))
     shown = on_disk(seen, part, tmp_path)
     before = shown.spool.rows(np.arange(len(part)))
-    refit(shown, Round(VIEWS, 1.0))
+    refit(shown, VIEWS)
     after = shown.spool.rows(np.arange(len(part)))
     # Nothing changes with the direction, so nothing is missing: what was left out is not painted onto what stays.
     assert (after.dc - before.dc).abs().max() < 0.02
@@ -203,7 +203,7 @@ def test_a_part_of_a_scene_is_compared_with_that_part(tmp_path):
 def test_refining_comes_nearer_and_ends_when_its_time_is_over(tmp_path):
     seen = survey(steep(model_at(scattered())), GRID)
     shown = on_disk(seen, np.flatnonzero(seen.pixels > 0), tmp_path, degree=1)
-    refit(shown, Round(GRID, 1.0))
+    refit(shown, GRID)
     before, means = error(shown, GRID), np.array(shown.spool.means)
     ticks = iter(range(1000))
     passed: list[float] = []
@@ -236,12 +236,11 @@ def test_rounds_look_from_between_and_the_last_one_at_the_photographs_too():
     cameras = [*GRID, camera_above(0.0, 0.0, tilt_deg=80.0)]
     planned = rounds(cameras, 4)
     known = {camera.position.tobytes() for camera in GRID}
-    assert [len(each.cameras) for each in planned] == [len(cameras)] * 3 + [len(cameras) + len(GRID)]
+    assert [len(each) for each in planned] == [len(cameras)] * 3 + [len(cameras) + len(GRID)]
     for each in planned[:3]:
-        assert each.cameras[-1].position == pytest.approx(cameras[-1].position)
-        assert not known & {camera.position.tobytes() for camera in each.cameras[:-1]}
-    assert list(planned[3].cameras[: len(cameras)]) == cameras
-    assert [each.step for each in planned] == [1.0, FARTHER, FARTHER, 1.0]
+        assert each[-1].position == pytest.approx(cameras[-1].position)
+        assert not known & {camera.position.tobytes() for camera in each[:-1]}
+    assert list(planned[3][: len(cameras)]) == cameras
     assert rounds(cameras, 0) == ()
     assert len(rounds(cameras, 1)) == 1
     assert (round_count(None, 10**6), round_count(None, 10**7), round_count(3, 10**7)) == (6, 2, 3)
@@ -264,7 +263,7 @@ def test_cameras_to_refine_by_never_end_nor_come_again_but_for_those_of_photogra
     shown = list(islice(endless(GRID), 4 * len(GRID)))
     places = [camera.position.tobytes() for camera in shown]
     known = {camera.position.tobytes() for camera in GRID}
-    of_rounds = {camera.position.tobytes() for each in rounds(GRID, 6) for camera in each.cameras} - known
+    of_rounds = {camera.position.tobytes() for cameras in rounds(GRID, 6) for camera in cameras} - known
     others = [place for place in places if place not in known]
     assert len(others) == len(set(others)) == 2 * len(GRID)
     assert not of_rounds & set(others)

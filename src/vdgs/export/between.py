@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import count
 
 import numpy as np
@@ -23,17 +23,6 @@ TURNED = 0.5
 ROUNDS, ROUNDS_OF_MANY, MANY_GAUSSIANS = 6, 2, 4_000_000
 #: No seed of `rounds` reaches here.
 BEYOND_ROUNDS = 1000
-#: How much farther than to what pictures lack colours go in rounds between the first and the last: over-relaxation,
-#: which converges below 2. Chosen at places that no round has (docs/export.md).
-FARTHER = 1.8
-
-
-@dataclass(frozen=True)
-class Round:
-    """By which pictures colours are fitted again, and how far they go of the way to what these lack."""
-
-    cameras: Sequence[Camera]
-    step: float
 
 
 def round_count(asked: int | None, gaussians: int) -> int:
@@ -43,13 +32,12 @@ def round_count(asked: int | None, gaussians: int) -> int:
     return ROUNDS if gaussians <= MANY_GAUSSIANS else ROUNDS_OF_MANY
 
 
-def rounds(training: Sequence[Camera], count: int) -> tuple[Round, ...]:
-    """Rounds at cameras between the training ones, others in each, for where the same places are looked at again and
-    again, what suits them is learnt by heart; the last one at those of the photographs too."""
-    inner = tuple(
-        Round(between(training, number, alone=True), FARTHER if number else 1.0) for number in range(count - 1)
-    )
-    return (*inner, Round([*training, *between(training, count - 1)], 1.0)) if count else ()
+def rounds(training: Sequence[Camera], count: int) -> tuple[Sequence[Camera], ...]:
+    """By which pictures colours are fitted again, round by round: from between the training cameras, others each time,
+    for where the same places are looked at again and again, what suits them is learnt by heart; the last time by those
+    of the photographs too."""
+    inner = tuple(between(training, number, alone=True) for number in range(count - 1))
+    return (*inner, [*training, *between(training, count - 1)]) if count else ()
 
 
 def endless(training: Sequence[Camera]) -> Iterator[Camera]:

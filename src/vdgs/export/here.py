@@ -79,11 +79,11 @@ class BakedHere:
 
     def _improve(self, baked: Baked, bar: Progress) -> None:
         """Fit the colours again to what pictures lack."""
-        task = bar.add_task("comparing pictures", total=sum(len(each.cameras) for each in self._rounds))
+        task = bar.add_task("comparing pictures", total=sum(map(len, self._rounds)))
 
         def after_view() -> None:
             stop_if_asked()
             bar.advance(task)
 
-        for round_ in self._rounds:
-            refit(baked, round_, after_view)
+        for cameras in self._rounds:
+            refit(baked, cameras, after_view)

@@ -96,7 +96,7 @@ def _fitting(run: TrainedRun, asked: ExportRequest, work: BakingWork, kept: np.n
 
 def _comparing(work: BakingWork, step: Step, baked: Baked) -> Do:
     def do(place: int) -> Callable[[Path], None]:
-        found = lacking(baked, work.round(step.round).cameras[place])
+        found = lacking(baked, work.cameras_of(step.round)[place])
         return lambda path: save_lacking(path, found)
 
     return do
@@ -106,7 +106,7 @@ def _mending(work: BakingWork, step: Step, baked: Baked) -> Do:
     views = [load_lacking(file) for file in work.files(work.step(COMPARE, step.round))]
 
     def do(place: int) -> Callable[[Path], None]:
-        found = added(baked, work.round(step.round), views, rows_of(baked, place))
+        found = added(baked, work.cameras_of(step.round), views, rows_of(baked, place))
         return lambda path: save_added(path, *found)
 
     return do

@@ -22,7 +22,6 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.export.baking import LEAST_PIXELS, RIDGE, part_count, part_size
-from vdgs.export.between import Round
 from vdgs.export.formats.spool import Spooled
 from vdgs.export.working import in_order, sorted_runs, view_by_view
 from vdgs.kernels import choose
@@ -76,16 +75,16 @@ class Baked:
         return picture.cpu(), self.of_anchors(rows.numpy())
 
 
-def refit(baked: Baked, round_: Round, after_view: Callable[[], None] = lambda: None) -> None:
-    """Add to the colours of all Gaussians, on the disk, what the pictures of a round lack."""
+def refit(baked: Baked, cameras: Sequence[Camera], after_view: Callable[[], None] = lambda: None) -> None:
+    """Add to the colours of all Gaussians, on the disk, what the pictures of these cameras lack."""
     views, device = list[Lacking](), baked.model.anchors.positions.device
-    for view in view_by_view(lambda camera: lacking(baked, camera), round_.cameras, device):
+    for view in view_by_view(lambda camera: lacking(baked, camera), cameras, device):
         views.append(view)
         if len(views) % LET_GO == 0:
             baked.spool.let_go()
         after_view()
     parts = [rows_of(baked, number) for number in range(part_count(baked.model))]
-    done = in_order(lambda rows: baked.spool.add_colours(*added(baked, round_, views, rows)), parts)
+    done = in_order(lambda rows: baked.spool.add_colours(*added(baked, cameras, views, rows)), parts)
     for number, _ in enumerate(done):
         if number % LET_GO == 0:
             baked.spool.let_go()
@@ -126,11 +125,11 @@ def _eye(camera: Camera) -> Float[Tensor, "3"]:
 
 
 def added(
-    baked: Baked, round_: Round, views: Sequence[Lacking], rows: range
+    baked: Baked, cameras: Sequence[Camera], views: Sequence[Lacking], rows: range
 ) -> tuple[Int[np.ndarray, " c"], Float[Tensor, "c f 3"]]:
     """What is to be added to the colours of the Gaussians of some rows: of which, ascending, and how much."""
     means, columns = torch.from_numpy(baked.spool.means), list[tuple[Tensor, ...]]()
-    for camera, view in zip(round_.cameras, views, strict=True):
+    for camera, view in zip(cameras, views, strict=True):
         low, high = np.searchsorted(view.gaussians.numpy(), [rows.start, rows.stop])
         if low < high:
             here = view.gaussians[low:high]
@@ -145,4 +144,4 @@ def added(
     changed = counts.nonzero()[:, 0]
     runs = (counts.cumsum(0) - counts)[changed]
     found = choose(colours.device).fit_harmonics(directions, colours + 0.5, pixels, runs, baked.spool.degree, RIDGE)
-    return changed.numpy() + rows.start, round_.step * found
+    return changed.numpy() + rows.start, found

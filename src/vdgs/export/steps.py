@@ -22,7 +22,7 @@ from vdgs.cameras import Camera
 from vdgs.executors.kinds import Kind
 from vdgs.executors.work import PieceWork, spans_of
 from vdgs.export.baking import gaussian_count, part_count
-from vdgs.export.between import Round, round_count, rounds
+from vdgs.export.between import round_count, rounds
 from vdgs.export.formats import registry
 from vdgs.export.frame import usual_crs
 from vdgs.runs.opening import TrainedRun
@@ -57,14 +57,15 @@ class BakingWork:
     pieces: PieceWork
     steps: tuple[Step, ...]
     training: Sequence[Camera]
-    rounds: tuple[Round, ...]
+    rounds: tuple[Sequence[Camera], ...]
+    """By which pictures are compared."""
 
     @staticmethod
     def of(run: TrainedRun, asked: ExportRequest) -> BakingWork:
         """What baking a run as it is asked for (`as_files_hold`) comes to, and what it depends on."""
         training = [view.camera for view in run.capture.train_views]
         planned = rounds(training, round_count(asked.rounds, gaussian_count(run.model)))
-        steps, spans = _cut(len(training), [len(each.cameras) for each in planned], part_count(run.model))
+        steps, spans = _cut(len(training), [len(each) for each in planned], part_count(run.model))
         output = Path(os.path.abspath(run.folder.path)) / FOLDER
         return BakingWork(PieceWork.of(output, _depends_on(run, asked), spans), steps, training, planned)
 
@@ -82,9 +83,9 @@ class BakingWork:
         """What the items of a step leave, in their order."""
         return [self.pieces.file(item, ".npy") for item in step.items]
 
-    def round(self, number: int) -> Round:
-        """From 1 on."""
-        return self.rounds[number - 1]
+    def cameras_of(self, round_: int) -> Sequence[Camera]:
+        """By which pictures are compared in a round, from 1 on."""
+        return self.rounds[round_ - 1]
 
     @property
     def pixels_file(self) -> Path:
