@@ -21,7 +21,7 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from vdgs.cameras import Camera
-from vdgs.export.working import in_order, sorted_runs, view_by_view
+from vdgs.export.working import in_order, sorted_runs, span_of, view_by_view
 from vdgs.kernels import choose
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.gaussians import Gaussians
@@ -151,7 +151,7 @@ def _gathered(seen: Seen, wanted: Int[np.ndarray, " m"]) -> _Pairs:
     place_of = torch.full((last - first + 1,), -1, dtype=torch.int32)
     place_of[torch.from_numpy(wanted - first)] = torch.arange(len(wanted), dtype=torch.int32)
     for camera, shown in zip(seen.cameras, seen.shown, strict=True):
-        low, high = np.searchsorted(shown.gaussians.numpy(), [first, last + 1])
+        low, high = span_of(shown.gaussians, first, last + 1)
         if low == high:
             continue
         gaussians, pixels = shown.gaussians[low:high], shown.pixels[low:high]

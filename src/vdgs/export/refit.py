@@ -23,7 +23,7 @@ from torch import Tensor
 from vdgs.cameras import Camera
 from vdgs.export.baking import LEAST_PIXELS, RIDGE, part_count, part_size
 from vdgs.export.formats.spool import Spooled
-from vdgs.export.working import in_order, sorted_runs, view_by_view
+from vdgs.export.working import in_order, sorted_runs, span_of, view_by_view
 from vdgs.kernels import choose
 from vdgs.kernels.types import Splats
 from vdgs.model.anchor_model import AnchorModel
@@ -130,7 +130,7 @@ def added(
     """What is to be added to the colours of the Gaussians of some rows: of which, ascending, and how much."""
     means, columns = torch.from_numpy(baked.spool.means), list[tuple[Tensor, ...]]()
     for camera, view in zip(cameras, views, strict=True):
-        low, high = np.searchsorted(view.gaussians.numpy(), [rows.start, rows.stop])
+        low, high = span_of(view.gaussians, rows.start, rows.stop)
         if low < high:
             here = view.gaussians[low:high]
             # index_select, not an index: torch is five times as fast at it.

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Int, Int64
+from jaxtyping import Int, Int32, Int64
 from torch import Tensor
 
 from vdgs.kernels import threads
@@ -31,6 +31,15 @@ def sorted_runs(numbers: Int[Tensor, " p"], first: int, count: int) -> tuple[Int
     keys = (numbers.numpy() - first).astype(small)
     order = torch.from_numpy(np.argsort(keys, kind="stable"))
     return order, torch.from_numpy(np.bincount(keys, minlength=count))
+
+
+def span_of(ascending: Int32[Tensor, " p"], first: int, end: int) -> tuple[int, int]:
+    """Where those numbers begin and end that are at least `first` and below `end`.
+
+    With bounds of another type numpy would copy all of the numbers.
+    """
+    low, high = np.searchsorted(ascending.numpy(), np.array([first, end], np.int32))
+    return int(low), int(high)
 
 
 def in_order(work: Callable[[P], R], parts: Iterable[P]) -> Iterator[R]:
