@@ -29,7 +29,7 @@ from rich.console import Console
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
 from vdgs.export import exporting
-from vdgs.kernels import set_threads, threads
+from vdgs.kernels import choose, set_threads, threads
 from vdgs.kernels.types import FEATURE_SIZE
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
@@ -46,11 +46,13 @@ TESTED = 40
 
 
 def made_up(anchors: int) -> tuple[AnchorModel, list[Camera]]:
-    """Anchors in rows on a square of ground, an anchor in each unit, and a flight above it looking straight down."""
+    """Anchors on a square of ground, one in each unit, in the order in which training leaves them, and a flight above it
+    looking straight down."""
     side = math.ceil(math.sqrt(anchors))
     generator = torch.Generator().manual_seed(0)
     row, column = torch.arange(anchors) // side, torch.arange(anchors) % side
     positions = torch.stack([column, row, torch.rand(anchors, generator=generator)], 1).float() * SPACING
+    positions = positions[choose(positions.device).morton_order(positions)]
     log_scales = torch.randn(anchors, 6, generator=generator) * 0.2 + math.log(0.7 * SPACING)
     tensors = Decoder.initial(OFFSETS, True, 0, 0, generator).tensors()
     # Every Gaussian is drawn, and none hides all behind it.
