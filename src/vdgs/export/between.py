@@ -20,7 +20,7 @@ LIKE = 0.7
 #: photograph nearby shows too: seen from afar alone, it would take any colour (docs/export.md).
 TURNED = 0.5
 #: So many times colours are fitted again, and how often where anchors spawn more Gaussians than that.
-ROUNDS, ROUNDS_OF_MANY, MANY_GAUSSIANS = 8, 2, 4_000_000
+ROUNDS, ROUNDS_OF_MANY, MANY_GAUSSIANS = 8, 1, 4_000_000
 #: No seed of `rounds` reaches here.
 BEYOND_ROUNDS = 1000
 
