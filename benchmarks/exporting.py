@@ -46,8 +46,8 @@ TESTED = 40
 
 
 def made_up(anchors: int) -> tuple[AnchorModel, list[Camera]]:
-    """Anchors on a square of ground, one in each unit, in the order in which training leaves them, and a flight above it
-    looking straight down."""
+    """Anchors on a square of ground, one in each unit, in the order in which training leaves them, and a flight above
+    that looks straight down."""
     side = math.ceil(math.sqrt(anchors))
     generator = torch.Generator().manual_seed(0)
     row, column = torch.arange(anchors) // side, torch.arange(anchors) % side

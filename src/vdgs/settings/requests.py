@@ -168,8 +168,8 @@ class ExportRequest:
     html_mb: Annotated[float, Range(1, 2000)] = 30.0
     """A .html file has at most so many MB: the scene is thinned until it fits."""
     rounds: Annotated[int | None, Range(0, 100)] = None
-    """How often colours are fitted again to what the file's pictures lack of the model's. By default 8, or once where the
-    anchors spawn more than four million Gaussians: more come nearer and take longer (docs/export.md)."""
+    """How often colours are fitted again to what the file's pictures lack of the model's. By default 8 times, or once
+    where the anchors spawn more than four million Gaussians: more come nearer and take longer (docs/export.md)."""
     refine: Annotated[float, SECONDS] = 0.0
     """Seconds for which all that is baked is moved towards the model's own pictures, after what is fitted in closed
     form; 0: not at all. Needs 0.7 kB of memory for each Gaussian of degree 3."""
