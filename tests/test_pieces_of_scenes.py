@@ -117,7 +117,7 @@ def small_parts_here() -> None:
 def exported(uncut, tmp_path_factory) -> bytes:
     """What one process makes of it, on more threads than a piece has."""
     file = tmp_path_factory.mktemp("exported") / "scene.ply"
-    done = vdgs("export", uncut, "--to", file, "--no-measure", "--threads", "2", prepare=small_parts)
+    done = vdgs("export", uncut, "--to", file, "--rounds", "2", "--no-measure", "--threads", "2", prepare=small_parts)
     assert done.returncode == 0, done.stderr + done.stdout
     return file.read_bytes()
 
@@ -125,7 +125,7 @@ def exported(uncut, tmp_path_factory) -> bytes:
 def test_whenever_its_driver_is_killed_a_scene_baked_in_pieces_is_that_of_one_process(uncut, exported, tmp_path):
     """While a second piece surveys; before the first Gaussians, and those with fitted colours, are there whole."""
     run, file = copy_run(uncut, tmp_path / "run"), tmp_path / "scene.ply"
-    command = ("export", run, "--to", file, "--no-measure", "--jobs", "2")
+    command = ("export", run, "--to", file, "--rounds", "2", "--no-measure", "--jobs", "2")
     for moment in ("*/pieces/*/01/000010.npy", "*/pieces/*/0.spool", "*/pieces/*/1.spool"):
         surveyed = {each: each.stat().st_mtime_ns for each in run.glob("baking/pieces/*/0[01]/0000*.npy")}
         with begun(*command, prepare=small_parts_here, pause_at=(moment, 1)) as driver:
@@ -145,7 +145,7 @@ def test_whenever_its_driver_is_killed_a_scene_baked_in_pieces_is_that_of_one_pr
 
 
 def test_what_is_chosen_is_baked_alike_in_pieces_and_moved_on_by_the_driver(uncut, tmp_path):
-    chosen = ("--max-gaussians", "150", "--sh-degree", "1", "--no-measure")
+    chosen = ("--max-gaussians", "150", "--sh-degree", "1", "--rounds", "2", "--no-measure")
     for name, more, prepare in (("one", (), small_parts), ("pieces", ("--jobs", "2"), small_parts_here)):
         done = vdgs("export", uncut, "--to", tmp_path / f"{name}.ply", *chosen, *more, prepare=prepare)
         assert done.returncode == 0, done.stderr + done.stdout
