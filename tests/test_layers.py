@@ -24,7 +24,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("kernels",),
     ("memory",),
     ("captures", "model"),
-    ("figures", "placing", "training"),
+    ("figures", "placing", "stereo", "training"),
     ("partition", "inspection", "synth"),
     ("runs",),
     ("watching",),

@@ -1,4 +1,5 @@
-"""Where anchors start: on the voxel grid of the sparse points, outliers left out and gaps filled."""
+"""Where anchors start: on the voxel grid of the sparse points and of what stereo adds to them, outliers left out and
+gaps filled."""
 
 from __future__ import annotations
 
@@ -44,18 +45,30 @@ def inliers(points: np.ndarray, factor: float) -> np.ndarray:
     return distances[:, 0] <= limit if limit > 0 else np.ones(len(points), bool)
 
 
+def voxel_of(points: np.ndarray, config: AnchorConfig) -> float:
+    """The edge of the voxel grid of the sparse points [n, 3]. Raises VdgsError as `automatic_voxel`."""
+    return config.voxel if config.voxel > 0 else automatic_voxel(points)
+
+
 def initial_anchors(
-    points: np.ndarray, colours: np.ndarray, cameras: Sequence[Camera], config: AnchorConfig
+    points: np.ndarray,
+    colours: np.ndarray,
+    cameras: Sequence[Camera],
+    config: AnchorConfig,
+    dense: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[Anchors, float]:
     """Anchors on the voxel grid of the sparse points [n, 3], and the voxel used.
 
-    Points are rounded to the grid and made unique (Scaffold-GS eq. 3); so are those that fill gaps seen by the
-    training cameras. Log-scales start at the logarithm of the mean distance to the three nearest other anchors,
-    offsets at 0, features at 0 or at the colours. Raises VdgsError with fewer than two distinct points.
+    Points are rounded to the grid and made unique (Scaffold-GS eq. 3); so are the `dense` ones [m, 3], with their
+    colours, that stereo found beside them, and those that fill gaps seen by the training cameras. Log-scales start at
+    the logarithm of the mean distance to the three nearest other anchors, offsets at 0, features at 0 or at the
+    colours. Raises VdgsError with fewer than two distinct points.
     """
-    voxel = config.voxel if config.voxel > 0 else automatic_voxel(points)
+    voxel = voxel_of(points, config)
     kept = inliers(points, config.outlier_distance)
     points, colours = points[kept], colours[kept]
+    if dense is not None:
+        points, colours = (np.concatenate(pair) for pair in zip((points, colours), dense, strict=True))
     if config.fill_gaps:
         gaps = gap_points(points, cameras, voxel)
         nearest = cKDTree(points).query(gaps, workers=1)[1] if len(gaps) else np.zeros(0, np.int64)

@@ -31,7 +31,7 @@ SINCE: dict[str, dict[str, Any]] = {
         "average": 0.0,
         "early": 1.0,
         "adam": "visible",
-        "anchors": {"bound_sizes": True},
+        "anchors": {"bound_sizes": True, "stereo": False},
         "compensation": {"added_to": "mean"},
         "rates": {"exposure": [0.001, 1e-4]},
         "exposure": False,

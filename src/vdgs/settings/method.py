@@ -34,6 +34,10 @@ class AnchorConfig:
     keeps all (choice: a few points deep below the ground become a backdrop that every camera sees through it)."""
     fill_gaps: bool = True
     """Also start anchors on ground that cameras see but that holds no sparse points: woods, water, fields (choice)."""
+    stereo: bool = False
+    """Also start anchors where pairs of photographs agree how far the ground is (semi-global matching, before
+    training): where few photographs look, sparse points are few, and what starts at a wrong height stays there
+    (choice)."""
     bound_sizes: bool = True
     """No Gaussian may be longer than a quarter of the pictures that train it: none can hang as a veil before a whole
     view. The unit of an anchor's offsets is bounded with them: its Gaussians stay about it (choice)."""

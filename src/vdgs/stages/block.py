@@ -33,6 +33,7 @@ from vdgs.runs.opening import open_run
 from vdgs.runs.seldom import seldom_terms
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
+from vdgs.runs.stereo import points_of_run
 from vdgs.settings.method import block_limit, block_training
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.tensors import identity
@@ -95,7 +96,7 @@ def _train(
     prepared = time.monotonic() - began
     note_without_growth(config, console, "--block.")
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
-    ground = ground_of(capture, method.training.anchors).to(device)
+    ground = ground_of(capture, method.training.anchors, points_of_run(run, method.training.anchors)).to(device)
     flown = [view.camera for view in capture.train_views]
     with ImageCache(views, image_budget(options), downscales=factors) as images:
         stage = Stage(

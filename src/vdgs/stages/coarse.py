@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import torch
@@ -23,13 +24,16 @@ from vdgs.model.start import initial_anchors
 from vdgs.runs.flight import keep_flight
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.seldom import seldom_terms
+from vdgs.runs.stereo import find_points
 from vdgs.settings.method import TrainConfig
 from vdgs.settings.watching import WatchOptions
+from vdgs.stereo import DensePoints
 from vdgs.storage.files import write_json
 from vdgs.training import Stage, TrainingState, mean_colour, start_state
 from vdgs.training.sampling import shares_for
 from vdgs.watching.anchors import continue_or_start, finish, note_without_growth, train_watched
 from vdgs.watching.images import image_budget
+from vdgs.watching.interrupts import stop_if_asked
 
 
 def train_coarse(
@@ -61,7 +65,8 @@ def _train(
     folder = run.coarse
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
     with ImageCache(capture.train_views, image_budget(options), downscales=factors) as images:
-        stage, anchors = open_stage(capture, config, images, device)
+        dense = _dense_points(run, capture, images, config, console)
+        stage, anchors = open_stage(capture, config, images, device, dense)
         state = continue_or_start(folder, stage, lambda: start(anchors, stage), console)
         _announce(capture, state, config, console)
         train_watched(folder, state, stage, options, console)
@@ -72,13 +77,39 @@ def _train(
     finish(folder, state, AnchorModel(*state.result(), stage.voxel, stage.background, facts), console)
 
 
+def _dense_points(
+    run: RunFolder, capture: Capture, images: ImageCache, config: TrainConfig, console: Console
+) -> DensePoints | None:
+    """What stereo adds to the sparse points, found now or before; what it found is said."""
+    began = time.monotonic()
+    wait = console.status("looking for ground by stereo")
+
+    def tell(done: int, of: int) -> None:
+        stop_if_asked()
+        wait.update(f"looking for ground by stereo, {done / of:.0%}")
+
+    with wait:
+        dense = find_points(run, capture, images, config.anchors, tell, torch.get_num_threads())
+    if dense is not None:
+        console.print(
+            f"stereo: {len(dense.points):,} points beside the sparse ones, {time.monotonic() - began:.0f} s",
+            highlight=False,
+        )
+    return dense
+
+
 def open_stage(
-    capture: Capture, config: TrainConfig, images: ImageCache, device: torch.device | str
+    capture: Capture,
+    config: TrainConfig,
+    images: ImageCache,
+    device: torch.device | str,
+    dense: DensePoints | None = None,
 ) -> tuple[Stage, Anchors]:
-    """What the coarse stage works with, and the anchors that it starts from."""
+    """What the coarse stage works with, and the anchors that it starts from: at the sparse points, and the `dense`
+    ones."""
     cameras = [view.camera for view in capture.train_views]
     # The voxel follows from the capture: recomputed when a run continues.
-    anchors, voxel = initial_anchors(capture.points, capture.point_colours, cameras, config.anchors)
+    anchors, voxel = initial_anchors(capture.points, capture.point_colours, cameras, config.anchors, dense)
     ground = anchors.positions.to(device)
     background = (0.0, 0.0, 0.0)
     if config.loss.background != "black":

@@ -1,0 +1,89 @@
+"""What dense stereo adds to the sparse points of a run: found once, before the coarse stage, and kept beside it.
+
+RUN/coarse/stereo.safetensors goes with the coarse stage: `StageFolder.discard_unless` removes it with all that was made
+for other settings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from vdgs.captures.capture import Capture
+from vdgs.captures.heights import camera_height
+from vdgs.captures.images import ImageCache
+from vdgs.errors import VdgsError
+from vdgs.model.gaps import gap_points
+from vdgs.model.start import voxel_of
+from vdgs.runs.folder import RunFolder
+from vdgs.settings.method import AnchorConfig
+from vdgs.stereo import DensePoints, StereoInputs, dense_points
+from vdgs.storage.files import write_atomically
+from vdgs.storage.tensors import checksum, read_tensors, write_tensors
+
+FORMAT = "vdgs-stereo-1"
+FILE = "stereo.safetensors"
+#: Edge of the cells that get a point each, in voxels and in pixels of the photographs as they are used: the larger of
+#: the two (choice). An anchor has ten Gaussians; growth makes more where that is too few.
+CELL_VOXELS, CELL_PX = 2.0, 5.0
+
+
+def points_of_run(run: RunFolder, config: AnchorConfig) -> DensePoints | None:
+    """What the coarse stage of the run found; None where its settings ask for none. VdgsError where the file is missing
+    or damaged."""
+    return _read(run.coarse.path / FILE) if config.stereo else None
+
+
+def find_points(
+    run: RunFolder,
+    capture: Capture,
+    images: ImageCache,
+    config: AnchorConfig,
+    tell: Callable[[int, int], None],
+    threads: int,
+) -> DensePoints | None:
+    """As `points_of_run`, found and kept where they are not yet: dense points that lie away from the sparse ones.
+
+    `images` are the training photographs; `tell(done, of)` is called after each step, and may raise.
+    """
+    file = run.coarse.path / FILE
+    if not config.stereo or file.exists():
+        return points_of_run(run, config)
+    cameras = [view.camera for view in capture.train_views]
+    cell = cell_of(capture, config)
+
+    def read(index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        picture = images.get(index)
+        return picture.image.numpy(), None if picture.mask is None else picture.mask.numpy()
+
+    gaps = gap_points(capture.points, cameras, voxel_of(capture.points, config))
+    inputs = StereoInputs(cameras, capture.points, np.concatenate([capture.points, gaps]), read)
+    found = dense_points(inputs, cell, run.coarse.path, tell, threads)
+    if len(found.points):
+        away = cKDTree(capture.points).query(found.points, workers=1)[0] > cell / 2
+        found = DensePoints(found.points[away], found.colours[away])
+    _write(file, found)
+    return found
+
+
+def cell_of(capture: Capture, config: AnchorConfig) -> float:
+    """The edge of the cells that get a dense point each, in units of the ground frame."""
+    focal = float(np.median([view.camera.fx for view in capture.train_views]))
+    return max(CELL_VOXELS * voxel_of(capture.points, config), CELL_PX * camera_height(capture) / focal)
+
+
+def _write(file: Path, found: DensePoints) -> None:
+    tensors = {"points": torch.from_numpy(found.points), "colours": torch.from_numpy(found.colours)}
+    write_atomically(file, lambda temporary: write_tensors(temporary, tensors, {FORMAT: str(checksum(tensors))}))
+
+
+def _read(file: Path) -> DensePoints:
+    tensors, header = read_tensors(file)
+    points, colours = (tensors.get(name) for name in ("points", "colours"))
+    if points is None or colours is None or header.get(FORMAT) != str(checksum(tensors)):
+        raise VdgsError(f"{file}: is damaged. Delete it and run the same command again: it is found anew.")
+    return DensePoints(points.numpy(), colours.numpy())

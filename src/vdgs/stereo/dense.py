@@ -1,0 +1,171 @@
+"""Points on what a flight shows: the depths of all its photographs, where others confirm them, one for each cell."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int64, UInt8
+
+from vdgs.cameras import Camera
+from vdgs.stereo.matching import AGREEMENT, StereoView, depth_of
+from vdgs.stereo.partners import partners
+
+#: Photographs are matched at this longest side, and enlarged at most by so much: steps of a sixteenth of a column tell
+#: depth better in larger pictures (choice).
+LONGEST_SIDE_PX, LARGEST_ZOOM = 480, 1.5
+#: Depths are looked for between these quantiles of a photograph's sparse points, and this much nearer and farther.
+QUANTILES, MARGIN = (0.01, 0.99), 0.15
+#: A cell holds a point where the confirmed pixels of all photographs in it would together cover so much of one of its
+#: faces: what is matched wrongly is strewn over many cells (choice; docs/findings.md).
+LEAST_COVER = 0.1
+#: A pixel counts where at least one partner agrees on its depth, and at least this share of those that hold the place:
+#: one among many agrees by chance. Not more, for some of them do not see it.
+LEAST_AGREED = 0.25
+#: Grey photographs that are held at a time.
+HELD = 256
+#: Cells have keys within this many cells of the origin on each axis.
+REACH = 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class StereoInputs:
+    """A flight as stereo sees it: cameras at the size of their photographs, sparse points [n, 3] of the same world,
+    places [p, 3] for which partners are chosen (the points, and ground without any), and what reads photograph i: RGB
+    [h, w, 3] and the mask [h, w] of what counts (None: all)."""
+
+    cameras: Sequence[Camera]
+    points: Float[np.ndarray, "n 3"]
+    places: Float[np.ndarray, "p 3"]
+    read: Callable[[int], tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None]]
+
+
+class DensePoints(NamedTuple):
+    """Points [m, 3] float64 and their colours [m, 3] uint8."""
+
+    points: Float[np.ndarray, "m 3"]
+    colours: UInt8[np.ndarray, "m 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Cells by their keys [c], and sums over the pixels that lie in them [c, 8]: position, colour, 1, and the area that
+    a pixel covers there."""
+
+    keys: Int64[np.ndarray, " c"]
+    sums: Float[np.ndarray, "c 8"]
+
+    @staticmethod
+    def of(keys: Int64[np.ndarray, " p"], values: Float[np.ndarray, "p 8"]) -> _Cells:
+        found, place = np.unique(keys, return_inverse=True)
+        sums = np.stack([np.bincount(place.reshape(-1), column, len(found)) for column in values.T], 1)
+        return _Cells(found, sums.astype(np.float64))  # bincount of nothing is of whole numbers
+
+
+def dense_points(
+    inputs: StereoInputs, cell: float, scratch: Path, tell: Callable[[int, int], None], threads: int = 1
+) -> DensePoints:
+    """Match every photograph with its partners, and give each cell of edge `cell` that enough pixels lie in the mean of
+    them. A pixel counts where the depths of partners confirm it.
+
+    `scratch` is a folder for a file of depths, gone afterwards: memory does not grow with the flight. `tell(done, of)`
+    is called in this thread after each photograph, once for matching and once for confirming. Deterministic, whatever
+    `threads`; raises what `read` raises.
+    """
+    cameras = [_matched_size(camera) for camera in inputs.cameras]
+    others = partners(inputs.cameras, inputs.places)
+    views = lru_cache(HELD)(lambda index: _view(inputs, cameras[index], index))
+    width, height = max(each.width for each in cameras), max(each.height for each in cameras)
+    steps, of = iter(range(1, 2 * len(cameras) + 1)), 2 * len(cameras)
+    with tempfile.TemporaryFile(dir=scratch) as file, ThreadPoolExecutor(max(1, threads)) as pool:
+        depths = np.memmap(file, np.float16, "w+", shape=(len(cameras), height, width))
+
+        def match(index: int) -> None:
+            if others[index]:
+                depth = depth_of(views(index), [views(other) for other in others[index]])
+                depths[index, : depth.shape[0], : depth.shape[1]] = depth
+
+        def confirm(index: int) -> _Cells:
+            return _confirmed(inputs, cameras, depths, index, others[index], cell)
+
+        for _ in pool.map(match, range(len(cameras))):
+            tell(next(steps), of)
+        found = list(_told(pool.map(confirm, range(len(cameras))), steps, of, tell))
+        del depths
+    return _fused(found, cell)
+
+
+def _told(cells: Iterator[_Cells], steps: Iterator[int], of: int, tell: Callable[[int, int], None]) -> Iterator[_Cells]:
+    for each in cells:
+        tell(next(steps), of)
+        yield each
+
+
+def _matched_size(camera: Camera) -> Camera:
+    longest = max(camera.width, camera.height)
+    zoom = min(LONGEST_SIDE_PX / longest, LARGEST_ZOOM)
+    return camera.resized(max(1, round(zoom * camera.width)), max(1, round(zoom * camera.height)))
+
+
+def _view(inputs: StereoInputs, camera: Camera, index: int) -> StereoView:
+    """A photograph grey, at the size at which it is matched."""
+    picture, _ = inputs.read(index)
+    small = camera.width < picture.shape[1]
+    grey = cv2.resize(
+        cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (camera.width, camera.height),
+        interpolation=cv2.INTER_AREA if small else cv2.INTER_CUBIC,
+    )  # fmt: skip
+    _, depth = camera.project(inputs.points[inputs.cameras[index].sees(inputs.points)])
+    near, far = np.quantile(depth, QUANTILES) if len(depth) else (1.0, 1.0)
+    return StereoView(camera, grey, float(near) * (1 - MARGIN), float(far) * (1 + MARGIN))
+
+
+def _confirmed(
+    inputs: StereoInputs, cameras: Sequence[Camera], depths: np.ndarray, index: int, others: Sequence[int], cell: float
+) -> _Cells:
+    """The cells in which confirmed pixels of a photograph lie."""
+    camera = cameras[index]
+    depth = np.asarray(depths[index, : camera.height, : camera.width], np.float32)
+    known = depth > 0
+    places = camera.unproject(np.where(known, depth, 1.0))
+    held, agreed = (np.zeros(known.shape, np.int32) for _ in range(2))
+    for other in others:
+        inside, agrees = _told_by(places, cameras[other], depths[other])
+        held, agreed = held + inside, agreed + agrees
+    confirmed = known & (agreed >= 1) & (agreed >= LEAST_AGREED * held) & (np.abs(places) < REACH * cell).all(-1)
+    picture, mask = inputs.read(index)
+    size = (camera.width, camera.height)
+    if mask is not None:
+        confirmed &= cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0
+    colours = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    area = (depth[confirmed].astype(np.float64) ** 2 / (camera.fx * camera.fy))[:, None]
+    values = np.concatenate([places[confirmed], colours[confirmed], np.ones_like(area), area], 1)
+    x, y, z = (np.floor(values[:, axis] / cell).astype(np.int64) + REACH for axis in range(3))
+    return _Cells.of((x << 42) | (y << 21) | z, values)
+
+
+def _told_by(
+    places: Float[np.ndarray, "h w 3"], camera: Camera, depths: Float[np.ndarray, "r c"]
+) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Which places another photograph holds in its picture, and which of them lie where its own depth says."""
+    pixels, distance = camera.project(places.reshape(-1, 3))
+    inside = camera.sees(places.reshape(-1, 3))
+    column, row = (np.where(inside, pixels[:, axis], 0).astype(np.int64) for axis in (0, 1))
+    there = np.asarray(depths[row, column], np.float64)
+    agrees = inside & (there > 0) & (np.abs(there - distance) < AGREEMENT * distance)
+    return inside.reshape(places.shape[:2]), agrees.reshape(places.shape[:2])
+
+
+def _fused(found: Sequence[_Cells], cell: float) -> DensePoints:
+    """One point for each cell that the pixels of all photographs cover well enough."""
+    together = _Cells.of(np.concatenate([each.keys for each in found]), np.concatenate([each.sums for each in found]))
+    kept = together.sums[together.sums[:, 7] >= LEAST_COVER * cell**2]
+    means = kept[:, :6] / kept[:, 6:7]
+    return DensePoints(means[:, :3], np.clip(np.rint(means[:, 3:]), 0, 255).astype(np.uint8))

@@ -1,0 +1,200 @@
+"""Dense stereo: pairs turned into rows, depths that are true, points where others confirm them and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from vdgs.cameras import Camera
+from vdgs.stereo import StereoInputs, StereoView, dense_points, depth_of_pair, partners
+from vdgs.stereo.rectification import Rectified
+
+HEIGHT, ROOF, HALF = 20.0, 4.0, 5.0  # of the flight, of a roof about the origin, and half its edge
+SLOPE = 0.05
+
+
+def camera(x: float, y: float, tilt: float = 0.0, turn: float = 0.0, focal: float = 150.0) -> Camera:
+    """160 x 120 pixels from HEIGHT, looking down but for a tilt about x, turned about the vertical (radians)."""
+    down = np.diag([1.0, -1.0, -1.0])
+    about_z = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
+    about_x = np.array([[1.0, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
+    pose = np.eye(4)
+    pose[:3, :3] = about_x @ down @ about_z
+    pose[:3, 3] = -pose[:3, :3] @ np.array([x, y, HEIGHT])
+    return Camera(pose, focal, focal, 80.0, 60.0, 160, 120)
+
+
+def texture() -> np.ndarray:
+    """Spots of several sizes, 0 to 255."""
+    rng, total = np.random.default_rng(3), np.zeros((512, 512), np.float32)
+    for size in (2, 4, 8, 16):
+        total += cv2.GaussianBlur(rng.normal(0, size, (512, 512)).astype(np.float32), (0, 0), size / 2)
+    return np.clip(128 + 60 * total / total.std(), 0, 255).astype(np.uint8)
+
+
+TEXTURE = texture()
+
+
+def true_depth(of: Camera) -> np.ndarray:
+    """Depth [h, w] of a slope with a level roof on it."""
+    rays = of.unproject(np.ones((of.height, of.width))) - of.position
+    slope = (SLOPE * of.position[0] - of.position[2]) / (rays[..., 2] - SLOPE * rays[..., 0])
+    roof = (ROOF - of.position[2]) / rays[..., 2]
+    on_roof = (np.abs(of.position[:2] + roof[..., None] * rays[..., :2]) < HALF).all(-1)
+    return np.where(on_roof, roof, slope)
+
+
+def photograph(of: Camera) -> np.ndarray:
+    """What it shows, RGB: places are painted alike from wherever one looks."""
+    places = of.unproject(true_depth(of))
+    column, row = (((places[..., axis] + 25.0) * 10.0).astype(np.float32) for axis in (0, 1))
+    grey = cv2.remap(TEXTURE, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    return np.stack([grey, grey // 2, 255 - grey], -1)
+
+
+def view(of: Camera) -> StereoView:
+    return StereoView(of, cv2.cvtColor(photograph(of), cv2.COLOR_RGB2GRAY), 12.0, 26.0)
+
+
+def sparse() -> np.ndarray:
+    flat = np.random.default_rng(0).uniform(-12, 12, (300, 2))
+    roof = (np.abs(flat) < HALF).all(1)
+    return np.column_stack([flat, np.where(roof, ROOF, SLOPE * flat[:, 0])])
+
+
+def flight() -> list[Camera]:
+    return [camera(x, y, tilt=0.05 * x, turn=0.4 * y) for y in (-4.0, 0.0, 4.0) for x in (-4.0, 0.0, 4.0)]
+
+
+def points_of(cameras: list[Camera], tmp_path, threads: int = 1, read=None, cell: float = 0.6):
+    read = read or (lambda index: (photograph(cameras[index]), None))
+    return dense_points(StereoInputs(cameras, sparse(), sparse(), read), cell, tmp_path, lambda done, of: None, threads)
+
+
+def height_at(points: np.ndarray) -> np.ndarray:
+    """How far points [n, 3] lie from the slope, the roof or its walls."""
+    on_slope = np.abs(points[:, 2] - SLOPE * points[:, 0])
+    within = (np.abs(points[:, :2]) < HALF + 0.3).all(1)
+    on_roof = np.where(within, np.abs(points[:, 2] - ROOF), np.inf)
+    at_wall = np.where(np.abs(np.abs(points[:, :2]).max(1) - HALF) < 0.6, 0.0, np.inf)
+    return np.minimum(np.minimum(on_slope, on_roof), at_wall)
+
+
+@settings(max_examples=50)
+@given(
+    x=st.floats(-6, 6), y=st.floats(-6, 6), tilt=st.floats(-0.3, 0.3), turn=st.floats(-3.1, 3.1),
+    focal=st.floats(100, 200), place=st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(-2, 6)),
+)  # fmt: skip
+def test_a_place_lies_in_the_same_row_and_as_far_left_as_its_depth_says(x, y, tilt, turn, focal, place):
+    assume(np.hypot(x, y) > 0.5)
+    pair = camera(0.0, 0.0, 0.1, 0.3), camera(x, y, tilt, turn, focal)
+    common = Rectified.of(*pair)
+    assume(common is not None)
+    found = []
+    for which, each in enumerate(pair):
+        pixel, _ = each.project(np.array([place]))
+        there = np.linalg.inv(common.to_photograph(each, which)) @ [*(pixel[0] - 0.5), 1.0]
+        found.append(there[:2] / there[2])
+    depth = float(common.rotation[2] @ (np.array(place) - pair[0].position))
+    assert found[0][1] == pytest.approx(found[1][1], abs=1e-6)
+    assert found[0][0] - found[1][0] == pytest.approx(common.disparity(depth), abs=1e-6)
+    assert common.depth(np.array([[common.disparity(depth)]]))[0, 0] == pytest.approx(depth, rel=1e-9)
+
+
+@pytest.mark.parametrize("second", [(4.0, 0.0, 0.0, 0.0), (0.0, 4.0, 0.1, 0.0), (-3.0, 3.0, -0.1, 2.0)])
+def test_the_depth_of_a_pair_is_the_true_one(second):
+    first = camera(0.0, 0.0, 0.05)
+    found, true = depth_of_pair(view(first), view(camera(*second))), true_depth(first)
+    assert found is not None
+    known = found > 0
+    assert known.mean() > 0.5
+    baseline = np.linalg.norm(np.array(second[:2]))
+    columns = first.fx * baseline * np.abs(1 / found[known] - 1 / true[known])
+    assert np.median(columns) < 0.25
+    assert (columns < 1).mean() > 0.85  # edges of the roof and of the picture apart
+
+
+def test_pairs_without_a_common_plane_have_no_depth():
+    first = view(camera(0.0, 0.0))
+    assert depth_of_pair(first, first) is None  # no baseline
+    behind = camera(0.0, 0.0)
+    pose = behind.camera_from_world.copy()
+    pose[2, 3] += 8.0  # 8 further up: along the line of sight
+    assert depth_of_pair(first, view(replace(behind, camera_from_world=pose))) is None
+
+
+def test_points_lie_on_the_ground_and_cover_it(tmp_path):
+    found = points_of(flight(), tmp_path)
+    off = height_at(found.points)
+    assert np.quantile(off, 0.95) < 0.02 * HEIGHT
+    roof = found.points[(np.abs(found.points[:, :2]) < HALF - 0.6).all(1)]
+    assert abs(np.median(roof[:, 2]) - ROOF) < 0.05
+    cells = {tuple(cell) for cell in np.floor(found.points[:, :2] / 0.6).astype(int)}
+    wanted = {(i, j) for i in range(-10, 10) for j in range(-10, 10)}
+    assert len(wanted & cells) > 0.85 * len(wanted)
+    assert np.abs(found.colours[:, 2].astype(int) + found.colours[:, 0] - 255).max() <= 2  # as painted
+    assert not list(tmp_path.iterdir())  # nothing is left behind
+
+
+def test_the_same_points_for_any_number_of_threads(tmp_path):
+    one, many = points_of(flight(), tmp_path), points_of(flight(), tmp_path, threads=4)
+    assert all(np.array_equal(a, b) for a, b in zip(one, many, strict=True))
+
+
+def test_two_photographs_are_enough_and_one_is_not(tmp_path):
+    two = points_of([camera(-2.0, 0.0), camera(2.0, 0.0)], tmp_path)
+    assert len(two.points) > 100
+    assert np.quantile(height_at(two.points), 0.9) < 0.02 * HEIGHT
+    assert len(points_of([camera(0.0, 0.0)], tmp_path).points) == 0
+
+
+def test_still_water_invents_nothing(tmp_path):
+    """One colour, and the noise of a sensor."""
+    rng = np.random.default_rng(0)
+    water = [rng.normal(90, 1.5, (120, 160, 3)).astype(np.uint8) for _ in flight()]
+    found = points_of(flight(), tmp_path, read=lambda index: (water[index], None))
+    assert len(found.points) < 0.02 * len(points_of(flight(), tmp_path).points)
+
+
+def test_what_a_mask_leaves_out_starts_nothing(tmp_path):
+    cameras = flight()
+
+    def read(index: int):
+        left = cameras[index].unproject(true_depth(cameras[index]))[..., 0] < 0.0
+        return photograph(cameras[index]), left.astype(np.uint8)
+
+    found = points_of(cameras, tmp_path, read=read)
+    assert len(found.points) > 100
+    assert found.points[:, 0].max() < 0.6
+
+
+def test_every_step_is_told_and_may_stop_the_work(tmp_path):
+    told = []
+    inputs = StereoInputs(flight(), sparse(), sparse(), lambda index: (photograph(flight()[index]), None))
+    dense_points(inputs, 0.6, tmp_path, lambda done, of: told.append((done, of)))
+    assert told == [(step, 18) for step in range(1, 19)]
+
+    def stop(done: int, of: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        dense_points(inputs, 0.6, tmp_path, stop)
+    assert not list(tmp_path.iterdir())
+
+
+def test_partners_stand_on_all_sides_and_see_the_same_ground():
+    grid = [camera(x, y) for y in (-4.0, 0.0, 4.0) for x in (-4.0, 0.0, 4.0)]
+    elsewhere = [camera(100.0 + x, 0.0) for x in (-2.0, 2.0)]
+    points = np.concatenate([sparse(), sparse() + np.array([100.0, 0, 5.0])])
+    found = partners([*grid, *elsewhere], points, count=4)
+    middle = np.array([grid[other].position[:2] for other in found[4]])
+    assert (middle.min(0) < 0).all()
+    assert (middle.max(0) > 0).all()
+    assert all(other < 9 for mine in found[:9] for other in mine)
+    assert (found[9], found[10]) == ([10], [9])
+    assert partners(grid, np.zeros((0, 3))) == [[]] * 9
