@@ -257,9 +257,10 @@ class Plane:
         noise = self.rng.normal(0, amount, tuple(drawn.image.shape)).astype(np.float32)
         return drawn._replace(image=drawn.image + torch.from_numpy(noise))
 
-    def evaluate(self, output: Path, mask: np.ndarray | None = None) -> dict:
+    def evaluate(self, output: Path, mask: np.ndarray | None = None, **more) -> dict:
         photographs = ReferenceViews(self.views, self.load_image, lambda _: mask)
-        return evaluate_blocks(BlockInputs(photographs, self.coarse, self.merged, self.block, quadrants()), output)
+        inputs = BlockInputs(photographs, self.coarse, self.merged, self.block, quadrants(), **more)
+        return evaluate_blocks(inputs, output)
 
 
 ONE_BLOCK = camera_above(-3.5, -3.5, 2.0)
@@ -281,6 +282,20 @@ def test_an_evaluation_of_blocks(tmp_path: Path):
     assert result["views"][2]["border_pixels"] == 0
     assert result["views"][2]["psnr_merged_border"] is None
     assert sorted(file.name for file in (tmp_path / "seams").iterdir()) == ["0.png", "1.png"]
+
+
+def test_blocks_are_measured_in_the_exposure_of_the_view(tmp_path: Path):
+    class Darker(Plane):
+        def load_image(self, which: View) -> np.ndarray:
+            return np.rint(0.8 * super().load_image(which)).astype(np.uint8)
+
+    neutral = Plane(CAMERAS[:2]).evaluate(tmp_path / "neutral")["all"]
+    exposed = Darker(CAMERAS[:2]).evaluate(tmp_path / "exposed", exposure=lambda _: 0.8 * torch.eye(3, 4))
+    for name in ("psnr_coarse", "psnr_merged"):
+        assert exposed["all"][name] == pytest.approx(neutral[name] - 20 * np.log10(0.8), abs=0.2)
+    alone = [row["psnr_alone"] for row in exposed["blocks"][:3]]
+    assert min(alone) > exposed["all"]["psnr_merged"]
+    assert Darker(CAMERAS[:2]).evaluate(tmp_path / "as it is")["all"]["psnr_coarse"] < neutral["psnr_coarse"]
 
 
 def test_pictures_of_the_views_with_most_borders(tmp_path: Path):

@@ -19,6 +19,7 @@ from cli_support import begun, entry_point, limit_files, vdgs
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.runs.opening import open_run
+from vdgs.storage.tensors import read_tensors
 
 pytestmark = pytest.mark.xdist_group("coarse")
 
@@ -72,6 +73,29 @@ def test_a_run_leaves_what_the_documents_say(unbroken):
     status = json.loads((unbroken / "coarse/status.json").read_text())
     assert status["state"] == "done"
     assert AnchorModel.load(unbroken / "coarse/model.safetensors").facts["iterations"] == 200
+
+
+def test_what_stereo_found_is_kept_and_looked_for_once(capture, unbroken, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(unbroken, run)
+    file = run / "coarse/stereo.safetensors"
+    found = read_tensors(file)[0]["points"].numpy()
+    assert len(found) > 20
+    assert np.abs(found[:, 2]).max() < 1.0  # of a camera height of ten: the ground is flat
+    (run / "coarse/model.safetensors").unlink()
+    kept = file.stat().st_mtime_ns
+    assert finish(capture, run).returncode == 0
+    assert file.stat().st_mtime_ns == kept
+    assert model_bytes(run) == model_bytes(unbroken)
+    (run / "coarse/model.safetensors").unlink()
+    file.write_bytes(file.read_bytes()[:-8])
+    broken = finish(capture, run)
+    assert broken.returncode == 1
+    assert str(file) in broken.stderr
+    assert "Delete it" in broken.stderr
+    file.unlink()
+    assert finish(capture, run).returncode == 0
+    assert np.array_equal(read_tensors(file)[0]["points"].numpy(), found)
 
 
 def test_a_finished_run_is_not_trained_again(capture, unbroken):

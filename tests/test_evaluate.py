@@ -172,6 +172,42 @@ def test_the_table_shows_the_figures(city: City, tmp_path: Path):
     assert "LPIPS is null: no weights." in text
 
 
+def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutral_colours(city: City, tmp_path: Path):
+    gains = {name: torch.eye(3, 4) * gain for name, gain in zip(NAMES, (0.8, 1.0, 1.1, 0.9), strict=True)}
+    photographs = ReferenceViews(
+        city.views, lambda v: (city.load_image(v) * float(gains[v.name][0, 0])).clip(0, 255).astype(np.uint8), load_mask
+    )
+    settings = EvaluationSettings(exposed="in the exposure of its neighbours")
+    out = StringIO()
+    neutral = MeasuredModel(city.render, city.visibility)
+    evaluate(photographs, neutral, tmp_path / "plain", settings=settings)
+    model = replace(neutral, exposure=lambda v: gains[v.name])
+    evaluate(photographs, model, tmp_path / "exposed", settings=settings, console=Console(file=out, width=120))
+    plain, result = (read(tmp_path / folder / "metrics.json") for folder in ("plain", "exposed"))
+    assert plain["psnr_neutral"] is plain["ssim_neutral"] is None
+    assert plain["notes"] == []
+    assert (result["psnr_neutral"], result["ssim_neutral"]) == (plain["psnr"], plain["ssim"])
+    assert result["psnr"] > plain["psnr"] + 1
+    assert result["notes"] == [
+        "views are drawn and measured in the exposure of its neighbours; 1 of them neutral, for want of training "
+        "photographs near by; beside that in neutral colours"
+    ]
+    rows = read(tmp_path / "exposed" / "per_view.json")
+    for row, shown, drawn in zip(rows, city.views, city.renders, strict=True):
+        saved = cv2.imread(str(tmp_path / "exposed" / row["render"]))[..., ::-1]
+        assert np.abs(saved - (drawn * float(gains[shown.name][0, 0])).clip(0, 255)).max() < 0.51
+        assert row["psnr"] == psnr(saved, photographs.load_image(shown))
+        assert row["psnr_neutral"] == psnr(drawn, photographs.load_image(shown))
+        assert row["exposure"] == gains[shown.name].tolist()
+    assert sum(10 ** (-each["psnr"] / 10) * each["pixels"] for each in result["by_visibility"]) == pytest.approx(
+        sum(10 ** (-row["psnr"] / 10) * row["kept_pixels"] for row in rows)
+    )
+    text = " ".join(out.getvalue().split())
+    assert "neutral colours" in text
+    assert f"{result['psnr_neutral']:.2f}" in text
+    assert "in the exposure of its neighbours" in text
+
+
 def test_what_cannot_be_evaluated_is_said(city: City, tmp_path: Path):
     model = MeasuredModel(city.render)
     with pytest.raises(RunError, match="no test views"):

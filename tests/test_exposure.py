@@ -1,18 +1,28 @@
-"""The exposure of photographs: neutral on average, fitted in training, left out of what is drawn and measured."""
+"""The exposure of photographs: neutral on average, fitted in training, left out of what is drawn, and known of test
+photographs from those before and after them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from checkerboard import Photographs
+from test_exporting import capture_at
 from test_training import CONFIG, bits, run, stage, start
+from vdgs.cameras import Camera
+from vdgs.captures.capture import Capture, View
+from vdgs.captures.order import places_in_flights
+from vdgs.evaluation.exposures import as_photographed, exposures_of
+from vdgs.evaluation.solidity import Rendered
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.exposure import exposed, exposure_of, neutral_exposures
+from vdgs.model.decoder import Decoder
+from vdgs.model.exposure import REACH, exposed, exposure_of, interpolated, neutral_exposures
 from vdgs.model.render import render
 from vdgs.training import Stage, from_saved, start_state, to_saved, train_step
 
@@ -47,6 +57,114 @@ def test_an_exposure_maps_colours():
     red, green, blue = picture.unbind(-1)
     expected = torch.stack([2 * red + 0.1, green, 0.5 * green + 0.5 * blue - 0.1], dim=-1)
     assert torch.allclose(exposed(picture, model), expected, atol=1e-6)
+
+
+NEUTRAL = torch.eye(3, 4).double()
+
+
+def random_departures(images: int, seed: int = 0) -> torch.Tensor:
+    return 0.2 * torch.randn(images, 3, 4, generator=torch.Generator().manual_seed(seed)).double()
+
+
+@given(places=st.sets(st.integers(0, 40), min_size=1), place=st.integers(0, 40))
+def test_what_drifts_evenly_along_a_flight_is_known_between_its_photographs(places, place):
+    images = {number: image for image, number in enumerate(sorted(places))}
+    start, drift = random_departures(2)
+    departures = torch.stack([start + number * drift for number in sorted(places)])
+    nearest = min(places, key=lambda number: abs(number - place))
+    found = interpolated(departures, images, place)
+    if abs(nearest - place) > REACH:
+        assert torch.equal(found, NEUTRAL)
+    elif min(places) <= place <= max(places):
+        assert torch.allclose(found, NEUTRAL + start + place * drift - departures.mean(0), atol=1e-12)
+    else:
+        assert torch.equal(found, exposure_of(departures, images[nearest]))
+
+
+def test_a_photograph_with_an_exposure_has_its_own_and_one_far_from_all_none():
+    departures = random_departures(3)
+    images = {2: 0, 3: 2, 30: 1}
+    for place, image in images.items():
+        assert torch.equal(interpolated(departures, images, place), exposure_of(departures, image))
+    assert torch.equal(interpolated(departures, images, 38), exposure_of(departures, 1))
+    for far in (39, 3 + REACH + 1, 30 - REACH - 1):
+        assert torch.equal(interpolated(departures, images, far), NEUTRAL)
+    assert torch.equal(interpolated(departures, {}, 2), NEUTRAL)
+
+
+def test_where_all_photographs_depart_alike_any_is_neutral():
+    departures = random_departures(1).expand(4, 3, 4)
+    for place in range(8):
+        assert torch.allclose(interpolated(departures, {1: 3, 2: 0, 6: 1}, place), NEUTRAL, atol=1e-12)
+
+
+def test_photographs_of_a_folder_follow_each_other_as_their_numbers_do():
+    names = ["b/DJI_10.JPG", "b/DJI_2.JPG", "a/7.jpg", "DJI_3.JPG", "b/DJI_1_2.JPG", "b/c/DJI_4.JPG", "b/DJI_1.JPG",
+             "b/DJI_02.JPG", "b/x.JPG"]  # fmt: skip
+    found = places_in_flights(names)
+    assert list(found) != names
+    assert found.keys() == {*names}
+    assert sorted((name for name in names if found[name].flight == "b"), key=lambda name: found[name].number) == [
+        "b/DJI_1.JPG", "b/DJI_1_2.JPG", "b/DJI_02.JPG", "b/DJI_2.JPG", "b/DJI_10.JPG", "b/x.JPG"
+    ]  # fmt: skip
+    assert places_in_flights(["train/2.jpg", "val/3.jpg", "train/10.jpg"])["val/3.jpg"] == ("", 1)
+    assert [found[name].number for name in ("a/7.jpg", "DJI_3.JPG", "b/c/DJI_4.JPG")] == [0, 0, 0]
+    assert len({place.flight for place in found.values()}) == 4
+
+
+def flown(**splits: str) -> Capture:
+    """Photographs of two flights; t trains, x tests."""
+    pose = Camera(np.eye(4), 60.0, 60.0, 32.0, 24.0, 64, 48)
+    views = [
+        View(f"{flight}/{number}.jpg", pose, Path(f"{number}.jpg"), None, "train" if letter == "t" else "test")
+        for flight, letters in splits.items()
+        for number, letter in enumerate(letters)
+    ]
+    return replace(capture_at(None), views=tuple(sorted(views, key=lambda view: view.name)))
+
+
+def test_test_views_have_the_exposure_between_their_neighbours_of_the_same_flight():
+    capture = flown(a="tttxxxtttttt", b="x", c="xt")
+    names = [view.name for view in capture.train_views]
+    assert names[:3] == ["a/0.jpg", "a/1.jpg", "a/10.jpg"]  # rows of a model are in another order than the flight
+    plain = Decoder.initial(2, False, 0, 0, torch.Generator())
+    decoder = replace(plain, exposure=random_departures(len(names)).float())
+    found = exposures_of(decoder, capture)
+    assert found is not None
+    views, departures = {view.name: view for view in capture.views}, decoder.exposure.double()
+
+    def own(name: str) -> torch.Tensor:
+        return exposure_of(departures, names.index(name))
+
+    for name in names:
+        assert torch.equal(found(views[name]), own(name))
+    between = [0.75 * own("a/2.jpg") + 0.25 * own("a/6.jpg"), 0.25 * own("a/2.jpg") + 0.75 * own("a/6.jpg")]
+    assert torch.allclose(found(views["a/3.jpg"]), between[0], atol=1e-12)
+    assert torch.allclose(found(views["a/5.jpg"]), between[1], atol=1e-12)
+    assert torch.equal(found(views["b/0.jpg"]), NEUTRAL)
+    assert torch.equal(found(views["c/0.jpg"]), own("c/1.jpg"))
+    assert exposures_of(plain, capture) is None
+
+
+@given(seed=st.integers(0, 1000))
+def test_a_picture_is_exposed_as_in_training_and_neutral_leaves_every_bit(seed):
+    generator = torch.Generator().manual_seed(seed)
+    picture, model = torch.rand(5, 7, 3, generator=generator), NEUTRAL + random_departures(1, seed)[0]
+    found = as_photographed(picture.numpy(), model)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, exposed(picture.double(), model).numpy(), atol=1e-6)
+    assert np.array_equal(as_photographed(picture.numpy(), NEUTRAL), picture.numpy())
+
+
+def test_before_another_background_the_exposed_scene_stays_as_it_is():
+    """Exposed, then put before black: as if its own colours were exposed and black stood behind them."""
+    scene, alpha = torch.rand(5, 7, 3).numpy(), torch.rand(5, 7).numpy()
+    behind, model = (0.2, 0.4, 0.6), NEUTRAL + 0.5 * random_departures(1)[0]
+    rendered = Rendered(alpha[..., None] * scene + (1 - alpha[..., None]) * np.float32(behind), alpha, behind)
+    black = rendered.exposed(model).before((0.0, 0.0, 0.0))
+    expected = (alpha[..., None] * as_photographed(scene, model)).clip(0, 1) * 255
+    assert np.abs(black - expected).max() < 0.501
+    assert replace(rendered, background=None).exposed(model).background is None
 
 
 def fitted(config=CONFIG, kind: str = "coarse") -> tuple:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cli_support import begun, do_tasks_here, vdgs, wait_until
-from cluster_support import alive, copy_run, evaluated, merge_run, train_here
+from cluster_support import COARSE, alive, copy_run, evaluated, merge_run, train_here
 from forking import start_tasks
 from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.by_block import BlockMetrics, SeamMetrics
@@ -23,7 +23,9 @@ from vdgs.evaluation.records import load_view, save_view
 from vdgs.evaluation.seams import BlockFigures
 from vdgs.evaluation.view import ViewFigures
 from vdgs.executors.work import PieceWork, alone, at_work, spans_of
+from vdgs.runs.folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder
+from vdgs.stages.evaluate import is_measured
 from vdgs.watching.interrupts import stop_if_asked, stop_requests
 
 pytestmark = pytest.mark.xdist_group("pieces")  # one worker, which trains once
@@ -184,6 +186,38 @@ def test_views_measured_in_pieces_are_those_of_one_process(merged, measured, tmp
     assert json.loads((run / "evaluation/metrics.json").read_text())["fps"] is None
     assert not (run / "evaluation/pieces").exists()
     assert vdgs("status", run).stdout.count("evaluation") == vdgs("status", merged).stdout.count("evaluation")
+
+
+def test_exposed_views_are_the_same_in_pieces_and_where_a_file_is_compared(uncut, tmp_path):
+    run, measured = tmp_path / "run", tmp_path / "run" / "coarse" / "evaluation"
+    trained = ("coarse", uncut.parent / "capture", "--output", run, *COARSE, "--test-every", "4", "--exposure")
+    for command in (trained, ("eval", run)):
+        done = vdgs(*command)
+        assert done.returncode == 0, done.stderr + done.stdout
+    assert "in the exposure interpolated from the training photographs" in " ".join(done.stdout.split())
+    figures, rows = (json.loads((measured / f"{name}.json").read_text()) for name in ("metrics", "per_view"))
+    assert all(row["psnr"] != row["psnr_neutral"] for row in rows)
+    assert figures["psnr_neutral"] == pytest.approx(np.mean([row["psnr_neutral"] for row in rows]))
+    one = evaluated(measured)
+    assert is_measured(RunFolder(run), "coarse", None, 4)
+    status = json.loads((measured / "status.json").read_text())
+    assert status.pop("exposed") == "interpolated"
+    (measured / "status.json").write_text(json.dumps(status))  # as of a version that measured neutral colours
+    assert not is_measured(RunFolder(run), "coarse", None, 4)
+    done = vdgs("eval", run, "--jobs", "2", prepare=do_tasks_here)
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "2 of 2 pieces done" in done.stdout
+    assert evaluated(measured) == one
+    done = vdgs("export", run, "--to", tmp_path / "scene.ply")
+    assert done.returncode == 0, done.stderr + done.stdout
+    (loss,) = json.loads((run / "export.json").read_text())["losses"]
+    assert loss["psnr"] == pytest.approx(figures["psnr"], abs=1e-9)
+    assert loss["ssim"] == pytest.approx(figures["ssim"], abs=1e-9)
+    assert abs(loss["psnr_baked"] - loss["psnr"]) < 0.5
+    done = vdgs("eval", run, "--views", "training")
+    assert done.returncode == 0, done.stderr + done.stdout
+    of_training = json.loads((measured.with_name("evaluation_training") / "metrics.json").read_text())
+    assert "in the exposure that was fitted to each" in " ".join(of_training["notes"])
 
 
 def test_whatever_is_stopped_or_killed_views_that_were_measured_are_not_measured_again(merged, measured, tmp_path):

@@ -174,9 +174,10 @@ def _say(plan: Plan, method: MethodConfig, standing: RunStanding | None, console
     chosen = " by estimate: --blocks auto counts again when anchors have grown" if method.partition.blocks == "auto" \
         and method.partition.blocking else ""  # fmt: skip
     per_block = _times(plan.blocks_seconds)
+    stereo = " (and what stereo finds beside the sparse points)" if method.training.anchors.stereo else ""
     names = [stage.name for stage in standing.blocks] if standing is not None else []
     lines = [
-        f"coarse model: {plan.anchors:,} anchors at the start, {plan.coarse_iterations:,} iterations, at most "
+        f"coarse model: {plan.anchors:,} anchors at the start{stereo}, {plan.coarse_iterations:,} iterations, at most "
         f"{in_gb(plan.coarse_bytes)}, {_times(plan.coarse_seconds)}{done('coarse')}",
         f"{blocks}{chosen}: about {plan.block_iterations:,} iterations each, {plan.jobs} at once, at most "
         f"{in_gb(plan.block_bytes)} each beside photographs, {per_block}{done(*names)}",

@@ -124,6 +124,8 @@ def take_coarse(source: Path, target: Path) -> None:
     Raises VdgsError if the other run has none. The keys of both are the same because the settings are; were they not,
     the coarse stage would be trained again.
     """
+    from vdgs.runs.stereo import FILE
+
     if (target / "coarse" / "model.safetensors").exists():
         return
     if not (source / "coarse" / "model.safetensors").exists():
@@ -131,7 +133,7 @@ def take_coarse(source: Path, target: Path) -> None:
     partial = target / f".coarse.{os.getpid()}"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    for name in ("key", "status.json", "log.jsonl"):
+    for name in ("key", "status.json", "log.jsonl", FILE):
         if (source / "coarse" / name).exists():
             shutil.copy2(source / "coarse" / name, partial / name)
     model = source / "coarse" / "model.safetensors"

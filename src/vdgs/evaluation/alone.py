@@ -6,6 +6,7 @@ from collections import OrderedDict
 from dataclasses import replace
 
 from vdgs.cameras import Camera
+from vdgs.evaluation.exposures import exposures_of
 from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.seams import BlockInputs
 from vdgs.kernels.types import Raster
@@ -31,6 +32,7 @@ def block_inputs(opened: TrainedRun, photographs: ReferenceViews) -> BlockInputs
         render_merged=lambda camera: render(opened.model, camera, depth=True),
         render_block=BlocksAlone(run, coarse).render,
         blocks=blocks_of(run),
+        exposure=exposures_of(opened.model.decoder, opened.capture),
     )
 
 

@@ -5,7 +5,7 @@ time.
     OUTPUT/
       metrics.json        means over the views, bins by visibility, size and speed of the model
       per_view.json       the same figures for each view
-      renders/NAME.png    what the model shows, 8 bits: the images that are measured
+      renders/NAME.png    what the model shows, in the exposure of the view if it says so, 8 bits: what is measured
       alpha/NAME.png      how opaque it is: black nothing, white opaque; none if the renderer does not say
       comparisons/        photograph | render | error
       contact_sheet.png   all views (or an even choice of them) at a glance
@@ -32,7 +32,7 @@ from vdgs.evaluation.measured_model import EvaluationSettings, MeasuredModel, Mo
 from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.solidity import largest_splats_of_all, solidity_of_all
 from vdgs.evaluation.tables import metrics_table
-from vdgs.evaluation.view import AFFINE, CORRECTED, RAW, ViewFigures, ViewInputs, measure_view
+from vdgs.evaluation.view import AFFINE, CORRECTED, NEUTRAL, RAW, ViewFigures, ViewInputs, measure_view
 from vdgs.storage.files import jsonable, write_json
 from vdgs.watching.interrupts import stop_if_asked
 
@@ -128,11 +128,12 @@ def _summary(
     visible = [np.nan if row["mean_visibility"] is None else row["mean_visibility"] for row in rows]
     figures = [{name: row[name] for name in RAW + CORRECTED + AFFINE} for row in rows]
     unfitted = sum(row.get("colour_fitted") is False for row in rows)
-    notes = [lpips_note] if lpips_note else []
+    notes = [note for note in (lpips_note, _exposure_note(rows, settings)) if note]
     if unfitted:
         notes.append(f"colour correction: too few unsaturated pixels in {unfitted} views, left as they are")
     result = {
         **means,
+        **{name: mean_or_none([row.get(name) for row in rows]) for name in NEUTRAL},
         "by_visibility": pixel_bins,
         "views_by_visibility": view_bins(visible, figures, settings.visibility_bins) if pixel_bins else None,
         **solidity_of_all(rows),
@@ -144,6 +145,16 @@ def _summary(
         "notes": notes,
     }
     return jsonable(result)
+
+
+def _exposure_note(rows: Sequence[Mapping[str, Any]], settings: EvaluationSettings) -> str:
+    """How the views are exposed; empty where all are in neutral colours."""
+    exposures = [exposure for row in rows if (exposure := row.get("exposure")) is not None]
+    if not exposures:
+        return ""
+    alone = sum(np.array_equal(exposure, np.eye(3, 4)) for exposure in exposures)
+    without = f"; {alone} of them neutral, for want of training photographs near by" if alone else ""
+    return f"views are drawn and measured {settings.exposed}{without}; beside that in neutral colours"
 
 
 def _write(output: Path, result: Mapping[str, Any], gathered: _Gathered, title: str) -> None:

@@ -61,6 +61,8 @@ class MeasuredModel:
     camera_height: float | None = None
     #: The splats that a view is drawn from.
     splats_of: Callable[[Camera], Splats] | None = None
+    #: The colour model of a view (`model.exposure`), in which its picture is measured; None: neutral colours.
+    exposure: Callable[[View], Float[Tensor, "3 4"]] | None = None
 
     def __post_init__(self) -> None:
         """Raise ValueError for a true depth without what it is compared with."""
@@ -80,6 +82,8 @@ class EvaluationSettings:
     comparisons: bool = True
     #: What the contact sheet calls the views, and, with _ between its words, metrics.json their number.
     title: str = "test views"
+    #: How pictures are exposed, if the model says how: what metrics.json notes of them.
+    exposed: str = "in the exposure of each photograph"
     #: Views on the contact sheet at most, chosen evenly.
     contact_views: int = 40
     #: Error at the bright end of the colour map, where white is 1.

@@ -18,6 +18,7 @@ from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
 from vdgs.errors import RunError
 from vdgs.evaluation.evaluate import evaluate
+from vdgs.evaluation.exposures import exposures_of
 from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.measured_model import EvaluationSettings, MeasuredModel, ModelFacts
 from vdgs.evaluation.reference_views import ReferenceViews
@@ -31,6 +32,13 @@ from vdgs.synth.truth import has_truth, load_truth
 
 #: Photographs kept decoded during an evaluation, which needs one at a time.
 EVALUATION_IMAGES_BYTES = 256_000_000
+
+#: How views are exposed, where exposures were fitted (`evaluation.exposures`).
+EXPOSED = {
+    "test": "in the exposure interpolated from the training photographs before and after (no pixel of a test view "
+    "is used)",
+    "training": "in the exposure that was fitted to each",
+}
 
 #: What to measure on. A model that is good on training views and not on test views overfits.
 Views = Literal["test", "training"]
@@ -57,7 +65,7 @@ def refuse_bins(bins: int) -> None:
 
 
 def settings_of(bins: int, views: Views) -> EvaluationSettings:
-    return EvaluationSettings(visibility_bins=bins, title=f"{views} views")
+    return EvaluationSettings(visibility_bins=bins, title=f"{views} views", exposed=EXPOSED[views])
 
 
 def views_of(capture: Capture, views: Views) -> list[View]:
@@ -87,6 +95,7 @@ def measured_model(run: TrainedRun, views: Views) -> MeasuredModel:
         render_depth=lambda camera: render(run.model, camera, depth=True),
         camera_height=camera_height(run.capture),
         splats_of=lambda camera: decode_view(run.model, camera)[1],
+        exposure=exposures_of(run.model.decoder, run.capture),
     )
 
 

@@ -19,6 +19,7 @@ from rich import box
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
+from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import View
@@ -33,6 +34,7 @@ from vdgs.evaluation.by_block import (
     border_pixels,
     label_map,
 )
+from vdgs.evaluation.exposures import as_photographed
 from vdgs.evaluation.metrics import masked_mean, psnr_of, squared_error, to_8bit
 from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.tables import shown
@@ -72,13 +74,19 @@ class SeamView:
 class BlockInputs:
     """Where the images of a view come from. `render_merged` draws depth; the labels follow from the median one.
     `render_block(index, camera)` is the image of a block as it was trained, among its frozen surroundings; None where
-    it was not trained."""
+    it was not trained. All are measured in the exposure of the view, as in `MeasuredModel`."""
 
     photographs: ReferenceViews
     render_coarse: Callable[[Camera], Raster]
     render_merged: Callable[[Camera], Raster]
     render_block: Callable[[int, Camera], Raster | None]
     blocks: Blocks
+    exposure: Callable[[View], Float[Tensor, "3 4"]] | None = None
+
+    def picture(self, rendered: Raster, view: View) -> UInt8[np.ndarray, "h w 3"]:
+        """What is measured of a render."""
+        pixels = rendered.image.detach().cpu().numpy()
+        return to_8bit(pixels if self.exposure is None else as_photographed(pixels, self.exposure(view)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +154,9 @@ def measure_view(view: View, stem: str, inputs: BlockInputs) -> tuple[BlockFigur
     reference, mask = inputs.photographs.load_image(view), inputs.photographs.load_mask(view)
     drawn = inputs.render_merged(view.camera)
     labels = label_map(drawn, view.camera, inputs.blocks)
-    coarse, merged = _eight_bits(inputs.render_coarse(view.camera)), _eight_bits(drawn)
+    coarse, merged = inputs.picture(inputs.render_coarse(view.camera), view), inputs.picture(drawn, view)
     squared = {"coarse": squared_error(coarse, reference), "merged": squared_error(merged, reference)}
-    alone = _alone(view.camera, labels, reference, inputs)
+    alone = _alone(view, labels, reference, inputs)
     by_block.add(labels, squared | {"alone": alone}, mask)
     errors = {f"mse_{name}": values for name, values in squared.items()}
     errors["mae_coarse"] = pictures.absolute_error(coarse, reference)
@@ -170,20 +178,16 @@ def _psnr_within(values: Float[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"
 
 
 def _alone(
-    camera: Camera, labels: Int16[np.ndarray, "h w"], reference: UInt8[np.ndarray, "h w 3"], inputs: BlockInputs
+    view: View, labels: Int16[np.ndarray, "h w"], reference: UInt8[np.ndarray, "h w 3"], inputs: BlockInputs
 ) -> Float[np.ndarray, "h w"]:
     """Squared error of each block's own render where the block is shown, NaN where there is none."""
     errors = np.full(labels.shape, np.nan)
     for index in blocks_shown(labels, len(inputs.blocks)):
-        rendered = inputs.render_block(index, camera)
+        rendered = inputs.render_block(index, view.camera)
         if rendered is not None:
             own = labels == index
-            errors[own] = squared_error(_eight_bits(rendered), reference)[own]
+            errors[own] = squared_error(inputs.picture(rendered, view), reference)[own]
     return errors
-
-
-def _eight_bits(rendered: Raster) -> UInt8[np.ndarray, "h w 3"]:
-    return to_8bit(rendered.image.detach().cpu().numpy())
 
 
 def seam_picture(view: SeamView) -> Image.Image:

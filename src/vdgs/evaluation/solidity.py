@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
 
 from vdgs.evaluation.by_visibility import mean_or_none
+from vdgs.evaluation.exposures import as_photographed
 from vdgs.evaluation.metrics import psnr_of, squared_error, to_8bit
 from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.types import Splats
@@ -40,6 +42,14 @@ class Rendered:
     alpha: Float[np.ndarray, "h w"] | None
     #: What is behind the model in `image`; None: not known.
     background: Colour | None = None
+
+    def exposed(self, exposure: Float[Tensor, "3 4"]) -> Rendered:
+        """The view with the colour model of a photograph: all colours, the background's too. They may leave [0, 1]."""
+        background = self.background
+        if background is not None:
+            red, green, blue = as_photographed(np.array(background), exposure).tolist()
+            background = red, green, blue
+        return Rendered(as_photographed(self.image, exposure), self.alpha, background)
 
     def before(self, colour: Colour) -> UInt8[np.ndarray, "h w 3"] | None:
         """The picture in 8 bits with another background; None where alpha or its own background is not known."""

@@ -33,14 +33,17 @@ SOLIDITY = (
 
 
 def metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
-    """What `metrics.json` holds: quality raw, colour-corrected and after an affine map of the colours, quality by
-    visibility, solidity, size and speed."""
+    """What `metrics.json` holds: quality raw, colour-corrected, after an affine map of the colours and, where pictures
+    are exposed, in neutral colours; quality by visibility, solidity, size and speed."""
     quality = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
-    for column in ("", "raw", "colour-corrected", "affine fit"):
+    besides = {"_cc": "colour-corrected", "_affine": "affine fit"}
+    if result["psnr_neutral"] is not None:
+        besides["_neutral"] = "neutral colours"
+    for column in ("", "raw", *besides.values()):
         quality.add_column(column, justify="left" if not column else "right")
     for key, label, form in FIGURES:
-        corrected = (shown(result.get(f"{key}{suffix}"), form) for suffix in ("_cc", "_affine"))
-        quality.add_row(label, shown(result[key], form), *corrected)
+        others = (shown(result.get(f"{key}{suffix}"), form) for suffix in besides)
+        quality.add_row(label, shown(result[key], form), *others)
     parts: list[RenderableType] = [quality]
     if result["by_visibility"]:
         parts.append(_visibility_table(result["by_visibility"]))

@@ -33,6 +33,8 @@ RAW = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")
 CORRECTED = tuple(f"{name}_cc" for name in RAW)
 #: After one affine map of the colours, which is fitted on the view too.
 AFFINE = ("psnr_affine", "ssim_affine")
+#: In neutral colours, where the other figures are of an exposed picture.
+NEUTRAL = ("psnr_neutral", "ssim_neutral")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +90,9 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewFigures:
     """
     view, stem, settings = inputs.photographs.views[index], inputs.stems[index], inputs.settings
     reference, mask = _photograph(view, inputs.photographs)
-    rendered, seconds = _rendered(view, inputs.model)
+    neutral, seconds = _rendered(view, inputs.model)
+    exposure = None if inputs.model.exposure is None else inputs.model.exposure(view)
+    rendered = neutral if exposure is None else neutral.exposed(exposure)
     image = metrics.to_8bit(rendered.image)
     saving.write_png(inputs.output / "renders" / f"{stem}.png", image)
     raw = _Pair(image, reference, mask)
@@ -98,6 +102,8 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewFigures:
         "render": f"renders/{stem}.png",
         "alpha": _write_alpha(inputs.output, stem, rendered),
         **_figures(raw, maps, "", inputs.lpips),
+        **_neutral_figures(None if exposure is None else _Pair(metrics.to_8bit(neutral.image), reference, mask)),
+        "exposure": None if exposure is None else exposure.tolist(),
     }
     if settings.colour_correction:
         correction = correct_colours(image, reference, mask)
@@ -107,7 +113,7 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewFigures:
         row["colour_fitted"] = correction.fitted
         affine = _Pair(metrics.to_8bit(correct_colours_affinely(image, reference, mask).image), reference, mask)
         affine_maps = _maps(affine, "_affine")
-        row |= {name: value for name, value in _figures(affine, affine_maps, "_affine", None).items() if name in AFFINE}
+        row |= _without_lpips(affine, affine_maps, "_affine")
         maps |= corrected_maps | affine_maps
     else:
         row |= dict.fromkeys((*CORRECTED, *AFFINE))
@@ -207,6 +213,19 @@ def _figures(pair: _Pair, maps: Mapping[str, np.ndarray], suffix: str, lpips: Lp
             scores.lpips_vgg_01,
         )
     return figures
+
+
+def _without_lpips(pair: _Pair, maps: Mapping[str, np.ndarray], suffix: str) -> dict[str, float | None]:
+    """PSNR and SSIM of a pair."""
+    figures = _figures(pair, maps, suffix, None)
+    return {name: figures[name] for name in (f"psnr{suffix}", f"ssim{suffix}")}
+
+
+def _neutral_figures(neutral: _Pair | None) -> dict[str, float | None]:
+    """What the picture in neutral colours comes to; None where that is the picture which is measured anyway."""
+    if neutral is None:
+        return dict.fromkeys(NEUTRAL)
+    return _without_lpips(neutral, _maps(neutral, "_neutral"), "_neutral")
 
 
 def _count_visibility(

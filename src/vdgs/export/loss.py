@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import View
 from vdgs.evaluation.by_visibility import VisibilityHistogram
 from vdgs.evaluation.colour import correct_colours
+from vdgs.evaluation.exposures import as_photographed, exposures_of
 from vdgs.evaluation.metrics import masked_mean, psnr_of, squared_error, ssim_map, to_8bit
 from vdgs.evaluation.of_run import cached_photographs, coarse_of, visibility_map
 from vdgs.export.formats.scene import joined
@@ -55,8 +56,9 @@ def measured_views(run: TrainedRun) -> list[View]:
 
 def loss_of(run: TrainedRun, pieces: Iterable[Gaussians], after_view: Callable[[], None] = lambda: None) -> Loss:
     """Draw `measured_views` with the model and with Gaussians, which are in the ground frame, and compare both with the
-    photographs, in 8 bits as all metrics. Of the pieces only what those views show is kept in memory."""
-    views = measured_views(run)
+    photographs, in 8 bits as all metrics, and as `vdgs eval` in the exposure of each view where exposures were fitted:
+    files hold neutral colours. Of the pieces only what those views show is kept in memory."""
+    views, exposure = measured_views(run), exposures_of(run.model.decoder, run.capture)
     gaussians = _seen(pieces, [view.camera for view in views])
     visibility = visibility_map(coarse_of(run))
     names = [f"{figure}{whose}" for figure in ("squared_error", "ssim") for whose in ("", "_baked")]
@@ -64,7 +66,9 @@ def loss_of(run: TrainedRun, pieces: Iterable[Gaussians], after_view: Callable[[
     with cached_photographs(views) as photographs:
         for view in views:
             reference, mask = photographs.load_image(view), photographs.load_mask(view)
-            drawn = to_8bit(render(run.model, view.camera).image.cpu().numpy()), _picture(gaussians, run, view.camera)
+            neutral = render(run.model, view.camera).image.cpu().numpy(), _picture(gaussians, run, view.camera)
+            exposed = neutral if exposure is None else [as_photographed(each, exposure(view)) for each in neutral]
+            drawn = [to_8bit(each) for each in exposed]
             corrected = [to_8bit(correct_colours(picture, reference, mask).image) for picture in drawn]
             errors = [squared_error(picture, reference) for picture in (*drawn, *corrected)]
             likeness = [ssim_map(picture, reference, mask) for picture in drawn]
@@ -94,8 +98,9 @@ def _seen(pieces: Iterable[Gaussians], cameras: Sequence[Camera]) -> Gaussians:
 
 
 @torch.no_grad()
-def _picture(gaussians: Gaussians, run: TrainedRun, camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
+def _picture(gaussians: Gaussians, run: TrainedRun, camera: Camera) -> Float[np.ndarray, "h w 3"]:
     background: Float[Tensor, "3"] = torch.tensor(run.model.background)
     seen = gaussians.select(visible_rows(gaussians, camera))
     raster, _ = draw_gaussians(seen, camera, background, seen.degree)
-    return to_8bit(raster.image.numpy())
+    pixels: np.ndarray = raster.image.numpy()
+    return pixels

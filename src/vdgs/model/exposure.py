@@ -2,15 +2,22 @@
 
 Photographs of one flight differ in brightness and white balance. Without a model of that, the scene takes the mean
 where many look, and the exposure of the one or two photographs that show it where few do. A photograph's model departs
-from the mean of all: the mean itself is neutral by construction, and it is neutral colours that a scene is drawn and
-measured in.
+from the mean of all: the mean itself is neutral by construction, and it is neutral colours that a scene is drawn in.
+
+Exposure drifts along a flight, so that of a photograph without a model follows from those taken just before and after
+it (`interpolated`). It is what test photographs are compared in.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+#: Farther than so many places along a flight, exposures say nothing of each other (choice).
+REACH = 8
 
 
 def neutral_exposures(images: int) -> Float[Tensor, "images 3 4"]:
@@ -20,10 +27,32 @@ def neutral_exposures(images: int) -> Float[Tensor, "images 3 4"]:
 
 def exposure_of(departures: Float[Tensor, "images 3 4"], image: int) -> Float[Tensor, "3 4"]:
     """The colour model [A | b] of a photograph: c -> A c + b. Over all photographs their mean is [1 | 0]."""
-    neutral = torch.eye(3, 4, dtype=departures.dtype, device=departures.device)
-    return neutral + departures[image] - departures.mean(0)
+    return _neutral(departures) + departures[image] - departures.mean(0)
+
+
+def interpolated(
+    departures: Float[Tensor, "images 3 4"], images: Mapping[int, int], place: int
+) -> Float[Tensor, "3 4"]:
+    """The colour model [A | b] of a photograph at a place of a flight, from those that have one: `images` are the rows
+    of `departures` that belong to the flight, by their places in it.
+
+    Linear between the nearest before and the nearest after it; at an end of the flight, that of the nearest; the own
+    one of a photograph that has one; neutral if even the nearest is more than `REACH` places away.
+    """
+    before = max((other for other in images if other <= place), default=None)
+    after = min((other for other in images if other >= place), default=None)
+    near = [other for other in (before, after) if other is not None]
+    if not near or min(abs(other - place) for other in near) > REACH:
+        return _neutral(departures)
+    first, last = near[0], near[-1]
+    share = (place - first) / (last - first) if last > first else 0.0
+    return torch.lerp(exposure_of(departures, images[first]), exposure_of(departures, images[last]), share)
 
 
 def exposed(image: Float[Tensor, "h w 3"], exposure: Float[Tensor, "3 4"]) -> Float[Tensor, "h w 3"]:
     """A picture in neutral colours as the photograph with that model has them."""
     return image @ exposure[:, :3].T + exposure[:, 3]
+
+
+def _neutral(departures: Float[Tensor, "images 3 4"]) -> Float[Tensor, "3 4"]:
+    return torch.eye(3, 4, dtype=departures.dtype, device=departures.device)

@@ -18,8 +18,10 @@ MOST_VIEWS, MOST_SEAMS = 400, 3
 MEASURES = (
     ("psnr", "PSNR (dB) ↑", "{:.2f}", "{:+.2f}"),
     ("psnr_cc", "PSNR, colour-corrected (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("psnr_neutral", "PSNR in neutral colours (dB) ↑", "{:.2f}", "{:+.2f}"),
     ("ssim", "SSIM ↑", "{:.4f}", "{:+.4f}"),
     ("ssim_cc", "SSIM, colour-corrected ↑", "{:.4f}", "{:+.4f}"),
+    ("ssim_neutral", "SSIM in neutral colours ↑", "{:.4f}", "{:+.4f}"),
     ("lpips_vgg", "LPIPS vgg ↓", "{:.4f}", "{:+.4f}"),
     ("lpips_vgg_cc", "LPIPS vgg, colour-corrected ↓", "{:.4f}", "{:+.4f}"),
     ("lpips_vgg_01", "LPIPS vgg, [0, 1] input ↓", "{:.4f}", "{:+.4f}"),

@@ -13,9 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from rich.console import Console
+from torch import Tensor
 
 from vdgs import __version__
+from vdgs.captures.capture import Capture
 from vdgs.captures.facts import capture_facts
 from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
@@ -34,7 +37,7 @@ from vdgs.runs.seldom import seldom_terms
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.runs.stereo import points_of_run
-from vdgs.settings.method import block_limit, block_training
+from vdgs.settings.method import TrainConfig, block_limit, block_training
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.tensors import identity
 from vdgs.training import Stage, Surroundings, start_state
@@ -96,7 +99,7 @@ def _train(
     prepared = time.monotonic() - began
     note_without_growth(config, console, "--block.")
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
-    ground = ground_of(capture, method.training.anchors, points_of_run(run, method.training.anchors)).to(device)
+    ground = _ground(run, capture, config).to(device)
     flown = [view.camera for view in capture.train_views]
     with ImageCache(views, image_budget(options), downscales=factors) as images:
         stage = Stage(
@@ -125,6 +128,13 @@ def _train(
         facts | {"iterations": state.iteration, "decoder": method.block.decoder},
     )
     finish(folder, state, model, console, area)
+
+
+def _ground(run: RunFolder, capture: Capture, config: TrainConfig) -> Float[Tensor, "g 3"]:
+    """The places where the coarse stage's anchors started; none where nothing asks for them."""
+    if not config.loss.alpha_weight and not config.seldom.asked:
+        return torch.zeros(0, 3)
+    return ground_of(capture, config.anchors, points_of_run(run, config.anchors))
 
 
 def _views_served(count: int, of: int, shares: Sequence[float] | None) -> str:

@@ -145,6 +145,8 @@ def _work(run: RunFolder, found: FoundModel, asked: Measuring, count: int) -> Pi
     depends_on = [
         found.stage.status().model, found.key, run.coarse_identity(), blocks, str(asked.lpips_weights), asked.views
     ]  # fmt: skip
+    if exposed := _exposed(run):
+        depends_on.append(exposed)
     return PieceWork.of(evaluation_folder(run, found.name, asked.views), depends_on, spans_of(count, *VIEWS_OF_PIECE))
 
 
@@ -250,7 +252,15 @@ def _record_of(run: RunFolder, name: str, lpips_weights: Path | None, bins: int)
     stage = run.merged if name == "merged" else run.coarse
     keys = run.keys()
     key = keys.merge if name == "merged" else keys.coarse
-    return {"key": key, "model": stage.status().model, "lpips_weights": str(lpips_weights), "bins": bins}
+    return {
+        "key": key, "model": stage.status().model, "lpips_weights": str(lpips_weights), "bins": bins,
+        "exposed": _exposed(run),
+    }  # fmt: skip
+
+
+def _exposed(run: RunFolder) -> str | None:
+    """How views are exposed; None in neutral colours, in which an earlier version measured all."""
+    return "interpolated" if run.method().training.exposure else None
 
 
 def _forget(output: Path) -> None:

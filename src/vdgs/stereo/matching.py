@@ -43,7 +43,8 @@ def depth_of_pair(first: StereoView, second: StereoView) -> Float[np.ndarray, "h
         return None
     least = int(np.floor(common.disparity(first.farthest))) - 2
     steps = -(-(int(np.ceil(common.disparity(first.nearest))) + 3 - least) // 16) * 16
-    if not 0 < steps <= MOST_STEPS:
+    overlap = common.width + min(least, 0) - max(least + steps, 0)
+    if not 0 < steps <= MOST_STEPS or overlap <= WINDOW:
         return None
     turned = [
         cv2.warpPerspective(

@@ -1,0 +1,42 @@
+"""In which order photographs were taken, as far as their names tell."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import PurePosixPath
+from typing import NamedTuple
+
+#: Folders that part the photographs of a flight into those that train and others.
+SPLITS = {"train", "val", "test"}
+
+
+class Place(NamedTuple):
+    """Where in a flight a photograph was taken."""
+
+    #: The folder of its name: photographs of other folders belong to other flights.
+    flight: str
+    #: From 0, counting all photographs of the flight that are known.
+    number: int
+
+
+def places_in_flights(names: Iterable[str]) -> dict[str, Place]:
+    """The place of each photograph, by its name: within its folder in natural order, DJI_2 before DJI_10. Folders of
+    splits (Mega-NeRF's train/ and val/) do not part a flight."""
+    flights = defaultdict[str, list[str]](list)
+    for name in names:
+        flights["/".join(part for part in PurePosixPath(name).parent.parts if part not in SPLITS)].append(name)
+    return {
+        name: Place(flight, number)
+        for flight, taken in flights.items()
+        for number, name in enumerate(sorted(taken, key=_natural))
+    }
+
+
+def _natural(name: str) -> tuple[list[tuple[int, str]], str]:
+    """A key to sort photographs of a flight by: digits count as the number that they are; those that are then equal by
+    their letters."""
+    # Text and digits take turns, text first: numbers stand at the same places of all names.
+    parts = re.split(r"([0-9]+)", PurePosixPath(name).name)
+    return [(int(part), "") if index % 2 else (0, part) for index, part in enumerate(parts)], name
