@@ -16,6 +16,7 @@ PLAIN = MethodConfig()
 #: Settings that came with exposure, dense Adam and the readings of compensation.
 CHANGED = {
     "adam": replace(PLAIN, training=replace(PLAIN.training, adam="dense")),
+    "stereo": replace(PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, stereo=True))),
     "exposure": replace(PLAIN, training=replace(PLAIN.training, exposure=True)),
     "drop": replace(PLAIN, training=replace(PLAIN.training, seldom=replace(PLAIN.training.seldom, drop=0.1))),
     "bound": replace(
@@ -31,11 +32,14 @@ def keys(method: MethodConfig):
 @pytest.mark.parametrize("preset", ["paper", "laptop"])
 def test_runs_of_before_have_their_keys(preset):
     """As settings were recorded before these came."""
-    now = to_dict(PRESETS[preset]) | CAPTURE
-    before = to_dict(PRESETS[preset]) | CAPTURE
+    training = PRESETS[preset].training
+    without = replace(training, exposure=False, anchors=replace(training.anchors, stereo=False))
+    now = to_dict(replace(PRESETS[preset], training=without)) | CAPTURE
+    before = to_dict(replace(PRESETS[preset], training=without)) | CAPTURE
     for name in ("adam", "exposure", "seldom"):
         del before["training"][name]
     del before["training"]["anchors"]["bound_sizes"]
+    del before["training"]["anchors"]["stereo"]
     del before["training"]["rates"]["exposure"]
     del before["training"]["compensation"]["added_to"]
     del before["block"]["compensation"]["added_to"]

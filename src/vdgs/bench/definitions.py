@@ -95,8 +95,9 @@ class Scene:
     note: str = ""
 
     def base(self, budget: Budget, seed: int, scale: float = 1.0) -> MethodConfig:
-        """The full method on this scene with so many iterations. `scale` is that of the budget to the scene's own:
-        growth begins that much earlier or later, as in `block.scale_iterations`."""
+        """The full method on this scene with so many iterations: the scene's preset, with compensated growth, which the
+        paper's method has and the preset `laptop` leaves out. `scale` is that of the budget to the scene's own: growth
+        begins that much earlier or later, as in `block.scale_iterations`."""
         config = self.adapt(PRESETS[self.preset])
         growth = config.training.growth
         early = replace(
@@ -108,7 +109,12 @@ class Scene:
             config,
             training=replace(config.training, iterations=budget.coarse, seed=seed, growth=early),
             partition=replace(config.partition, blocks=budget.blocks),
-            block=replace(config.block, iterations=budget.per_block, growth=earlier),
+            block=replace(
+                config.block,
+                iterations=budget.per_block,
+                growth=earlier,
+                compensation=replace(config.block.compensation, enabled=True),
+            ),
         )
 
 

@@ -8,7 +8,9 @@
             only anchors that a photograph shows are moved.
 `literal`   none of those. What remains ours has no reading without a choice: the threshold tau, the number of clusters'
             starts, the width of a ring, who owns a place, how volumes are weighted in scenes of another scale.
-`laptop`    a good result in minutes on a CPU; docs/findings.md says what each of its departures brings.
+`laptop`    a good result in minutes on a CPU; docs/findings.md says what each of its departures brings. Growth in blocks
+            is plain: compensated growth (`--block.compensation.enabled`) lost where few cameras look, and places start
+            by stereo there instead.
 """
 
 from __future__ import annotations
@@ -66,7 +68,7 @@ PRESETS: dict[str, MethodConfig] = {
             feature_rate=2.0,
             decoder="own",
             growth=GrowthConfig(statistics_from=0, start=100, threshold=1e-4),
-            compensation=CompensationConfig(t_low_quantile=0.25, beta_g=0.1),
+            compensation=CompensationConfig(enabled=False, t_low_quantile=0.25, beta_g=0.1),
         ),
     ),
 }
