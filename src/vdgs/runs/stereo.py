@@ -29,7 +29,7 @@ FORMAT = "vdgs-stereo-1"
 FILE = "stereo.safetensors"
 #: Edge of the cells that get a point each, in voxels and in pixels of the photographs as they are used: the larger of
 #: the two (choice). An anchor has ten Gaussians; growth makes more where that is too few.
-CELL_VOXELS, CELL_PX = 2.0, 5.0
+CELL_VOXELS, CELL_PX = 1.4, 3.5
 
 
 def points_of_run(run: RunFolder, config: AnchorConfig) -> DensePoints | None:

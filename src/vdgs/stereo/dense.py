@@ -13,6 +13,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int64, UInt8
+from scipy.spatial import cKDTree
 
 from vdgs.cameras import Camera
 from vdgs.stereo.matching import AGREEMENT, StereoView, depth_of
@@ -22,10 +23,12 @@ from vdgs.stereo.partners import partners
 #: depth better in larger pictures (choice).
 LONGEST_SIDE_PX, LARGEST_ZOOM = 480, 1.5
 #: Depths are looked for between these quantiles of a photograph's sparse points, and this much nearer and farther.
-QUANTILES, MARGIN = (0.01, 0.99), 0.15
+QUANTILES, MARGIN = (0.01, 0.99), 0.2
 #: A cell holds a point where the confirmed pixels of all photographs in it would together cover so much of one of its
 #: faces: what is matched wrongly is strewn over many cells (choice; docs/findings.md).
-LEAST_COVER = 0.1
+LEAST_COVER = 0.05
+#: Points keep so many cells from each other: a surface cuts the corners of cells, and each corner would have its own.
+SPACING = 0.7
 #: A pixel counts where at least one partner agrees on its depth, and at least this share of those that hold the place:
 #: one among many agrees by chance. Not more, for some of them do not see it.
 LEAST_AGREED = 0.25
@@ -164,8 +167,24 @@ def _told_by(
 
 
 def _fused(found: Sequence[_Cells], cell: float) -> DensePoints:
-    """One point for each cell that the pixels of all photographs cover well enough."""
+    """One point for each cell that the pixels of all photographs cover well enough, the better covered of two that lie
+    too close."""
     together = _Cells.of(np.concatenate([each.keys for each in found]), np.concatenate([each.sums for each in found]))
     kept = together.sums[together.sums[:, 7] >= LEAST_COVER * cell**2]
+    kept = kept[np.argsort(-kept[:, 7], kind="stable")]
     means = kept[:, :6] / kept[:, 6:7]
+    means = means[_apart(means[:, :3], SPACING * cell)]
     return DensePoints(means[:, :3], np.clip(np.rint(means[:, 3:]), 0, 255).astype(np.uint8))
+
+
+def _apart(points: Float[np.ndarray, "n 3"], distance: float) -> Bool[np.ndarray, " n"]:
+    """Which points stay where each, in their order, takes the place of those after it that are nearer than that."""
+    stays = np.ones(len(points), bool)
+    if len(points) < 2:
+        return stays
+    pairs = cKDTree(points).query_pairs(distance, output_type="ndarray")
+    pairs = np.sort(pairs, 1)
+    for first, second in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
+        if stays[first]:
+            stays[second] = False
+    return stays
