@@ -19,6 +19,7 @@ from vdgs.captures.images import ImageCache
 from vdgs.errors import VdgsError
 from vdgs.model.gaps import gap_points
 from vdgs.model.start import voxel_of
+from vdgs.model.visibility import visibility_of
 from vdgs.runs.folder import RunFolder
 from vdgs.settings.method import AnchorConfig
 from vdgs.stereo import DensePoints, StereoInputs, dense_points
@@ -30,6 +31,9 @@ FILE = "stereo.safetensors"
 #: Edge of the cells that get a point each, in voxels and in pixels of the photographs as they are used: the larger of
 #: the two (choice). An anchor has ten Gaussians; growth makes more where that is too few.
 CELL_VOXELS, CELL_PX = 1.4, 3.5
+#: Photographs are to have so many pixels for each point that anchors start from, sparse and dense together: more
+#: anchors than that cost time and are learnt by heart (choice; docs/findings.md). Seldom seen places come first.
+PIXELS_A_POINT = 250
 
 
 def points_of_run(run: RunFolder, config: AnchorConfig) -> DensePoints | None:
@@ -46,7 +50,8 @@ def find_points(
     tell: Callable[[int, int], None],
     threads: int,
 ) -> DensePoints | None:
-    """As `points_of_run`, found and kept where they are not yet: dense points that lie away from the sparse ones.
+    """As `points_of_run`, found and kept where they are not yet: dense points that lie away from the sparse ones, none
+    where those are as many as the photographs can bear.
 
     `images` are the training photographs; `tell(done, of)` is called after each step, and may raise.
     """
@@ -54,6 +59,11 @@ def find_points(
     if not config.stereo or file.exists():
         return points_of_run(run, config)
     cameras = [view.camera for view in capture.train_views]
+    room = sum(camera.width * camera.height for camera in cameras) // PIXELS_A_POINT - len(capture.points)
+    if room <= 0:
+        nothing = DensePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+        _write(file, nothing)
+        return nothing
     cell = cell_of(capture, config)
 
     def read(index: int) -> tuple[np.ndarray, np.ndarray | None]:
@@ -64,8 +74,10 @@ def find_points(
     inputs = StereoInputs(cameras, capture.points, np.concatenate([capture.points, gaps]), read)
     found = dense_points(inputs, cell, run.coarse.path, tell, threads)
     if len(found.points):
-        away = cKDTree(capture.points).query(found.points, workers=1)[0] > cell / 2
-        found = DensePoints(found.points[away], found.colours[away])
+        away = np.flatnonzero(cKDTree(capture.points).query(found.points, workers=1)[0] > cell / 2)
+        views = visibility_of(torch.from_numpy(found.points[away]), cameras).numpy()
+        kept = np.sort(away[np.argsort(views, kind="stable")[:room]])
+        found = DensePoints(found.points[kept], found.colours[kept])
     _write(file, found)
     return found
 

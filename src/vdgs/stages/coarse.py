@@ -91,8 +91,9 @@ def _dense_points(
     with wait:
         dense = find_points(run, capture, images, config.anchors, tell, torch.get_num_threads())
     if dense is not None:
+        added = f"{len(dense.points):,} points beside the sparse ones, {time.monotonic() - began:.0f} s"
         console.print(
-            f"stereo: {len(dense.points):,} points beside the sparse ones, {time.monotonic() - began:.0f} s",
+            f"stereo: {added if len(dense.points) else 'no points added: the sparse ones suffice, or nothing matches'}",
             highlight=False,
         )
     return dense
