@@ -28,7 +28,7 @@ ITERATIONS, BLOCK_ITERATIONS = 200, 120
 SETTINGS = (
     "--preset", "laptop", "--iterations", str(ITERATIONS), "--save-every", "20", "--anchors.offsets", "3",
     "--growth.start", "50", "--growth.interval", "50", "--growth.statistics-from", "25", "--growth.gate", "0.05",
-    "--blocks", "2", "--jobs", "2", "--block.compensation.t-low-quantile", "0",
+    "--blocks", "2", "--jobs", "2", "--block.compensation.enabled", "--block.compensation.t-low-quantile", "0",
     "--assignment.min-cameras", "4", "--block.iterations", str(BLOCK_ITERATIONS), "--block.growth.gate", "0.05",
     "--block.growth.start", "25", "--block.growth.statistics-from", "0", "--block.growth.interval", "25", "--no-maps",
 )  # fmt: skip
@@ -183,7 +183,9 @@ def test_a_block_alone_stands_among_coarse_anchors_with_the_coarse_decoder(unbro
 def test_cycles_of_compensated_growth_are_logged(unbroken):
     lines = [json.loads(line) for line in (unbroken / "blocks/00/log.jsonl").read_text().splitlines()]
     cycles = [line for line in lines if line.get("low_share") is not None]
-    assert [line["iteration"] for line in cycles] == [25, 50]
+    until = lines[-1]["iteration"] // 2  # blocks draw parts of photographs: how many steps they make follows from those
+    assert until >= 50
+    assert [line["iteration"] for line in cycles] == list(range(25, until + 1, 25))
     assert all(0 <= line["low_share"] <= 1 and line["t_low"] == 0.2 for line in cycles)
     assert all(line["grown_low"] + line["grown_other"] == line["grown"] for line in cycles)
 
