@@ -140,6 +140,20 @@ def test_solidity_is_a_table_where_it_is_known():
     assert "| VDGS (full) | **90.00 ± 0.00** |" in markdown([grid], "T", [])
 
 
+def test_methods_that_fit_exposures_are_compared_with_others_in_neutral_colours():
+    plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full")))
+    results = made({"baseline": (0, 0), "full": (1, 0)})
+    assert not [grid for grid in grids_of(plan, results) if grid.name == "neutral"]
+    for result in results[:3]:
+        result.figures.update({"psnr": 20.5, "ssim": 0.61})
+    for result in results[3:]:
+        result.figures.update({"psnr": 30.0, "ssim": 0.9, "psnr_neutral": 20.25, "ssim_neutral": 0.6})
+    (grid,) = [grid for grid in grids_of(plan, results) if grid.name == "neutral"]
+    text = markdown([grid], "T", [])
+    assert "| VDGS (full) | <u>20.25 ± 0.00</u> | <u>0.600 ± 0.000</u> |" in text
+    assert "| **20.50 ± 0.00** | **0.610 ± 0.000** |" in text
+
+
 def test_failures_are_shown_and_leave_a_gap(tmp_path):
     plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full")))
     results = made({"baseline": (0, 0), "full": (1, 0)}, method_failed="full")

@@ -59,6 +59,7 @@ QUALITY = (Column("PSNR ↑", "psnr"), Column("SSIM ↑", "ssim", 3), Column("LP
 CORRECTED = (
     Column("PSNR ↑", "psnr_cc"), Column("SSIM ↑", "ssim_cc", 3), Column("LPIPS ↓", "lpips_vgg_cc", 3, -1),
 )  # fmt: skip
+NEUTRAL = Column("PSNR ↑", "psnr_neutral"), Column("SSIM ↑", "ssim_neutral", 3)
 COSTS = (
     Column("iterations", "iterations", 0, 0),
     Column("photographs drawn", "photographs", 0, 0),
@@ -83,6 +84,11 @@ SOLIDITY = (
     Column("median depth within 1 %, % ↑", "depth_within_1_percent_median", 1, 1, 100.0),
     Column("large splats ↓", "splats_larger_than_picture", 0, -1),
 )
+#: What makes rows comparable that are exposed and rows that are not.
+NEUTRAL_COLOURS = (
+    "All methods in the colours of one exposure for the whole place. Raw figures of methods that fit exposures are of "
+    "views drawn as their neighbours in the flight are exposed; those of the others are the same here as there."
+)
 #: Over which pixels, and what the columns hold.
 SOLID = (
     "Over the pixels whose place at least 3 training cameras hold in their frustum, as the coarse model of each run "
@@ -104,8 +110,8 @@ SEEN_BY = {
 
 
 def grids_of(plan: Plan, results: Sequence[Result]) -> list[Grid]:
-    """Quality raw and corrected over all scenes; by visibility, solidity and cost for each scene; the paper's own
-    numbers."""
+    """Quality raw, corrected and, where views are drawn exposed, neutral over all scenes; by visibility, solidity and
+    cost for each scene; the paper's own numbers."""
     across = "mean ± standard deviation over seeds" if len(plan.seeds) > 1 else "one seed"
     views = "Validation views" if plan.validation else "Test views"
     unseen = _unseen(plan, results)
@@ -114,6 +120,7 @@ def grids_of(plan: Plan, results: Sequence[Result]) -> list[Grid]:
         _measured(
             plan, results, "corrected", f"{views}, colour-corrected ({across})", _for_scenes(plan, CORRECTED), unseen
         ),
+        *_neutral(plan, results, f"{views}, neutral colours ({across})"),
     ]
     for scene in plan.scenes:
         mine = [result for result in results if result.scene == scene.name]
@@ -134,6 +141,21 @@ def grids_of(plan: Plan, results: Sequence[Result]) -> list[Grid]:
         grids.append(_measured(plan, mine, f"costs-{scene.name}", title, columns, (SIZES,)))
     quoted = _quoted(plan)
     return grids + ([quoted] if quoted else [])
+
+
+def _neutral(plan: Plan, results: Sequence[Result], title: str) -> list[Grid]:
+    """Quality in neutral colours, of all methods; nothing where no method is measured in others."""
+    if all(result.figures.get("psnr_neutral") is None for result in results):
+        return []
+    alike = [replace(result, figures=_in_neutral_colours(result.figures)) for result in results]
+    return [_measured(plan, alike, "neutral", title, _for_scenes(plan, NEUTRAL), (NEUTRAL_COLOURS,))]
+
+
+def _in_neutral_colours(figures: Mapping[str, float | None]) -> Mapping[str, float | None]:
+    """The figures with those in neutral colours, which are the raw ones where nothing else is said."""
+    if figures.get("psnr_neutral") is not None:
+        return figures
+    return {**figures, "psnr_neutral": figures.get("psnr"), "ssim_neutral": figures.get("ssim")}
 
 
 def _for_scene(column: Column, scene: str) -> Column:

@@ -18,6 +18,8 @@ from vdgs.storage.files import read_json
 
 #: What evaluations report, raw and after colour correction.
 QUALITY = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01", "psnr_cc", "ssim_cc", "lpips_vgg_cc", "lpips_vgg_01_cc")
+#: The same in neutral colours, of views that are drawn exposed as their neighbours in the flight.
+NEUTRAL = ("psnr_neutral", "ssim_neutral")
 #: Over the pixels that training cameras see: how opaque they are, PSNR by background, errors of depth; and veils.
 SOLIDITY = (
     "solid_share", "psnr_seen_own", "psnr_seen_black", "psnr_seen_white", "depth_error_median_expected",
@@ -72,7 +74,7 @@ def _read(output: Path, planned: PlannedRun, result: Result) -> Result:
     """The result with the figures that the run left."""
     run = RunFolder(output / planned.folder)
     metrics, record = read_json(evaluated(run.path) / "metrics.json"), read_json(run.path / RECORD)
-    figures: dict[str, float | None] = {name: metrics.get(name) for name in (*QUALITY, *SOLIDITY)}
+    figures: dict[str, float | None] = {name: metrics.get(name) for name in (*QUALITY, *NEUTRAL, *SOLIDITY)}
     figures |= {"model_bytes": metrics.get("model_bytes"), "fps": metrics["fps"]}
     if planned.renders is None:
         figures |= _sizes(metrics, planned) | _costs(run, planned.stages, record.get("seconds", {}))
