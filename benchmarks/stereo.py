@@ -6,6 +6,7 @@
 
 Precision: the share of the points that lie within a cell of a true surface that some photograph shows. Recall: of what
 the test views show, the share with a point within 1.25 cells, by the sparse points alone and with those of stereo.
+Cells are as large as the training photograph that shows a place largest asks for.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from machine import describe
+from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.images import ImageCache
 from vdgs.captures.loading import load_capture
@@ -27,6 +30,7 @@ from vdgs.runs.folder import RunFolder
 from vdgs.runs.stereo import cell_of, find_points
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.method import AnchorConfig
+from vdgs.stereo.dense import SIZES, Cell
 from vdgs.synth.truth import Truth, load_truth
 
 #: Groups by true V: from, to.
@@ -51,21 +55,33 @@ def main() -> None:
     print(describe())
     print(
         f"{len(capture.train_views)} photographs, {len(capture.points):,} sparse points, {len(found.points):,} by "
-        f"stereo beside them in {time.monotonic() - began:.1f} s, cells of {cell:.3f}"
+        f"stereo beside them in {time.monotonic() - began:.1f} s, cells of {cell.least:.3f} and more"
     )
     surface = np.concatenate([places(view, truth, capture)[0][::EVERY] for view in capture.train_views])
-    print(f"precision {(cKDTree(surface).query(found.points)[0] < cell).mean():.1%}\n")
+    cameras = [view.camera for view in capture.train_views]
+    within = cKDTree(surface).query(found.points)[0] < edges(cell, cameras, found.points)
+    print(f"precision {within.mean():.1%}\n")
     print(f"{'true V':>10} {'pixels':>7} {'sparse':>7} {'stereo':>7}")
     shown, views = zip(*(places(view, truth, capture, counted=True) for view in capture.test_views), strict=True)
     where, seen = np.concatenate(shown), np.concatenate(views)
+    reach = 1.25 * edges(cell, cameras, where)
     near = [
-        cKDTree(points).query(where)[0] < 1.25 * cell
+        cKDTree(points).query(where)[0] < reach
         for points in (capture.points, np.concatenate([capture.points, found.points]))
     ]
     for low, high in GROUPS:
         group = (seen >= low) & (seen <= high)
         label = f"{low}" if low == high else f"{low} to {high}" if high < 10_000 else f"{low} and more"
         print(f"{label:>10} {group.mean():>7.1%}", *(f"{each[group].mean():>7.1%}" for each in near))
+
+
+def edges(cell: Cell, cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
+    """The edge [n] of the cells at points [n, 3]."""
+    pixel = np.full(len(points), np.inf)
+    for camera in cameras:
+        _, depth = camera.project(points)
+        pixel = np.minimum(pixel, np.where(camera.sees(points), depth / camera.fx, np.inf))
+    return cell.least * SIZES[cell.sizes(np.where(np.isfinite(pixel), pixel, 0.0))]
 
 
 def places(

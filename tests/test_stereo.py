@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from vdgs.cameras import Camera
-from vdgs.stereo import StereoInputs, StereoView, dense_points, depth_of_pair, partners
+from vdgs.stereo import Cell, StereoInputs, StereoView, dense_points, depth_of_pair, partners
+from vdgs.stereo.dense import SIZES, SPACING
 from vdgs.stereo.rectification import Rectified
 
 HEIGHT, ROOF, HALF = 20.0, 4.0, 5.0  # of the flight, of a roof about the origin, and half its edge
@@ -71,9 +73,10 @@ def flight() -> list[Camera]:
     return [camera(x, y, tilt=0.05 * x, turn=0.4 * y) for y in (-4.0, 0.0, 4.0) for x in (-4.0, 0.0, 4.0)]
 
 
-def points_of(cameras: list[Camera], tmp_path, threads: int = 1, read=None, cell: float = 0.6):
+def points_of(cameras: list[Camera], tmp_path, threads: int = 1, read=None, cell: float = 0.6, pixels: float = 0.0):
     read = read or (lambda index: (photograph(cameras[index]), None))
-    return dense_points(StereoInputs(cameras, sparse(), sparse(), read), cell, tmp_path, lambda done, of: None, threads)
+    inputs = StereoInputs(cameras, sparse(), sparse(), read)
+    return dense_points(inputs, Cell(cell, pixels), tmp_path, lambda done, of: None, threads)
 
 
 def height_at(points: np.ndarray) -> np.ndarray:
@@ -141,6 +144,29 @@ def test_points_lie_on_the_ground_and_cover_it(tmp_path):
     assert not list(tmp_path.iterdir())  # nothing is left behind
 
 
+def test_cells_are_as_large_as_pixels_are(tmp_path):
+    """Photographs with a long lens to the left, whose pixels are half as wide as those of the others."""
+    left = [camera(x, y, focal=300.0) for x in (-9.0, -7.0, -5.0) for y in (-2.0, 0.0, 2.0)]
+    right = [camera(x, y) for x in (3.0, 6.0, 9.0) for y in (-3.0, 0.0, 3.0)]
+    points = points_of([*left, *right], tmp_path, cell=0.4, pixels=6.0).points
+    spacing = cKDTree(points).query(points, k=2)[0][:, 1]
+    assert spacing.min() > SPACING * 0.4 - 1e-9
+    fine, coarse = (np.abs(points[:, 1]) < 2) & (points[:, 0] < -6), points[:, 0] > 6
+    assert np.median(spacing[fine]) < 0.5
+    assert np.median(spacing[coarse]) > SPACING * 0.8 - 1e-9
+    assert np.quantile(height_at(points[coarse]), 0.95) < 0.02 * HEIGHT
+    wanted = np.array([(x, y) for x in np.arange(7.0, 10.0, 0.5) for y in np.arange(-3.0, 3.0, 0.5)])
+    assert (cKDTree(points[:, :2]).query(wanted)[0] < 0.8).mean() > 0.9
+
+
+@given(st.lists(st.floats(1e-6, 1e3), min_size=1, max_size=20), st.floats(0.01, 10), st.floats(0, 10))
+def test_a_cell_is_hardly_larger_or_smaller_than_its_pixels_ask_for(widths, least, pixels):
+    asked, edges = pixels * np.array(widths), least * SIZES[Cell(least, pixels).sizes(np.array(widths))]
+    assert (edges >= least).all()
+    assert (edges <= np.maximum(least, 1.42 * asked)).all()
+    assert (edges >= np.minimum(least * SIZES[-1], 0.7 * asked)).all()
+
+
 def test_the_same_points_for_any_number_of_threads(tmp_path):
     one, many = points_of(flight(), tmp_path), points_of(flight(), tmp_path, threads=4)
     assert all(np.array_equal(a, b) for a, b in zip(one, many, strict=True))
@@ -176,14 +202,14 @@ def test_what_a_mask_leaves_out_starts_nothing(tmp_path):
 def test_every_step_is_told_and_may_stop_the_work(tmp_path):
     told = []
     inputs = StereoInputs(flight(), sparse(), sparse(), lambda index: (photograph(flight()[index]), None))
-    dense_points(inputs, 0.6, tmp_path, lambda done, of: told.append((done, of)))
+    dense_points(inputs, Cell(0.6, 0.0), tmp_path, lambda done, of: told.append((done, of)))
     assert told == [(step, 18) for step in range(1, 19)]
 
     def stop(done: int, of: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        dense_points(inputs, 0.6, tmp_path, stop)
+        dense_points(inputs, Cell(0.6, 0.0), tmp_path, stop)
     assert not list(tmp_path.iterdir())
 
 

@@ -22,14 +22,15 @@ from vdgs.model.start import voxel_of
 from vdgs.model.visibility import visibility_of
 from vdgs.runs.folder import RunFolder
 from vdgs.settings.method import AnchorConfig
-from vdgs.stereo import DensePoints, StereoInputs, dense_points
+from vdgs.stereo import Cell, DensePoints, StereoInputs, dense_points
 from vdgs.storage.files import write_atomically
 from vdgs.storage.tensors import checksum, read_tensors, write_tensors
 
 FORMAT = "vdgs-stereo-1"
 FILE = "stereo.safetensors"
 #: Edge of the cells that get a point each, in voxels and in pixels of the photographs as they are used: the larger of
-#: the two (choice). An anchor has ten Gaussians; growth makes more where that is too few.
+#: the two, and two, four or eight times that where pixels are so much larger than below the flight (choice). An anchor
+#: has ten Gaussians; growth makes more where that is too few.
 CELL_VOXELS, CELL_PX = 1.4, 3.5
 #: Photographs are to have so many pixels for each point that anchors start from, sparse and dense together: more
 #: anchors than that cost time and are learnt by heart (choice; docs/findings.md). Seldom seen places come first.
@@ -74,7 +75,7 @@ def find_points(
     inputs = StereoInputs(cameras, capture.points, np.concatenate([capture.points, gaps]), read)
     found = dense_points(inputs, cell, run.coarse.path, tell, threads)
     if len(found.points):
-        away = np.flatnonzero(cKDTree(capture.points).query(found.points, workers=1)[0] > cell / 2)
+        away = np.flatnonzero(cKDTree(capture.points).query(found.points, workers=1)[0] > cell.least / 2)
         views = visibility_of(torch.from_numpy(found.points[away]), cameras).numpy()
         kept = np.sort(away[np.argsort(views, kind="stable")[:room]])
         found = DensePoints(found.points[kept], found.colours[kept])
@@ -82,10 +83,10 @@ def find_points(
     return found
 
 
-def cell_of(capture: Capture, config: AnchorConfig) -> float:
-    """The edge of the cells that get a dense point each, in units of the ground frame."""
+def cell_of(capture: Capture, config: AnchorConfig) -> Cell:
+    """The cells that get a dense point each, in units of the ground frame."""
     focal = float(np.median([view.camera.fx for view in capture.train_views]))
-    return max(CELL_VOXELS * voxel_of(capture.points, config), CELL_PX * camera_height(capture) / focal)
+    return Cell(max(CELL_VOXELS * voxel_of(capture.points, config), CELL_PX * camera_height(capture) / focal), CELL_PX)
 
 
 def _write(file: Path, found: DensePoints) -> None:

@@ -11,8 +11,8 @@ knows what training does not: that neighbouring pixels mostly lie on one surface
 Nothing of it needs a GPU or a network; it is deterministic, for any number of threads.
 """
 
-from vdgs.stereo.dense import DensePoints, StereoInputs, dense_points
+from vdgs.stereo.dense import Cell, DensePoints, StereoInputs, dense_points
 from vdgs.stereo.matching import StereoView, depth_of_pair
 from vdgs.stereo.partners import partners
 
-__all__ = ["DensePoints", "StereoInputs", "StereoView", "dense_points", "depth_of_pair", "partners"]
+__all__ = ["Cell", "DensePoints", "StereoInputs", "StereoView", "dense_points", "depth_of_pair", "partners"]

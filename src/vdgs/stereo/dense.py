@@ -1,4 +1,8 @@
-"""Points on what a flight shows: the depths of all its photographs, where others confirm them, one for each cell."""
+"""Points on what a flight shows: the depths of all its photographs, where others confirm them, one for each cell.
+
+Cells are as large as pixels are there: what is only seen from afar has cells of two, four, ... times the edge. Fine
+ones would hold the noise of depths there, and nobody can bear so many.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +28,8 @@ from vdgs.stereo.partners import partners
 LONGEST_SIDE_PX, LARGEST_ZOOM = 480, 1.5
 #: Depths are looked for between these quantiles of a photograph's sparse points, and this much nearer and farther.
 QUANTILES, MARGIN = (0.01, 0.99), 0.2
+#: Edges of cells are the least one times these. Keys have room for so many.
+SIZES = 2.0 ** np.arange(4)
 #: A cell holds a point where the confirmed pixels of all photographs in it would together cover so much of one of its
 #: faces: what is matched wrongly is strewn over many cells (choice; docs/findings.md).
 LEAST_COVER = 0.05
@@ -34,8 +40,8 @@ SPACING = 0.7
 LEAST_AGREED = 0.25
 #: Grey photographs that are held at a time.
 HELD = 256
-#: Cells have keys within this many cells of the origin on each axis.
-REACH = 2**20
+#: Cells have keys within this many cells of the origin on each axis: 20 bits each, and the size on top.
+REACH = 2**19
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +56,19 @@ class StereoInputs:
     read: Callable[[int], tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None]]
 
 
+class Cell(NamedTuple):
+    """The edge of cells that get a point each: the least, in units of the world, and in pixels of the photographs as
+    they are used, where those are larger."""
+
+    least: float
+    pixels: float
+
+    def sizes(self, pixel: Float[np.ndarray, " p"]) -> Int64[np.ndarray, " p"]:
+        """Which of `SIZES` cells have where a pixel is so wide."""
+        wide = np.log2(np.maximum(self.pixels * pixel / self.least, 1.0))
+        return np.minimum(np.rint(wide).astype(np.int64), len(SIZES) - 1)
+
+
 class DensePoints(NamedTuple):
     """Points [m, 3] float64 and their colours [m, 3] uint8."""
 
@@ -59,8 +78,8 @@ class DensePoints(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Cells by their keys [c], and sums over the pixels that lie in them [c, 8]: position, colour, 1, and the area that
-    a pixel covers there."""
+    """Cells by their keys [c], which begin with the number of their size, and sums over the pixels that lie in them
+    [c, 8]: position, colour, 1, and the area that a pixel covers there."""
 
     keys: Int64[np.ndarray, " c"]
     sums: Float[np.ndarray, "c 8"]
@@ -73,10 +92,10 @@ class _Cells:
 
 
 def dense_points(
-    inputs: StereoInputs, cell: float, scratch: Path, tell: Callable[[int, int], None], threads: int = 1
+    inputs: StereoInputs, cell: Cell, scratch: Path, tell: Callable[[int, int], None], threads: int = 1
 ) -> DensePoints:
-    """Match every photograph with its partners, and give each cell of edge `cell` that enough pixels lie in the mean of
-    them. A pixel counts where the depths of partners confirm it.
+    """Match every photograph with its partners, and give each cell that enough pixels lie in the mean of them. A pixel
+    counts where the depths of partners confirm it.
 
     `scratch` is a folder for a file of depths, gone afterwards: memory does not grow with the flight. `tell(done, of)`
     is called in this thread after each photograph, once for matching and once for confirming. Deterministic, whatever
@@ -131,7 +150,7 @@ def _view(inputs: StereoInputs, camera: Camera, index: int) -> StereoView:
 
 
 def _confirmed(
-    inputs: StereoInputs, cameras: Sequence[Camera], depths: np.ndarray, index: int, others: Sequence[int], cell: float
+    inputs: StereoInputs, cameras: Sequence[Camera], depths: np.ndarray, index: int, others: Sequence[int], cell: Cell
 ) -> _Cells:
     """The cells in which confirmed pixels of a photograph lie."""
     camera = cameras[index]
@@ -142,7 +161,7 @@ def _confirmed(
     for other in others:
         inside, agrees = _told_by(places, cameras[other], depths[other])
         held, agreed = held + inside, agreed + agrees
-    confirmed = known & (agreed >= 1) & (agreed >= LEAST_AGREED * held) & (np.abs(places) < REACH * cell).all(-1)
+    confirmed = known & (agreed >= 1) & (agreed >= LEAST_AGREED * held) & (np.abs(places) < REACH * cell.least).all(-1)
     picture, mask = inputs.read(index)
     size = (camera.width, camera.height)
     if mask is not None:
@@ -150,8 +169,10 @@ def _confirmed(
     colours = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     area = (depth[confirmed].astype(np.float64) ** 2 / (camera.fx * camera.fy))[:, None]
     values = np.concatenate([places[confirmed], colours[confirmed], np.ones_like(area), area], 1)
-    x, y, z = (np.floor(values[:, axis] / cell).astype(np.int64) + REACH for axis in range(3))
-    return _Cells.of((x << 42) | (y << 21) | z, values)
+    sizes = cell.sizes(depth[confirmed].astype(np.float64) / inputs.cameras[index].fx)
+    edge = cell.least * SIZES[sizes]
+    x, y, z = (np.floor(values[:, axis] / edge).astype(np.int64) + REACH for axis in range(3))
+    return _Cells.of((sizes << 60) | (x << 40) | (y << 20) | z, values)
 
 
 def _told_by(
@@ -166,14 +187,18 @@ def _told_by(
     return inside.reshape(places.shape[:2]), agrees.reshape(places.shape[:2])
 
 
-def _fused(found: Sequence[_Cells], cell: float) -> DensePoints:
-    """One point for each cell that the pixels of all photographs cover well enough, the better covered of two that lie
-    too close."""
+def _fused(found: Sequence[_Cells], cell: Cell) -> DensePoints:
+    """One point for each cell that the pixels of all photographs cover well enough; of two that lie too close that of
+    the smaller cell, or of the better covered one."""
     together = _Cells.of(np.concatenate([each.keys for each in found]), np.concatenate([each.sums for each in found]))
-    kept = together.sums[together.sums[:, 7] >= LEAST_COVER * cell**2]
-    kept = kept[np.argsort(-kept[:, 7], kind="stable")]
-    means = kept[:, :6] / kept[:, 6:7]
-    means = means[_apart(means[:, :3], SPACING * cell)]
+    means = np.zeros((0, 6))
+    for size, edge in enumerate(cell.least * SIZES):
+        sums = together.sums[(together.keys >> 60 == size) & (together.sums[:, 7] >= LEAST_COVER * edge**2)]
+        sums = sums[np.argsort(-sums[:, 7], kind="stable")]
+        more = sums[:, :6] / sums[:, 6:7]
+        if len(means):
+            more = more[cKDTree(means[:, :3]).query(more[:, :3], workers=1)[0] > SPACING * edge]
+        means = np.concatenate([means, more[_apart(more[:, :3], SPACING * edge)]])
     return DensePoints(means[:, :3], np.clip(np.rint(means[:, 3:]), 0, 255).astype(np.uint8))
 
 
