@@ -3,6 +3,7 @@ photographs from those before and after them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,9 +19,11 @@ from test_training import CONFIG, bits, run, stage, start
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.order import places_in_flights
-from vdgs.evaluation.exposures import as_photographed, exposures_of
+from vdgs.evaluation.exposures import Exposures, as_photographed, exposures_of
+from vdgs.evaluation.metering import Metering, learnt, metered
 from vdgs.evaluation.solidity import Rendered
 from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.model.exposure import REACH, exposed, exposure_of, interpolated, neutral_exposures
 from vdgs.model.render import render
@@ -123,15 +126,30 @@ def flown(**splits: str) -> Capture:
     return replace(capture_at(None), views=tuple(sorted(views, key=lambda view: view.name)))
 
 
+def nothing() -> Anchors:
+    return Anchors(torch.zeros(0, 3), torch.zeros(0, 32), torch.zeros(0, 2, 3), torch.zeros(0, 6))
+
+
+class Lit(Exposures):
+    """Exposures over a place whose views are as light as they say."""
+
+    def __init__(self, capture: Capture, departures: torch.Tensor, light: Callable[[View], float]):
+        plain = Decoder.initial(2, False, 0, 0, torch.Generator())
+        decoder = replace(plain, exposure=departures.float())
+        super().__init__(AnchorModel(nothing(), decoder, 0.4, (0.0, 0.0, 0.0), {}), capture)
+        self._light = light
+
+    def _drawn(self, view: View) -> np.ndarray:
+        return np.full((4, 6, 3), self._light(view))
+
+
 def test_test_views_have_the_exposure_between_their_neighbours_of_the_same_flight():
     capture = flown(a="tttxxxtttttt", b="x", c="xt")
     names = [view.name for view in capture.train_views]
     assert names[:3] == ["a/0.jpg", "a/1.jpg", "a/10.jpg"]  # rows of a model are in another order than the flight
-    plain = Decoder.initial(2, False, 0, 0, torch.Generator())
-    decoder = replace(plain, exposure=random_departures(len(names)).float())
-    found = exposures_of(decoder, capture)
-    assert found is not None
-    views, departures = {view.name: view for view in capture.views}, decoder.exposure.double()
+    departures = random_departures(len(names)).float().double()
+    found = Lit(capture, departures, lambda view: 0.5)
+    views = {view.name: view for view in capture.views}
 
     def own(name: str) -> torch.Tensor:
         return exposure_of(departures, names.index(name))
@@ -143,7 +161,59 @@ def test_test_views_have_the_exposure_between_their_neighbours_of_the_same_fligh
     assert torch.allclose(found(views["a/5.jpg"]), between[1], atol=1e-12)
     assert torch.equal(found(views["b/0.jpg"]), NEUTRAL)
     assert torch.equal(found(views["c/0.jpg"]), own("c/1.jpg"))
-    assert exposures_of(plain, capture) is None
+
+
+@pytest.mark.parametrize("slope", [-0.6, 0.0])
+def test_a_camera_that_meters_exposes_what_is_brighter_less(slope):
+    """Light changes at random from view to view, and the exposure drifts beside."""
+    capture = flown(a="ttxtttxttttxtttxttttxtt")
+    light = dict(
+        zip([view.name for view in capture.views], np.random.default_rng(0).uniform(0.2, 0.3, 23), strict=True)
+    )
+
+    def gain(view: View) -> float:
+        return 1.5 * light[view.name] ** slope * np.exp(0.02 * int(Path(view.name).stem))
+
+    views = capture.train_views
+    fitted = torch.tensor([gain(view) for view in views])[:, None, None] * torch.eye(3, 4)
+    fitted /= fitted.mean(0)[0, 0]  # what all have in common is the scene's
+    found = Lit(capture, fitted - torch.eye(3, 4), lambda view: light[view.name])
+    assert found.metering.slope == pytest.approx(slope, abs=0.02)
+    for view in capture.test_views:
+        wanted = gain(view) / np.mean([gain(other) for other in views])
+        assert found(view)[1, 1] == pytest.approx(wanted, rel=0.01 if slope else 0.001)
+        assert torch.equal(found(view), found(view)[0, 0] * torch.eye(3, 4, dtype=torch.float64))
+
+
+def test_a_model_without_exposures_has_none():
+    plain = Decoder.initial(2, False, 0, 0, torch.Generator())
+    model = AnchorModel(nothing(), plain, 0.4, (0.0, 0.0, 0.0), {})
+    assert exposures_of(model, flown(a="tx")) is None
+
+
+def test_the_middle_of_a_picture_is_metered_whatever_its_size():
+    picture = np.full((48, 64, 3), 0.2)
+    picture[16:32, 20:44] = 0.6
+    whole = np.log(picture.mean())
+    assert metered(picture) > whole + 0.2
+    assert metered(np.repeat(np.repeat(picture, 2, 0), 2, 1)) == pytest.approx(metered(picture), abs=0.01)
+    assert metered(0.5 * picture) == pytest.approx(metered(picture) - np.log(2), abs=0.01)
+    assert np.isfinite(metered(np.zeros((4, 4, 3))))
+
+
+@given(st.floats(-1.5, 1.0), st.integers(0, 1000))
+def test_the_law_of_metering_is_learnt_or_left(slope, seed):
+    rng = np.random.default_rng(seed)
+    brighter = rng.normal(0, 0.2, 40)
+    assert learnt(brighter, slope * brighter).slope == pytest.approx(np.clip(slope, -1, 0), abs=1e-6)
+    assert learnt(brighter, slope * brighter).gain(0.0) == 1.0
+    noise = rng.normal(0, 0.2, 40)
+    unrelated = learnt(brighter, noise - brighter * (noise @ brighter) / (brighter @ brighter))
+    assert unrelated.slope == 0.0
+    assert learnt(brighter[:7], -brighter[:7]).slope == 0.0
+    assert learnt(np.zeros(40), noise).slope == 0.0
+    steep = Metering(-0.5, 0.3)
+    assert steep.gain(5.0) == steep.gain(0.3) < 1 < steep.gain(-0.3)
 
 
 @given(seed=st.integers(0, 1000))

@@ -32,7 +32,7 @@ def block_inputs(opened: TrainedRun, photographs: ReferenceViews) -> BlockInputs
         render_merged=lambda camera: render(opened.model, camera, depth=True),
         render_block=BlocksAlone(run, coarse).render,
         blocks=blocks_of(run),
-        exposure=exposures_of(opened.model.decoder, opened.capture),
+        exposure=exposures_of(opened.model, opened.capture),
     )
 
 

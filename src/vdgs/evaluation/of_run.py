@@ -35,8 +35,8 @@ EVALUATION_IMAGES_BYTES = 256_000_000
 
 #: How views are exposed, where exposures were fitted (`evaluation.exposures`).
 EXPOSED = {
-    "test": "in the exposure interpolated from the training photographs before and after (no pixel of a test view "
-    "is used)",
+    "test": "in the exposure interpolated from the training photographs before and after, corrected for what is "
+    "metered where that foretells these (no pixel of a test view is used)",
     "training": "in the exposure that was fitted to each",
 }
 
@@ -95,7 +95,7 @@ def measured_model(run: TrainedRun, views: Views) -> MeasuredModel:
         render_depth=lambda camera: render(run.model, camera, depth=True),
         camera_height=camera_height(run.capture),
         splats_of=lambda camera: decode_view(run.model, camera)[1],
-        exposure=exposures_of(run.model.decoder, run.capture),
+        exposure=exposures_of(run.model, run.capture),
     )
 
 

@@ -58,7 +58,7 @@ def loss_of(run: TrainedRun, pieces: Iterable[Gaussians], after_view: Callable[[
     """Draw `measured_views` with the model and with Gaussians, which are in the ground frame, and compare both with the
     photographs, in 8 bits as all metrics, and as `vdgs eval` in the exposure of each view where exposures were fitted:
     files hold neutral colours. Of the pieces only what those views show is kept in memory."""
-    views, exposure = measured_views(run), exposures_of(run.model.decoder, run.capture)
+    views, exposure = measured_views(run), exposures_of(run.model, run.capture)
     gaussians = _seen(pieces, [view.camera for view in views])
     visibility = visibility_map(coarse_of(run))
     names = [f"{figure}{whose}" for figure in ("squared_error", "ssim") for whose in ("", "_baked")]

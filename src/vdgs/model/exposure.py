@@ -11,6 +11,7 @@ it (`interpolated`). It is what test photographs are compared in.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -30,6 +31,32 @@ def exposure_of(departures: Float[Tensor, "images 3 4"], image: int) -> Float[Te
     return _neutral(departures) + departures[image] - departures.mean(0)
 
 
+class Neighbours(NamedTuple):
+    """The nearest photographs before and after a place of a flight, as rows (twice the same one at an end of the
+    flight), and how far from the first to the last the place lies, 0 to 1."""
+
+    first: int
+    last: int
+    share: float
+
+    def between(self, values: Float[Tensor, "images *shape"]) -> Float[Tensor, "*shape"]:
+        """The value at the place, linear between the two."""
+        return torch.lerp(values[self.first], values[self.last], self.share)
+
+
+def neighbours(images: Mapping[int, int], place: int, itself: bool = True) -> Neighbours | None:
+    """Those of a place among the photographs of a flight: `images` are rows by their places in it. A photograph that
+    stands there is its own unless not `itself`. None if even the nearest is more than `REACH` places away."""
+    others = images.keys() if itself else images.keys() - {place}
+    before = max((other for other in others if other <= place), default=None)
+    after = min((other for other in others if other >= place), default=None)
+    near = [other for other in (before, after) if other is not None]
+    if not near or min(abs(other - place) for other in near) > REACH:
+        return None
+    first, last = near[0], near[-1]
+    return Neighbours(images[first], images[last], (place - first) / (last - first) if last > first else 0.0)
+
+
 def interpolated(
     departures: Float[Tensor, "images 3 4"], images: Mapping[int, int], place: int
 ) -> Float[Tensor, "3 4"]:
@@ -39,14 +66,10 @@ def interpolated(
     Linear between the nearest before and the nearest after it; at an end of the flight, that of the nearest; the own
     one of a photograph that has one; neutral if even the nearest is more than `REACH` places away.
     """
-    before = max((other for other in images if other <= place), default=None)
-    after = min((other for other in images if other >= place), default=None)
-    near = [other for other in (before, after) if other is not None]
-    if not near or min(abs(other - place) for other in near) > REACH:
+    near = neighbours(images, place)
+    if near is None:
         return _neutral(departures)
-    first, last = near[0], near[-1]
-    share = (place - first) / (last - first) if last > first else 0.0
-    return torch.lerp(exposure_of(departures, images[first]), exposure_of(departures, images[last]), share)
+    return torch.lerp(exposure_of(departures, near.first), exposure_of(departures, near.last), near.share)
 
 
 def exposed(image: Float[Tensor, "h w 3"], exposure: Float[Tensor, "3 4"]) -> Float[Tensor, "h w 3"]:
