@@ -207,6 +207,10 @@ def test_the_law_of_metering_is_learnt_or_left(slope, seed):
     brighter = rng.normal(0, 0.2, 40)
     assert learnt(brighter, slope * brighter).slope == pytest.approx(np.clip(slope, -1, 0), abs=1e-6)
     assert learnt(brighter, slope * brighter).gain(0.0) == 1.0
+    alone, metered_too = learnt(brighter, slope * brighter).unforetold
+    assert alone == pytest.approx(abs(slope) * np.sqrt(np.mean(brighter**2)))
+    beyond = abs(slope - np.clip(slope, -1, 0))
+    assert metered_too == pytest.approx(beyond * np.sqrt(np.mean(brighter**2)), abs=1e-9)
     noise = rng.normal(0, 0.2, 40)
     unrelated = learnt(brighter, noise - brighter * (noise @ brighter) / (brighter @ brighter))
     assert unrelated.slope == 0.0

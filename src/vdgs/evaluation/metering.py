@@ -10,6 +10,7 @@ exposed, y = slope x. A camera that is set by hand has slope 0, one that makes a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,9 @@ class Metering:
     slope: float
     #: Brightness beyond what was learnt from counts as this much, either way.
     reach: float
+    #: By how much, as logarithms and in the root of the mean square, photographs are brighter than foretold by their
+    #: neighbours alone, and by what is metered as well, each by a law that was learnt without it. NaN without any law.
+    unforetold: tuple[float, float] = (math.nan, math.nan)
 
     def gain(self, brighter: float) -> float:
         """The factor on the exposure of a photograph whose view is brighter than between its neighbours, by the
@@ -59,8 +63,8 @@ def learnt(brighter: Float[np.ndarray, " n"], gains: Float[np.ndarray, " n"]) ->
     if len(gains) < LEAST_TAUGHT or squares.sum() <= squares.max() * (1 + 1e-9):
         return Metering(0.0, 0.0)
     without = np.clip((products.sum() - products) / (squares.sum() - squares), -1.0, 0.0)
-    left = float(np.square(gains - without * brighter).mean() / max(float(np.square(gains).mean()), 1e-12))
-    if left > LEAST_GAIN**2:
-        return Metering(0.0, 0.0)
+    alone, metered_too = (float(np.sqrt(np.square(error).mean())) for error in (gains, gains - without * brighter))
+    if metered_too > LEAST_GAIN * alone:
+        return Metering(0.0, 0.0, (alone, metered_too))
     slope = np.clip(products.sum() / squares.sum(), -1.0, 0.0)
-    return Metering(float(slope), float(np.abs(brighter).max()))
+    return Metering(float(slope), float(np.abs(brighter).max()), (alone, metered_too))

@@ -1,0 +1,35 @@
+"""How well the exposure of a photograph is foretold by its neighbours in the flight, and by what its camera metered.
+
+    python benchmarks/metering.py RUN
+
+RUN was trained with --exposure. Errors are those of photographs that the law was not learnt from, one left out after
+the other; all are training photographs, against the training photographs before and after them.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from machine import describe
+from vdgs.evaluation.exposures import exposures_of
+from vdgs.runs.opening import open_run
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", type=Path)
+    asked = parser.parse_args()
+    run = open_run(asked.run, "coarse")
+    exposures = exposures_of(run.model, run.capture)
+    if exposures is None:
+        raise SystemExit(f"{asked.run}: was trained without --exposure")
+    law = exposures.metering
+    print(describe())
+    print(f"{len(run.capture.train_views)} training photographs; errors of the logarithm of brightness:")
+    print(f"by neighbours alone {law.unforetold[0]:.4f}, by what is metered as well {law.unforetold[1]:.4f}")
+    print(f"a view that is 1 % brighter is exposed {law.slope:+.2f} %" if law.slope else "the law is not used")
+
+
+if __name__ == "__main__":
+    main()
