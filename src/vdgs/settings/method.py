@@ -205,9 +205,9 @@ class TrainConfig:
     """The loss."""
     exposure: bool = False
     """Fit a small colour model to each photograph: an affine map whose mean over all photographs is neutral. The scene
-    is drawn in neutral colours, and compared with a test photograph in the exposure that is interpolated from the
-    training photographs taken before and after it (no pixel of it is used). Blocks take it over as the coarse stage
-    leaves it (choice)."""
+    is drawn in neutral colours, and compared with a test photograph in the exposure that the training photographs
+    taken before and after it and what its camera meters foretell (no pixel of it is used). Blocks take it over as the
+    coarse stage leaves it (choice)."""
     seldom: SeldomConfig = field(default_factory=SeldomConfig)
     """Where few cameras look, here and in blocks."""
     compensation: CompensationConfig = field(default_factory=lambda: CompensationConfig(enabled=False))
