@@ -24,7 +24,7 @@ from vdgs.model.render import render
 
 #: Training photographs that the law of metering is learnt from at most, evenly chosen: each is drawn small, and so are
 #: its two neighbours.
-SAMPLE = 150
+SAMPLE = 64
 
 
 def exposures_of(model: AnchorModel, capture: Capture) -> Exposures | None:
