@@ -11,9 +11,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import numpy as np
+
 from machine import describe
 from vdgs.evaluation.exposures import exposures_of
 from vdgs.runs.opening import open_run
+
+#: What fitted exposures are compared on.
+GREY = 0.4
 
 
 def main() -> None:
@@ -25,8 +30,12 @@ def main() -> None:
     if exposures is None:
         raise SystemExit(f"{asked.run}: was trained without --exposure")
     law = exposures.metering
+    grey = np.stack([exposures(view).numpy() @ [GREY, GREY, GREY, 1.0] for view in run.capture.train_views])
     print(describe())
-    print(f"{len(run.capture.train_views)} training photographs; errors of the logarithm of brightness:")
+    print(
+        f"{len(grey)} training photographs, in which grey deviates by {np.log(grey.mean(1)).std():.1%}; errors of the"
+    )
+    print("logarithm of brightness:")
     print(f"by neighbours alone {law.unforetold[0]:.4f}, by what is metered as well {law.unforetold[1]:.4f}")
     print(f"a view that is 1 % brighter is exposed {law.slope:+.2f} %" if law.slope else "the law is not used")
 
