@@ -12,7 +12,7 @@ from vdgs.bench import bench
 from vdgs.bench.measure import evaluated
 from vdgs.bench.notes import notes_of
 from vdgs.bench.plan import Choices, make_plan
-from vdgs.bench.results import SOLIDITY
+from vdgs.bench.results import NEUTRAL, SOLIDITY
 from vdgs.bench.verdict import verdict
 from vdgs.errors import VdgsError
 from vdgs.evaluation import saving
@@ -55,7 +55,7 @@ def test_renders_of_our_own_measure_as_our_own(data, output, theirs):
     ours, foreign = both["baseline"], both["some-program-2"]
     quality = {
         name: value for name, value in ours.figures.items()
-        if name.startswith(("psnr", "ssim", "lpips")) and name not in SOLIDITY
+        if name.startswith(("psnr", "ssim", "lpips")) and name not in (*SOLIDITY, *NEUTRAL)
     }  # fmt: skip
     assert quality["psnr"]
     assert quality["psnr@0"]
@@ -63,6 +63,9 @@ def test_renders_of_our_own_measure_as_our_own(data, output, theirs):
     assert (foreign.groups, foreign.seen_by) == (ours.groups, ours.seen_by)
     for of_alpha in SOLIDITY:  # an opaque picture does not say
         assert foreign.figures[of_alpha] is None, of_alpha
+    for of_colours in NEUTRAL:  # nor what it would be in another exposure
+        assert ours.figures[of_colours] is not None, of_colours
+        assert foreign.figures[of_colours] is None, of_colours
     assert ours.figures["solid_share"] is not None
     for cost in ("anchors", "gaussians", "iterations", "seconds", "peak_memory_bytes", "fps"):
         assert foreign.figures.get(cost) is None, cost
