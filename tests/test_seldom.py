@@ -158,7 +158,7 @@ def test_points_fall_into_the_pixels_that_show_them_in_every_size_and_part():
     points = np.concatenate([rng.uniform(-3, 3, (50, 2)), rng.uniform(0, 1, (50, 1))], axis=1)
     pixels, depth = camera.project(points)
     rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    known = KnownDepths.of(Sightings(points, rays), camera, seldom())
+    known = KnownDepths.of(Sightings(points, rays, np.arange(len(points))), camera, seldom())
     for part in (camera, camera.resized(24, 20), camera.cropped(10, 5, 40, 30)):
         where, _ = part.project(points)
         inside = part.sees(points)
@@ -184,7 +184,7 @@ def seldom_stage(asked: SeldomConfig) -> Stage:
         given = replace(
             given,
             known_depths=[
-                KnownDepths.of(Sightings(points, _rays(points, camera)), camera, by)
+                KnownDepths.of(Sightings(points, _rays(points, camera), np.arange(len(points))), camera, by)
                 for points, camera in zip(shown, PHOTOGRAPHS.cameras, strict=True)
             ],
         )

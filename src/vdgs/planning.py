@@ -119,11 +119,11 @@ def _plan(capture: Capture, method: MethodConfig, asked: RunRequest) -> Plan:
     factors = sorted({factor for _, factor in (*config.resolutions, *method.block.resolutions)})
     with ImageCache(capture.train_views, image_budget(asked.watching), downscales=tuple(factors)) as images:
         stage, anchors = open_stage(capture, config, images, asked.device)
-        need = need_of(start(anchors, stage), stage)
+        need = need_of(start(anchors, stage, config.exposure), stage)
         timed = {}
         for factor in factors:
             at_size = replace(stage, config=replace(config, resolutions=((0.0, factor),)))
-            timed[factor] = _seconds_a_step(start(anchors, at_size), at_size)
+            timed[factor] = _seconds_a_step(start(anchors, at_size, config.exposure), at_size)
     camera = capture.train_views[0].camera
     blocks = choose_block_count(need.grown, views, camera.width * camera.height, method.partition, need.offsets)
     in_block = -(-need.grown // blocks)

@@ -223,5 +223,5 @@ def _view(photo: FoundView, options: CaptureOptions, ground: GroundFrame) -> Vie
         width, height = int(width / options.downscale), int(height / options.downscale)
         camera = camera.resized(width, height)
     seen = photo.view.sightings
-    sightings = None if seen is None else Sightings(ground.to_ground(seen.points), seen.rays)
+    sightings = None if seen is None else Sightings(ground.to_ground(seen.points), seen.rays, seen.numbers)
     return View(photo.view.name, camera, photo.file.path, photo.file.mask, "train", sightings)

@@ -15,10 +15,11 @@ from vdgs.cameras import Camera
 @dataclass(frozen=True, eq=False)
 class Sightings:
     """Points [m, 3] that a photograph shows, in the world of its camera, and where it shows them: x/z and y/z of the
-    camera's rays [m, 2]. All float64."""
+    camera's rays [m, 2], all float64; and their numbers [m] int64, the same in all photographs of a capture."""
 
     points: np.ndarray
     rays: np.ndarray
+    numbers: np.ndarray
 
     def errors_px(self, camera: Camera) -> np.ndarray:
         """Reprojection errors [m] in pixels of a pinhole camera in the same world; infinite behind it."""

@@ -35,6 +35,7 @@ SINCE: dict[str, dict[str, Any]] = {
         "compensation": {"added_to": "mean"},
         "rates": {"exposure": [0.001, 1e-4]},
         "exposure": False,
+        "exposure_spread": 0.0,
         "seldom": {"quantile": 0.5, "drop": 0.0, "depth_weight": 0.0, "smooth_weight": 0.0},
     },
     "assignment": {"best_block": True},

@@ -208,6 +208,10 @@ class TrainConfig:
     is drawn in neutral colours, and compared with a test photograph in the exposure that the training photographs
     taken before and after it and what its camera meters foretell (no pixel of it is used). Blocks take it over as the
     coarse stage leaves it (choice)."""
+    exposure_spread: Annotated[float, Range(0, 1)] = 0.0
+    """Fit exposures only where photographs differ in brightness by at least this share of it, by the colours of the
+    sparse points that several show: what is fitted to photographs of one exposure costs quality where few cameras look
+    (choice). At 0, and in a capture that does not say which photograph shows which point, they are always fitted."""
     seldom: SeldomConfig = field(default_factory=SeldomConfig)
     """Where few cameras look, here and in blocks."""
     compensation: CompensationConfig = field(default_factory=lambda: CompensationConfig(enabled=False))

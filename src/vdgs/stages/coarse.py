@@ -5,10 +5,12 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
+import numpy as np
 import torch
 from rich.console import Console
 
 from vdgs import __version__
+from vdgs.captures.brightness import deviation, gains_of
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import capture_facts
 from vdgs.captures.heights import camera_height
@@ -63,11 +65,15 @@ def _train(
     run: RunFolder, capture: Capture, config: TrainConfig, options: WatchOptions, console: Console, device: torch.device
 ) -> None:
     folder = run.coarse
-    factors = tuple(sorted({factor for _, factor in config.resolutions}))
+    factors = tuple(sorted({1, *(factor for _, factor in config.resolutions)}))  # stereo looks at them in full
     with ImageCache(capture.train_views, image_budget(options), downscales=factors) as images:
         dense = _dense_points(run, capture, images, config, console)
         stage, anchors = open_stage(capture, config, images, device, dense)
-        state = continue_or_start(folder, stage, lambda: start(anchors, stage), console)
+
+        def fitted() -> bool:
+            return config.exposure and _exposures_differ(capture, images, config.exposure_spread, console)
+
+        state = continue_or_start(folder, stage, lambda: start(anchors, stage, fitted()), console)
         _announce(capture, state, config, console)
         train_watched(folder, state, stage, options, console)
     facts = {
@@ -99,6 +105,25 @@ def _dense_points(
     return dense
 
 
+def _exposures_differ(capture: Capture, images: ImageCache, spread: float, console: Console) -> bool:
+    """Whether photographs differ in brightness by at least so much, or may for all that the capture tells; says so."""
+
+    def read(index: int) -> np.ndarray:
+        stop_if_asked()
+        return images.get(index).image.numpy()
+
+    if not spread:
+        return True
+    with console.status("comparing the photographs' brightness"):
+        gains = gains_of(capture.train_views, read)
+    if gains is None:
+        return True
+    found = deviation(gains)
+    said = "one is fitted to each photograph" if found >= spread else f"less than {spread:.1%}, so none is fitted"
+    console.print(f"exposure: the photographs differ in brightness by {found:.1%}; {said}", highlight=False)
+    return found >= spread
+
+
 def open_stage(
     capture: Capture,
     config: TrainConfig,
@@ -126,14 +151,14 @@ def open_stage(
     return stage, anchors
 
 
-def start(anchors: Anchors, stage: Stage) -> TrainingState:
-    """The state before the first step."""
+def start(anchors: Anchors, stage: Stage, exposures: bool) -> TrainingState:
+    """The state before the first step, in which photographs have exposures to be fitted or have none."""
     config = stage.config
     generator = torch.Generator().manual_seed(config.seed)
     decoder = Decoder.initial(
         config.anchors.offsets, config.anchors.distance, config.anchors.appearance, stage.image_count, generator
     )
-    if config.exposure:
+    if exposures:
         decoder = replace(decoder, exposure=neutral_exposures(stage.image_count))
     return start_state(anchors.to(stage.device), decoder.to(stage.device), stage)
 

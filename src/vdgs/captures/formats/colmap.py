@@ -141,7 +141,7 @@ def _sightings(record: ImageRecord, points: Points, intrinsics: Intrinsics) -> S
     rays = rays_of(intrinsics, pixels)
     known = (points.numbers[places] == numbers) & np.isfinite(rays).all(axis=1)
     known &= np.isfinite(points.positions[places]).all(axis=1)
-    return Sightings(points.positions[places[known]], rays[known]) if known.any() else None
+    return Sightings(points.positions[places[known]], rays[known], numbers[known]) if known.any() else None
 
 
 def _pose(record: ImageRecord, file: Path) -> np.ndarray:

@@ -11,8 +11,9 @@ import numpy as np
 from vdgs.captures.formats.source import Intrinsics, check_intrinsics
 from vdgs.errors import CaptureError
 
-#: So many of the points that a photograph shows are remembered: enough to see whether cameras and points agree.
-SIGHTINGS = 200
+#: So many of the points that a photograph shows are remembered: enough to see whether cameras and points agree, and
+#: whether photographs are equally bright.
+SIGHTINGS = 400
 
 
 class Points(NamedTuple):
@@ -38,10 +39,19 @@ class ImageRecord:
 
 
 def some_of(numbers: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At most `SIGHTINGS` of an image's points that are points of the model, spread over all of them; copies."""
+    """At most `SIGHTINGS` of an image's points that are points of the model, at random; copies. A point that one image
+    remembers is likely to be remembered by others that show it: chance depends on its number alone."""
     matched = np.flatnonzero((numbers >= 0) & np.isfinite(pixels).all(axis=1))
-    few = matched[np.unique(np.linspace(0, len(matched) - 1, min(SIGHTINGS, len(matched))).round().astype(int))]
+    few = np.sort(matched[np.argsort(_chance(numbers[matched]), kind="stable")[:SIGHTINGS]])
     return numbers[few], pixels[few]
+
+
+def _chance(numbers: np.ndarray) -> np.ndarray:
+    """A number at random for each, uint64: the finaliser of splitmix64 (Steele et al. 2014)."""
+    mixed = numbers.astype(np.int64).view(np.uint64).copy()
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
+    return mixed ^ (mixed >> np.uint64(31))
 
 
 def add_camera(cameras: dict[int, Intrinsics], identifier: int, intrinsics: Intrinsics, file: Path) -> None:
