@@ -18,6 +18,7 @@ CHANGED = {
     "adam": replace(PLAIN, training=replace(PLAIN.training, adam="dense")),
     "stereo": replace(PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, stereo=True))),
     "exposure": replace(PLAIN, training=replace(PLAIN.training, exposure=True)),
+    "spread": replace(PLAIN, training=replace(PLAIN.training, exposure_spread=0.1)),
     "drop": replace(PLAIN, training=replace(PLAIN.training, seldom=replace(PLAIN.training.seldom, drop=0.1))),
     "bound": replace(
         PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, bound_sizes=False))
@@ -33,10 +34,10 @@ def keys(method: MethodConfig):
 def test_runs_of_before_have_their_keys(preset):
     """As settings were recorded before these came."""
     training = PRESETS[preset].training
-    without = replace(training, exposure=False, anchors=replace(training.anchors, stereo=False))
+    without = replace(training, exposure=False, exposure_spread=0.0, anchors=replace(training.anchors, stereo=False))
     now = to_dict(replace(PRESETS[preset], training=without)) | CAPTURE
     before = to_dict(replace(PRESETS[preset], training=without)) | CAPTURE
-    for name in ("adam", "exposure", "seldom"):
+    for name in ("adam", "exposure", "exposure_spread", "seldom"):
         del before["training"][name]
     del before["training"]["anchors"]["bound_sizes"]
     del before["training"]["anchors"]["stereo"]

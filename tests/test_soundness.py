@@ -15,6 +15,7 @@ from rich.console import Console
 from captures_support import TinyScene, look_down, moved, tiny_scene, write_colmap, write_images, write_ply
 from cli_support import vdgs
 from vdgs.captures.checks import check_images
+from vdgs.captures.formats.colmap_records import SIGHTINGS
 from vdgs.captures.loading import load_capture
 from vdgs.captures.precision import rounding_of
 from vdgs.errors import CaptureError
@@ -65,7 +66,7 @@ def test_a_true_capture_reprojects_onto_itself(tmp_path, scene, text, model, ext
     write_colmap(tmp_path, scene, text=text, model=model, extra=extra, tracks=True)
     found = judge(load_capture(tmp_path))
     assert found.reprojection_px == pytest.approx(0, abs=1e-6)
-    assert found.sightings == sum(min(200, camera.sees(scene.points).sum()) for camera in scene.cameras.values())
+    assert found.sightings == sum(min(SIGHTINGS, camera.sees(scene.points).sum()) for camera in scene.cameras.values())
     assert not found.problems
     assert not found.warnings
 

@@ -24,6 +24,8 @@ LEAST_LIGHT = 4.0
 #: Weighs a gain of nothing as so many points do (choice): what a point looks like changes a little with the distance
 #: that it is seen from, and over a long chain of photographs that adds up to gains which no camera made.
 NEUTRAL_POINTS = 10.0
+#: So many times each photograph's gain is moved by the median of what its points leave.
+MEDIANS = 5
 
 
 def gains_of(views: Sequence[View], read: Callable[[int], np.ndarray]) -> Float[np.ndarray, "n 3"] | None:
@@ -63,7 +65,7 @@ def _seen(view: View, picture: np.ndarray) -> tuple[Int64[np.ndarray, " m"], Flo
 
 def _fitted(numbers: Sequence[np.ndarray], colours: Sequence[np.ndarray]) -> Float[np.ndarray, "n 3"]:
     """Gains of photographs, 0 in the mean of those with points, from logarithms of colours of points: by least squares,
-    then by the median of what is left, which heeds no point that something moving hides."""
+    then by medians of what is left, which heed no point that something moving hides."""
     much = np.array([len(each) for each in numbers])
     image, values = np.repeat(np.arange(len(much)), much), np.concatenate(list(colours))
     _, point = np.unique(np.concatenate(list(numbers)), return_inverse=True)
@@ -82,8 +84,9 @@ def _fitted(numbers: Sequence[np.ndarray], colours: Sequence[np.ndarray]) -> Flo
     wanted = np.stack([np.bincount(image, column, len(much)) for column in from_points.T], axis=1)
     operator = LinearOperator((len(much), len(much)), matvec=normal, dtype=np.float64)
     gains = np.stack([cg(operator, column)[0] for column in wanted.T], axis=1)
-    left = from_points - gains[image] + ((sees @ gains) / often)[point]
-    for index, rows in enumerate(np.split(left, np.cumsum(much)[:-1])):
-        gains[index] += np.median(rows, axis=0) if len(rows) else 0.0
+    for _ in range(MEDIANS):
+        left = from_points - gains[image] + ((sees @ gains) / often)[point]
+        for index, rows in enumerate(np.split(left, np.cumsum(much)[:-1])):
+            gains[index] += np.median(rows, axis=0) if len(rows) else 0.0
     centred: np.ndarray = gains - gains[much > 0].mean(axis=0)
     return centred
