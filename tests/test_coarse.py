@@ -98,6 +98,13 @@ def test_what_stereo_found_is_kept_and_looked_for_once(tmp_path):
     assert np.array_equal(read_tensors(file)[0]["points"].numpy(), found)
 
 
+def test_stereo_looks_at_photographs_in_full_whatever_size_they_are_trained_at(tmp_path):
+    write_colmap(tmp_path / "capture", tiny_scene(points=60))
+    done = finish(tmp_path / "capture", tmp_path / "run", "--iterations", "5", "--resolutions", "0", "2")
+    assert done.returncode == 0, done.stderr
+    assert "stereo: 62 points" in done.stdout
+
+
 def test_many_sparse_points_need_no_stereo(unbroken):
     assert len(read_tensors(unbroken / "coarse/stereo.safetensors")[0]["points"]) == 0
 

@@ -15,7 +15,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import LinearOperator, cg
 
 from vdgs.captures.capture import View
+from vdgs.captures.images import ImageCache
 
+#: Photographs are looked at in the smallest size that training has of them with so many pixels along the longest side.
+LONGEST_SIDE_PX = 256
 #: Photographs are blurred by this share of their longest side, and by half a pixel at least: points are not found to
 #: the pixel, and edges fall on either side.
 BLUR = 0.006
@@ -26,6 +29,22 @@ LEAST_LIGHT = 4.0
 NEUTRAL_POINTS = 10.0
 #: So many times each photograph's gain is moved by the median of what its points leave.
 MEDIANS = 5
+
+
+def difference(images: ImageCache, before_each: Callable[[], object]) -> float | None:
+    """By how much the photographs of a cache differ in brightness (`deviation`); None where no points tell.
+
+    `before_each` is called before each of them is looked at.
+    """
+    side = max(max(view.camera.width, view.camera.height) for view in images.views)
+    factor = max((each for each in images.downscales if side / each >= LONGEST_SIDE_PX), default=min(images.downscales))
+
+    def read(index: int) -> np.ndarray:
+        before_each()
+        return images.get(index, factor).image.numpy()
+
+    gains = gains_of(images.views, read)
+    return None if gains is None else deviation(gains)
 
 
 def gains_of(views: Sequence[View], read: Callable[[int], np.ndarray]) -> Float[np.ndarray, "n 3"] | None:

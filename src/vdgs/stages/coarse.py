@@ -5,12 +5,11 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
-import numpy as np
 import torch
 from rich.console import Console
 
 from vdgs import __version__
-from vdgs.captures.brightness import deviation, gains_of
+from vdgs.captures.brightness import difference
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import capture_facts
 from vdgs.captures.heights import camera_height
@@ -65,13 +64,13 @@ def _train(
     run: RunFolder, capture: Capture, config: TrainConfig, options: WatchOptions, console: Console, device: torch.device
 ) -> None:
     folder = run.coarse
-    factors = tuple(sorted({1, *(factor for _, factor in config.resolutions)}))  # stereo looks at them in full
+    factors = tuple(sorted({1, *(factor for _, factor in config.resolutions)}))  # 1: stereo sees them in full
     with ImageCache(capture.train_views, image_budget(options), downscales=factors) as images:
         dense = _dense_points(run, capture, images, config, console)
         stage, anchors = open_stage(capture, config, images, device, dense)
 
         def fitted() -> bool:
-            return config.exposure and _exposures_differ(capture, images, config.exposure_spread, console)
+            return config.exposure and _exposures_differ(images, config.exposure_spread, console)
 
         state = continue_or_start(folder, stage, lambda: start(anchors, stage, fitted()), console)
         _announce(capture, state, config, console)
@@ -105,20 +104,14 @@ def _dense_points(
     return dense
 
 
-def _exposures_differ(capture: Capture, images: ImageCache, spread: float, console: Console) -> bool:
+def _exposures_differ(images: ImageCache, spread: float, console: Console) -> bool:
     """Whether photographs differ in brightness by at least so much, or may for all that the capture tells; says so."""
-
-    def read(index: int) -> np.ndarray:
-        stop_if_asked()
-        return images.get(index).image.numpy()
-
     if not spread:
         return True
     with console.status("comparing the photographs' brightness"):
-        gains = gains_of(capture.train_views, read)
-    if gains is None:
+        found = difference(images, stop_if_asked)
+    if found is None:
         return True
-    found = deviation(gains)
     said = "one is fitted to each photograph" if found >= spread else f"less than {spread:.1%}, so none is fitted"
     console.print(f"exposure: the photographs differ in brightness by {found:.1%}; {said}", highlight=False)
     return found >= spread
