@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from machine import describe
-from vdgs.captures.brightness import deviation, gains_of
-from vdgs.captures.images import load_picture
+from vdgs.captures.brightness import point_colours
+from vdgs.captures.images import ImageCache
 from vdgs.captures.loading import load_capture
 from vdgs.settings.capture import CaptureOptions
 
@@ -25,16 +25,21 @@ def main() -> None:
     parser.add_argument("capture", type=Path)
     parser.add_argument("--images", default="images")
     asked = parser.parse_args()
-    views = load_capture(asked.capture, CaptureOptions(images=asked.images)).views
+    views = load_capture(asked.capture, CaptureOptions(images=asked.images)).train_views
     began = time.monotonic()
-    gains = gains_of(views, lambda index: load_picture(views[index]).image.numpy())
-    if gains is None:
-        raise SystemExit(f"{asked.capture}: does not say which photograph shows which point")
+    with ImageCache(views, 0) as images:
+        colours = point_colours(images, lambda _done, _of: None)
+    if colours is None:
+        raise SystemExit(f"{asked.capture}: does not say which photographs show the same points")
+    gains = np.full((len(views), 3), np.nan)
+    for index, gain in colours.gains().items():
+        gains[index] = gain
     foretold = (gains[:-2] + gains[2:]) / 2
     print(describe())
     print(
-        f"{len(gains)} photographs differ by {deviation(gains):.2%} ({words(gains)} in red, green, blue), "
-        f"from the mean of their neighbours by {words(gains[1:-1] - foretold)}; {time.monotonic() - began:.1f} s"
+        f"{len(gains)} training photographs: of the same places differ by {colours.difference():.2%}, all by "
+        f"{words(gains)} (red, green, blue), from the mean of their neighbours by {words(gains[1:-1] - foretold)}; "
+        f"{time.monotonic() - began:.1f} s"
     )
 
 

@@ -18,7 +18,7 @@ CHANGED = {
     "adam": replace(PLAIN, training=replace(PLAIN.training, adam="dense")),
     "stereo": replace(PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, stereo=True))),
     "exposure": replace(PLAIN, training=replace(PLAIN.training, exposure=True)),
-    "spread": replace(PLAIN, training=replace(PLAIN.training, exposure_spread=0.1)),
+    "spread": replace(PLAIN, training=replace(PLAIN.training, exposure=True, exposure_spread=0.1)),
     "drop": replace(PLAIN, training=replace(PLAIN.training, seldom=replace(PLAIN.training.seldom, drop=0.1))),
     "bound": replace(
         PLAIN, training=replace(PLAIN.training, anchors=replace(PLAIN.training.anchors, bound_sizes=False))
@@ -65,3 +65,9 @@ def test_settings_of_blocks_and_assignment_leave_what_is_before_them():
     changed = keys(replace(PLAIN, assignment=replace(PLAIN.assignment, best_block=False)))
     assert changed.partition == plain.partition
     assert changed.assignment != plain.assignment
+
+
+def test_a_setting_counts_only_beside_the_one_that_it_needs():
+    alone = replace(PLAIN, training=replace(PLAIN.training, exposure_spread=0.1))
+    assert keys(alone) == keys(PLAIN)
+    assert keys(CHANGED["spread"]).coarse != keys(CHANGED["exposure"]).coarse

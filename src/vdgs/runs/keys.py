@@ -49,6 +49,8 @@ SINCE: dict[str, dict[str, Any]] = {
         "compensation": {"added_to": "mean"},
     },
 }
+#: Settings that do nothing without another.
+NEEDS = {("training", "exposure_spread"): "exposure"}
 
 
 @dataclass(frozen=True)
@@ -76,8 +78,10 @@ def stage_keys(settings: dict[str, Any], coarse_model: str | None = None) -> Sta
 
 
 def counted(section: str, settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings of a section that keys are made of: a setting that came later counts only where it changes a run."""
-    own = {name: value for name, value in settings.items() if (section, name) != ("capture", "path")}
+    """The settings of a section that keys are made of: a setting that came later, or that needs another, counts only
+    where it changes a run."""
+    idle = {("capture", "path"), *(each for each, needed in NEEDS.items() if not settings.get(needed))}
+    own = {name: value for name, value in settings.items() if (section, name) not in idle}
     return _changed(own, SINCE.get(section, {}))
 
 

@@ -209,9 +209,10 @@ class TrainConfig:
     taken before and after it and what its camera meters foretell (no pixel of it is used). Blocks take it over as the
     coarse stage leaves it (choice)."""
     exposure_spread: Annotated[float, Range(0, 1)] = 0.0
-    """Fit exposures only where photographs differ in brightness by at least this share of it, by the colours of the
-    sparse points that several show: what is fitted to photographs of one exposure costs quality where few cameras look
-    (choice). At 0, and in a capture that does not say which photograph shows which point, they are always fitted."""
+    """Fit exposures only where photographs of the same places differ in brightness by at least this share of it, by the
+    colours of the sparse points that several show: where photographs have one exposure, fitting some gains nothing and
+    may cost (choice). At 0, and in a capture that does not say which photograph shows which point, they are always
+    fitted."""
     seldom: SeldomConfig = field(default_factory=SeldomConfig)
     """Where few cameras look, here and in blocks."""
     compensation: CompensationConfig = field(default_factory=lambda: CompensationConfig(enabled=False))

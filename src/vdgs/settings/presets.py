@@ -50,7 +50,7 @@ PRESETS: dict[str, MethodConfig] = {
             iterations=0,
             anchors=AnchorConfig(stereo=True),
             exposure=True,
-            exposure_spread=0.025,
+            exposure_spread=0.015,
             resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
             rates=RateConfig(offsets=(0.02, 2e-4), features=(0.015, 0.015), log_scales=(0.014, 0.014)),
             early=3.0,

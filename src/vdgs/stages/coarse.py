@@ -9,7 +9,7 @@ import torch
 from rich.console import Console
 
 from vdgs import __version__
-from vdgs.captures.brightness import difference
+from vdgs.captures.brightness import point_colours
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import capture_facts
 from vdgs.captures.heights import camera_height
@@ -108,12 +108,25 @@ def _exposures_differ(images: ImageCache, spread: float, console: Console) -> bo
     """Whether photographs differ in brightness by at least so much, or may for all that the capture tells; says so."""
     if not spread:
         return True
-    with console.status("comparing the photographs' brightness"):
-        found = difference(images, stop_if_asked)
-    if found is None:
+    wait = console.status("comparing the photographs' brightness")
+
+    def tell(done: int, of: int) -> None:
+        stop_if_asked()
+        wait.update(f"comparing the photographs' brightness, {done / of:.0%}")
+
+    with wait:
+        colours = point_colours(images, tell)
+    if colours is None:
+        console.print(
+            "exposure: one is fitted to each photograph; whether they differ in brightness is not known, for the "
+            "capture does not say which of them show the same points", highlight=False,
+        )  # fmt: skip
         return True
-    said = "one is fitted to each photograph" if found >= spread else f"less than {spread:.1%}, so none is fitted"
-    console.print(f"exposure: the photographs differ in brightness by {found:.1%}; {said}", highlight=False)
+    found = colours.difference()
+    said = "one is fitted to each" if found >= spread else f"less than {spread:.2%}, so none is fitted"
+    console.print(
+        f"exposure: photographs of the same places differ in brightness by {found:.2%}; {said}", highlight=False
+    )
     return found >= spread
 
 

@@ -41,14 +41,14 @@ class ImageRecord:
 def some_of(numbers: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """At most `SIGHTINGS` of an image's points that are points of the model, at random; copies. A point that one image
     remembers is likely to be remembered by others that show it: chance depends on its number alone."""
-    matched = np.flatnonzero((numbers >= 0) & np.isfinite(pixels).all(axis=1))
-    few = np.sort(matched[np.argsort(_chance(numbers[matched]), kind="stable")[:SIGHTINGS]])
-    return numbers[few], pixels[few]
+    matched = np.flatnonzero((numbers >= 0) & (numbers < 2**63) & np.isfinite(pixels).all(axis=1))
+    few = np.sort(matched[np.argsort(_chance(numbers[matched].astype(np.int64)), kind="stable")[:SIGHTINGS]])
+    return numbers[few].astype(np.int64), pixels[few]
 
 
 def _chance(numbers: np.ndarray) -> np.ndarray:
     """A number at random for each, uint64: the finaliser of splitmix64 (Steele et al. 2014)."""
-    mixed = numbers.astype(np.int64).view(np.uint64).copy()
+    mixed = numbers.view(np.uint64).copy()
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
     return mixed ^ (mixed >> np.uint64(31))
