@@ -259,7 +259,8 @@ def _record_of(run: RunFolder, name: str, lpips_weights: Path | None, bins: int)
 
 
 def _exposed(run: RunFolder) -> str | None:
-    """How views are exposed; None in neutral colours, in which earlier versions measured all."""
+    """How views are exposed, if training fitted exposures; None in neutral colours, in which earlier versions measured
+    all."""
     return "interpolated and metered" if run.method().training.exposure else None
 
 
