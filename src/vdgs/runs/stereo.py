@@ -31,10 +31,10 @@ FILE = "stereo.safetensors"
 #: Edge of the cells that get a point each, in voxels and in pixels of the photographs as they are used: the larger of
 #: the two, and two, four or eight times that where pixels are so much larger than below the flight (choice). An anchor
 #: has ten Gaussians; growth makes more where that is too few.
-CELL_VOXELS, CELL_PX = 1.4, 3.5
+CELL_VOXELS, CELL_PX = 1.2, 3.0
 #: Photographs are to have so many pixels for each point that anchors start from, sparse and dense together: more
 #: anchors than that cost time and are learnt by heart (choice; docs/findings.md). Seldom seen places come first.
-PIXELS_A_POINT = 250
+PIXELS_A_POINT = 180
 
 
 def points_of_run(run: RunFolder, config: AnchorConfig) -> DensePoints | None:
