@@ -20,7 +20,7 @@ from vdgs.captures.images import ImageCache, Picture, shrink
 
 #: So many photographs are looked at, evenly taken.
 AT_MOST = 500
-#: They are looked at with so many pixels along their longest side, or as small as training has them with no fewer.
+#: They are looked at with so many pixels along their longest side, or fewer where they have fewer.
 LONGEST_SIDE_PX = 512
 #: They are blurred by this share of it, and by half a pixel at least: points are not found to the pixel, and edges fall
 #: on either side.
