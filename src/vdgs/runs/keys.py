@@ -50,7 +50,7 @@ SINCE: dict[str, dict[str, Any]] = {
     },
 }
 #: Settings that do nothing without another.
-NEEDS = {("training", "exposure_spread"): "exposure"}
+NEEDS: dict[tuple[str, ...], str] = {("training", "exposure_spread"): "exposure"}
 
 
 @dataclass(frozen=True)
