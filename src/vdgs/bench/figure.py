@@ -25,6 +25,8 @@ LINES = ("-", "--", ":")
 #: In the title of a panel.
 WHICH_V = {"truth": "true V", "model": "V by a coarse model"}
 PANEL_WIDTH, PANEL_HEIGHT = 4.4, 3.6
+#: Inches in the legend: a line with its marker and the space beside it, and a letter of 9 points on average.
+HANDLE_WIDTH, LETTER_WIDTH = 0.65, 0.075
 
 
 def draw_groups(file: Path, plan: Plan, results: Sequence[Result]) -> bool:
@@ -32,10 +34,10 @@ def draw_groups(file: Path, plan: Plan, results: Sequence[Result]) -> bool:
     scenes = [scene for scene in plan.scenes if any(r.groups for r in results if r.scene == scene.name)]
     if not scenes:
         return False
-    rows = -(-len(plan.methods) // 3)
-    legend = 0.3 * rows + 0.25
-    width, height = 0.4 + (PANEL_WIDTH + 0.75) * len(scenes), PANEL_HEIGHT + 2.2 + legend
-    width = max(width, 7.5)
+    width = max(0.4 + (PANEL_WIDTH + 0.75) * len(scenes), 7.5)
+    columns = _columns([method.title for method in plan.methods], width - 0.75)
+    legend = 0.3 * -(-len(plan.methods) // columns) + 0.25
+    height = PANEL_HEIGHT + 2.2 + legend
     figure = Figure(figsize=(width, height), dpi=DPI)
     canvas = FigureCanvasAgg(figure)
     panel = (width - 0.4) / len(scenes) - 0.75
@@ -44,13 +46,18 @@ def draw_groups(file: Path, plan: Plan, results: Sequence[Result]) -> bool:
         axes = figure.add_axes((left / width, (0.7 + legend) / height, panel / width, PANEL_HEIGHT / height))
         _panel(axes, plan, [each for each in results if each.scene == scene.name], scene.title, index == 0)
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower left", bbox_to_anchor=(0.75 / width, 0.1 / height), ncols=3,
+    figure.legend(handles, labels, loc="lower left", bbox_to_anchor=(0.75 / width, 0.1 / height), ncols=columns,
                   frameon=False, fontsize=9)  # fmt: skip
     bars = "bars: standard deviation over seeds" if len(plan.seeds) > 1 else "one seed"
     titles(figure, plan.table.title, "PSNR by how many training cameras see the place (raw, dB)",
            f"the same pixels for every method; {bars}")  # fmt: skip
     canvas.print_png(file)  # type: ignore[arg-type]
     return True
+
+
+def _columns(labels: Sequence[str], width: float) -> int:
+    """Up to three columns of a legend, as many as its labels leave room for in so many inches."""
+    return min(3, max(1, int(width / (HANDLE_WIDTH + LETTER_WIDTH * max(map(len, labels))))))
 
 
 def _panel(axes: Axes, plan: Plan, results: Sequence[Result], title: str, first: bool) -> None:
