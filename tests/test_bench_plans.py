@@ -85,6 +85,20 @@ def test_the_ablations_change_what_they_are_named_after():
     }  # fmt: skip
 
 
+def test_more_anchors_by_plain_growth_differ_from_it_in_the_threshold_alone():
+    scene = SCENES["regime-uneven"]
+    base = scene.base(scene.budget, 0)
+    settings = {name: to_dict(METHODS[name].settings(base, scene.budget)) for name in TABLES["more-anchors"].methods}
+    threshold = base.training.growth.threshold
+    assert base.block.growth.threshold == threshold
+    for factor in (0.5, 0.25):
+        line = f"growth.threshold: {threshold} -> {factor * threshold}"
+        eager = f"threshold-{factor:g}"
+        assert differences(settings["cell-1-off"], settings[f"cell-1-{eager}"]) == [f"block.{line}"]
+        assert differences(settings["coarse"], settings[f"coarse-{eager}"]) == [f"training.{line}"]
+    assert not settings["cell-1-off"]["block"]["compensation"]["enabled"]
+
+
 def test_blocks_as_printed_take_back_what_the_laptop_changes():
     scene = SCENES["lab-uneven"]
     base = scene.base(scene.budget, 0)

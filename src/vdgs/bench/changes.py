@@ -167,6 +167,28 @@ def factorial(lambda_vis: float, added_to: Literal["mean", "sum"] | None, t_low:
     return change
 
 
+def eager(change: Change, factor: float) -> Change:
+    """A method whose blocks grow at `factor` times the threshold: where it is below 1, more anchors than plain growth,
+    and so a measure of whether compensation is more than that."""
+
+    def grown(config: MethodConfig, budget: Budget) -> MethodConfig:
+        changed = change(config, budget)
+        growth = replace(changed.block.growth, threshold=factor * changed.block.growth.threshold)
+        return replace(changed, block=replace(changed.block, growth=growth))
+
+    return grown
+
+
+def eager_coarse(factor: float) -> Change:
+    """The coarse stage alone, plainly grown at `factor` times the threshold."""
+
+    def change(config: MethodConfig, _budget: Budget) -> MethodConfig:
+        growth = replace(config.training.growth, threshold=factor * config.training.growth.threshold)
+        return replace(config, training=replace(config.training, growth=growth))
+
+    return change
+
+
 def with_lambda_vis(value: float) -> Change:
     return lambda config, _: replace(config, partition=replace(config.partition, lambda_vis=value))
 

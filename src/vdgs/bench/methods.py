@@ -18,6 +18,8 @@ from vdgs.bench.changes import (
     coarse_as_long,
     coarse_compensated,
     densely,
+    eager,
+    eager_coarse,
     explicit_gaussians,
     factorial,
     full,
@@ -259,12 +261,35 @@ _FACTORIAL = [
     for t_low in (FACTORIAL_T_LOW if added_to else FACTORIAL_T_LOW[:1])
 ]
 
+#: Of the threshold of growth: plain growth then makes as many anchors as compensated growth, or more.
+EAGER = (0.5, 0.25)
+_EAGER = [
+    *(
+        Method(
+            f"coarse-threshold-{factor:g}", f"coarse stage, plain growth at {factor:g} of the threshold",
+            eager_coarse(factor), COARSE_ONLY, less="iterations of the coarse stage only",
+            differs="to be read against `coarse`",
+        )
+        for factor in EAGER
+    ),
+    *(
+        Method(
+            f"cell-1-threshold-{factor:g}", f"λ_vis = 1, plain growth at {factor:g} of the threshold",
+            eager(factorial(1.0, None, FACTORIAL_T_LOW[0]), factor),
+            differs=f"each block has the {FACTORIAL_CAMERAS} cameras that show it best: read it against `cell-1-off`",
+        )
+        for factor in EAGER
+    ),
+]  # fmt: skip
+
 #: The cells of the factorial.
 FACTORIAL = tuple(method.name for method in _FACTORIAL)
 #: Every method by name.
 METHODS: dict[str, Method] = {
     method.name: method
-    for method in (
-        _ABLATIONS + _OTHERS + _BLOCKS + _EACH_AS_LONG + _COARSE_COMPENSATED + _LONGER + _CHOICES + _SWEEPS + _FACTORIAL
+    for group in (
+        _ABLATIONS, _OTHERS, _BLOCKS, _EACH_AS_LONG, _COARSE_COMPENSATED, _LONGER, _CHOICES, _SWEEPS, _FACTORIAL,
+        _EAGER,
     )
-}
+    for method in group
+}  # fmt: skip

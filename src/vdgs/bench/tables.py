@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vdgs.bench.definitions import Group, Table
-from vdgs.bench.methods import BETA_G, BLOCKS, FACTORIAL, GAMMA, LAMBDA_VIS, T_LOW
+from vdgs.bench.methods import BETA_G, BLOCKS, EAGER, FACTORIAL, GAMMA, LAMBDA_VIS, T_LOW
 
 LAB = ("lab-uneven", "lab-distant", "lab-even")
 #: Where the paper's premise holds.
@@ -21,6 +21,17 @@ _SWEEPS = (
     _sweep("(c) compensation scale β_g", "beta-g", BETA_G),
     _sweep("(d) decay factor γ", "gamma", GAMMA),
 )
+_MORE_ANCHORS = (
+    Group(
+        "four blocks",
+        ("cell-1-off", "cell-1-sum-0.2", "cell-1-mean-0.2", *(f"cell-1-threshold-{factor:g}" for factor in EAGER)),
+    ),
+    Group(
+        "coarse stage alone",
+        ("coarse", "coarse-compensated-sum", "coarse-compensated-mean",
+         *(f"coarse-threshold-{factor:g}" for factor in EAGER)),
+    ),
+)  # fmt: skip
 _ABLATION = (
     "coarse",
     "coarse-as-long",
@@ -71,6 +82,11 @@ TABLES: dict[str, Table] = {
         Table(
             "coarse-compensation", "Compensation in the coarse stage alone",
             ("coarse", "coarse-compensated-mean", "coarse-compensated-sum"), REGIME, ours="coarse-compensated-mean",
+        ),
+        Table(
+            "more-anchors", "Plain growth of as many anchors as compensated growth",
+            tuple(name for group in _MORE_ANCHORS for name in group.methods), REGIME, groups=_MORE_ANCHORS,
+            ours="cell-1-mean-0.2",
         ),
         Table(
             "longer", "Blocks trained longer",

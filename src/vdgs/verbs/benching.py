@@ -14,8 +14,8 @@ from vdgs.settings.requests import BINS
 from vdgs.verbs.shared import open_console, parse
 
 TableName = Literal[
-    "table1", "table2", "table3", "table3-each", "table4", "factorial", "coarse-compensation", "efficiency", "longer",
-    "choices", "toy",
+    "table1", "table2", "table3", "table3-each", "table4", "factorial", "coarse-compensation", "more-anchors",
+    "efficiency", "longer", "choices", "toy",
 ]  # fmt: skip
 
 
@@ -27,10 +27,10 @@ class BenchArguments:
     """
 
     table: Positional[TableName]
-    """table1 to table4: those of the paper; table3-each, factorial, coarse-compensation: where its premise holds, each
-    block trained as long, its choices crossed, its compensation without blocks; efficiency: its paragraph; longer:
-    blocks that train two and four times as long; choices: one choice of ours changed at a time; toy: a small one in a
-    minute or two."""
+    """table1 to table4: those of the paper; table3-each, factorial, coarse-compensation, more-anchors: where its
+    premise holds, each block trained as long, its choices crossed, its compensation without blocks, and against plain
+    growth of as many anchors; efficiency: its paragraph; longer: blocks that train two and four times as long; choices:
+    one choice of ours changed at a time; toy: a small one in a minute or two."""
     output: Path
     """Folder for runs and results; new, or the one to continue."""
     seeds: Annotated[int | None, Range(1, 1000)] = None
