@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -274,3 +275,6 @@ def test_exposures_are_fitted_where_photographs_differ(
     assert said in " ".join(done.stdout.split())
     model = AnchorModel.load(run / "coarse/model.safetensors")
     assert (model.decoder.exposure is not None) == fitted
+    begun = json.loads((run / "coarse/start.json").read_text())
+    assert begun["exposures"] == fitted
+    assert (begun["brightness_differs"] is not None) == tracks

@@ -23,7 +23,8 @@ from vdgs.runs.folder import RunFolder
 pytestmark = pytest.mark.xdist_group("report")
 
 VOID = {"meta", "img", "br", "link", "hr", "input"}
-FILES = ("coarse/log.jsonl", "coarse/evaluation/metrics.json", "visibility/visibility.json", "partition/partition.json",
+FILES = ("coarse/start.json",
+         "coarse/log.jsonl", "coarse/evaluation/metrics.json", "visibility/visibility.json", "partition/partition.json",
          "blocks/00/log.jsonl", "blocks/01/status.json", "merged/status.json", "evaluation/metrics.json",
          "evaluation/per_view.json", "evaluation/by_block.json", "config.yaml", "capture.json")  # fmt: skip
 PICTURES = ("visibility/map.png", "partition/blocks.png", "partition/block_facts.png", "partition/scores.png",
@@ -105,6 +106,8 @@ def coarse_run(root: Path, name: str = "meadow") -> RunFolder:
     status = {"state": "done", "iteration": 400, "iterations": 400, "anchors": 1400, "seconds": 83.0,
               "peak_memory_bytes": 500_000_000, "psnr_training": 24.0}  # fmt: skip
     write(root / "coarse/status.json", status)
+    start = {"sparse_points": 2000, "dense_points": 12_757, "brightness_differs": 0.029, "exposures": True}
+    write(root / "coarse/start.json", start)
     write(root / "coarse/log.jsonl", log(400))
     write(root / "coarse/evaluation/metrics.json", metrics(27.125, "coarse"))
     write(root / "coarse/evaluation/per_view.json", views(27.0))
@@ -286,6 +289,19 @@ def test_an_empty_folder_gives_a_report_and_none_an_error(tmp_path):
     assert "Nothing is evaluated yet." in text
     with pytest.raises(RunError, match="not a run folder"):
         write_report(RunFolder(tmp_path / "nowhere"))
+
+
+def test_the_report_tells_what_training_began_with(tmp_path):
+    run = whole_run(tmp_path / "run")
+    assert "starts from 2,000 sparse points and 12,757 that stereo found" in Page(write_report(run)).text()
+    assert "differ in brightness by 2.9 %. Each has an exposure" in Page(write_report(run)).text()
+    alike = {"sparse_points": 90, "dense_points": None, "brightness_differs": 0.004, "exposures": False}
+    write(run.path / "coarse/start.json", alike)
+    text = Page(write_report(run)).text()
+    assert "starts from 90 sparse points." in text
+    assert "differ in brightness by 0.4 %. None has an exposure" in text
+    (run.path / "coarse/start.json").unlink()  # of a version before
+    assert "It starts from" not in Page(write_report(run)).text()
 
 
 @pytest.mark.parametrize("damage", ["[[1, {", '{"blocks": 3}', "\x00\xff" + "[" * 100_000])

@@ -24,7 +24,7 @@ def block_names(run: RunFolder) -> list[tuple[int, str]]:
 
 def training_section(shown: Shown) -> Html:
     source, run = shown.source(), shown.run
-    parts = [heading("Coarse model")]
+    parts = [heading("Coarse model"), _start(source.record("coarse/start.json"))]
     coarse = source.lines("coarse/log.jsonl")
     parts.append(_curves([("coarse", MERGED, coarse)]))
     if not coarse and not source.exists("coarse/log.jsonl"):
@@ -39,6 +39,20 @@ def training_section(shown: Shown) -> Html:
     parts.append(_states([("coarse", source.record("coarse/status.json")), *statuses], shown))
     parts += _growth(logs)
     return section("training", "Training", parts, source.notes)
+
+
+def _start(found: Record) -> Html:
+    """What was found before the first step."""
+    said = []
+    if found.number("sparse_points") is not None:
+        dense = found.number("dense_points")
+        beside = "" if dense is None else f" and {count(dense)} that stereo found"
+        said.append(f"It starts from {count(found.number('sparse_points'))} sparse points{beside}.")
+    if found.values.get("exposures") in (True, False):
+        differ = found.number("brightness_differs")
+        known = "" if differ is None else f"Photographs of the same places differ in brightness by {share(differ)}. "
+        said.append(known + ("Each has" if found.values["exposures"] else "None has") + " an exposure of its own.")
+    return paragraph(" ".join(said), "facts") if said else Html("")
 
 
 def _curves(logs: list[Log]) -> Html:

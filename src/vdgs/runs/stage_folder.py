@@ -31,6 +31,11 @@ class StageFolder:
         return self.path / "log.jsonl"
 
     @property
+    def start_file(self) -> Path:
+        """What was found before the first step of the coarse stage."""
+        return self.path / "start.json"
+
+    @property
     def model(self) -> Path:
         return self.path / "model.safetensors"
 

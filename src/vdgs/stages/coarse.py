@@ -69,10 +69,14 @@ def _train(
         dense = _dense_points(run, capture, images, config, console)
         stage, anchors = open_stage(capture, config, images, device, dense)
 
-        def fitted() -> bool:
-            return config.exposure and _exposures_differ(images, config.exposure_spread, console)
+        def begun() -> TrainingState:
+            differ = _brightness(images, config, console)
+            fitted = config.exposure and (differ is None or differ >= config.exposure_spread)
+            found = {"sparse_points": len(capture.points), "dense_points": None if dense is None else len(dense.points)}
+            write_json(folder.start_file, {**found, "brightness_differs": differ, "exposures": fitted})
+            return start(anchors, stage, fitted)
 
-        state = continue_or_start(folder, stage, lambda: start(anchors, stage, fitted()), console)
+        state = continue_or_start(folder, stage, begun, console)
         _announce(capture, state, config, console)
         train_watched(folder, state, stage, options, console)
     facts = {
@@ -104,10 +108,11 @@ def _dense_points(
     return dense
 
 
-def _exposures_differ(images: ImageCache, spread: float, console: Console) -> bool:
-    """Whether photographs differ in brightness by at least so much, or may for all that the capture tells; says so."""
-    if not spread:
-        return True
+def _brightness(images: ImageCache, config: TrainConfig, console: Console) -> float | None:
+    """By what share photographs of the same places differ in brightness; None where nothing depends on it, or the
+    capture does not tell. Says what follows."""
+    if not (config.exposure and config.exposure_spread):
+        return None
     wait = console.status("comparing the photographs' brightness")
 
     def tell(done: int, of: int) -> None:
@@ -121,13 +126,13 @@ def _exposures_differ(images: ImageCache, spread: float, console: Console) -> bo
             "exposure: one is fitted to each photograph; whether they differ in brightness is not known, for the "
             "capture does not say which of them show the same points", highlight=False,
         )  # fmt: skip
-        return True
-    found = colours.difference()
+        return None
+    found, spread = colours.difference(), config.exposure_spread
     said = "one is fitted to each" if found >= spread else f"less than {spread:.2%}, so none is fitted"
     console.print(
         f"exposure: photographs of the same places differ in brightness by {found:.2%}; {said}", highlight=False
     )
-    return found >= spread
+    return found
 
 
 def open_stage(
