@@ -21,6 +21,7 @@ from vdgs.partition.assignment.saving import load_scores
 from vdgs.partition.blocks import load_blocks, places_of
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
+from vdgs.runs.stereo import PIXELS_A_POINT
 
 pytestmark = pytest.mark.xdist_group("pipeline")
 
@@ -306,6 +307,7 @@ def test_a_dry_run_says_what_it_takes_and_writes_nothing(capture, copied, tmp_pa
         assert f"{ITERATIONS} iterations" in planned.stdout
         assert f"2 blocks: about {BLOCK_ITERATIONS} iterations each, 2 at once" in planned.stdout
         assert planned.stdout.count("done already") == 2 * done
+        assert "stereo" not in planned.stdout  # sparse points suffice
     changed = vdgs(
         "run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0", "--dry-run", prepare=time_few_steps
     )
@@ -318,6 +320,15 @@ def test_a_dry_run_says_what_it_takes_and_writes_nothing(capture, copied, tmp_pa
     assert "done already" not in shrunk.stdout
     assert changed_files(copied, before) == set()
     assert not (tmp_path / "new").exists()
+
+
+def test_a_dry_run_counts_what_stereo_may_add(tmp_path):
+    write_colmap(tmp_path / "capture", tiny_scene(points=80))
+    planned = vdgs(
+        "run", tmp_path / "capture", "--output", tmp_path / "run", *SETTINGS, "--dry-run", prepare=time_few_steps
+    )
+    assert f"and at most {10 * 64 * 48 // PIXELS_A_POINT - 80} where stereo finds ground" in planned.stdout
+    assert "and with those of stereo" in " ".join(planned.stdout.split())
 
 
 def test_another_cut_leaves_no_old_result_standing(copied):

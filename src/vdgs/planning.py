@@ -27,6 +27,7 @@ from vdgs.runs.beginning import reads_otherwise, run_settings
 from vdgs.runs.config_file import changed_options
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.standing import RunStanding, standing_of
+from vdgs.runs.stereo import room_for_points
 from vdgs.settings.checks import validate
 from vdgs.settings.method import MethodConfig, TrainConfig, block_limit, block_training, with_iterations
 from vdgs.settings.ranges import refuse
@@ -46,9 +47,12 @@ TIMED_STEPS, TIMED_SECONDS = 4, 2.0
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run takes by estimate. Seconds are pairs: anchors as many as at the start, and grown all the while."""
+    """What a run takes by estimate. Seconds are pairs: anchors as many as at the start, and, with all that stereo may
+    add, grown all the while."""
 
     anchors: int
+    dense_points: int
+    """What stereo may add to the sparse points at most; an anchor starts at each."""
     blocks: int
     coarse_iterations: int
     block_iterations: int
@@ -119,11 +123,13 @@ def _plan(capture: Capture, method: MethodConfig, asked: RunRequest) -> Plan:
     factors = sorted({factor for _, factor in (*config.resolutions, *method.block.resolutions)})
     with ImageCache(capture.train_views, image_budget(asked.watching), downscales=tuple(factors)) as images:
         stage, anchors = open_stage(capture, config, images, asked.device)
-        need = need_of(start(anchors, stage, config.exposure), stage)
+        alone = need_of(start(anchors, stage, config.exposure), stage)
         timed = {}
         for factor in factors:
             at_size = replace(stage, config=replace(config, resolutions=((0.0, factor),)))
             timed[factor] = _seconds_a_step(start(anchors, at_size, config.exposure), at_size)
+    dense = room_for_points(capture) if config.anchors.stereo else 0
+    need, more = replace(alone, anchors=alone.anchors + dense), GROWTH * (1 + dense / max(alone.anchors, 1))
     camera = capture.train_views[0].camera
     blocks = choose_block_count(need.grown, views, camera.width * camera.height, method.partition, need.offsets)
     in_block = -(-need.grown // blocks)
@@ -137,9 +143,9 @@ def _plan(capture: Capture, method: MethodConfig, asked: RunRequest) -> Plan:
     block = block_training(method, max(1, round(views * min(1.0, 1.5 / blocks))))
     coarse = _seconds(config, timed)
     return Plan(
-        len(anchors), blocks, config.iterations, block.iterations, min(jobs, blocks), estimate(need).total, each,
-        (coarse, coarse * (1 + GROWTH) / 2),
-        (blocks * _seconds(block, timed), blocks * _seconds(block, timed) * GROWTH),
+        len(anchors), dense, blocks, config.iterations, block.iterations, min(jobs, blocks), estimate(need).total, each,
+        (coarse, coarse * (1 + more) / 2),
+        (blocks * _seconds(block, timed), blocks * _seconds(block, timed) * more),
     )  # fmt: skip
 
 
@@ -174,7 +180,7 @@ def _say(plan: Plan, method: MethodConfig, standing: RunStanding | None, console
     chosen = " by estimate: --blocks auto counts again when anchors have grown" if method.partition.blocks == "auto" \
         and method.partition.blocking else ""  # fmt: skip
     per_block = _times(plan.blocks_seconds)
-    stereo = " (and what stereo finds beside the sparse points)" if method.training.anchors.stereo else ""
+    stereo = f" (and at most {plan.dense_points:,} where stereo finds ground)" if plan.dense_points else ""
     names = [stage.name for stage in standing.blocks] if standing is not None else []
     lines = [
         f"coarse model: {plan.anchors:,} anchors at the start{stereo}, {plan.coarse_iterations:,} iterations, at most "
@@ -183,7 +189,8 @@ def _say(plan: Plan, method: MethodConfig, standing: RunStanding | None, console
         f"{in_gb(plan.block_bytes)} each beside photographs, {per_block}{done(*names)}",
         f"memory that is free: {in_gb(available_bytes())}",
         "Times are of training alone, from steps timed now on this machine; the larger one is with "
-        f"{GROWTH:g} times as many anchors. Nothing was written.",
+        f"{GROWTH:g} times as many anchors{', and with those of stereo' if plan.dense_points else ''}. Nothing was "
+        "written.",
     ]
     console.print("\n".join(lines), highlight=False)
     if max(plan.coarse_bytes, plan.jobs * plan.block_bytes) > available_bytes():

@@ -59,9 +59,8 @@ def find_points(
     file = run.coarse.path / FILE
     if not config.stereo or file.exists():
         return points_of_run(run, config)
-    cameras = [view.camera for view in capture.train_views]
-    room = sum(camera.width * camera.height for camera in cameras) // PIXELS_A_POINT - len(capture.points)
-    if room <= 0:
+    cameras, room = [view.camera for view in capture.train_views], room_for_points(capture)
+    if not room:
         nothing = DensePoints(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
         _write(file, nothing)
         return nothing
@@ -81,6 +80,12 @@ def find_points(
         found = DensePoints(found.points[kept], found.colours[kept])
     _write(file, found)
     return found
+
+
+def room_for_points(capture: Capture) -> int:
+    """At most so many points are added to the sparse ones: photographs are to bear them all."""
+    pixels = sum(view.camera.width * view.camera.height for view in capture.train_views)
+    return max(0, pixels // PIXELS_A_POINT - len(capture.points))
 
 
 def cell_of(capture: Capture, config: AnchorConfig) -> Cell:
