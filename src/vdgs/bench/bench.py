@@ -24,6 +24,7 @@ from rich.console import Console
 from vdgs.bench.definitions import Scene
 from vdgs.bench.figure import draw_groups
 from vdgs.bench.grids import grids_of
+from vdgs.bench.known import left_to_train, on_the_same_pixels, read_known
 from vdgs.bench.measure import FRUSTA_FILE, GROUPS_FILE, measure_groups
 from vdgs.bench.notes import notes_of
 from vdgs.bench.plan import Choices, Plan, PlannedRun, make_plan
@@ -60,6 +61,8 @@ class BenchSettings:
     bins: int = 4
     lpips_weights: Path | None = None
     redo: bool = False
+    #: What other benches wrote as results.json: runs that they hold are not trained.
+    known: tuple[Path, ...] = ()
 
 
 def run_bench(settings: BenchSettings, console: Console) -> list[Result]:
@@ -71,12 +74,17 @@ def run_bench(settings: BenchSettings, console: Console) -> list[Result]:
     if settings.jobs < 1 or settings.bins < 1:
         raise VdgsError("--jobs and --bins must be at least 1")
     _refuse_among_inputs(settings.output, plan := make_plan(settings.table, settings.choices))
+    known, keys = read_known(settings.known), {run.name: _key(run, plan, settings) for run in plan.coarse + plan.runs}
+    left = left_to_train(plan, keys, known)
+    if settings.known:
+        taken = len(plan.runs) - len(left.runs)
+        console.print(f"{taken} of {len(plan.runs)} runs are known and not trained here", highlight=False)
     began = time.monotonic()
     with _locked(settings.output):
-        captures, lost = _captures(plan, settings, console)
-        ended = lost | _train(plan, captures, settings, console)
-        ended |= _measure(plan, captures, ended, settings, console)
-        results = gather(plan, settings.output, ended)
+        captures, lost = _captures(left, settings, console)
+        ended = lost | _train(left, captures, keys, settings, console)
+        ended |= _measure(left, captures, ended, settings, console)
+        results = on_the_same_pixels(gather(plan, settings.output, ended, keys, known), known)
         _write(plan, results, settings, console)
     console.print(f"{(time.monotonic() - began) / 60:.1f} min", highlight=False)
     if any(each.state == "stopped" for each in ended.values()):
@@ -108,7 +116,7 @@ def _captures(plan: Plan, settings: BenchSettings, console: Console) -> tuple[di
         except VdgsError as error:
             names = [run.name for run in plan.coarse + plan.runs if run.scene == scene.name]
             lost |= {name: Outcome(name, "failed", why=str(error)) for name in names}
-    if not found:
+    if lost and not found:
         raise VdgsError(next(iter(lost.values())).why)
     return found, lost
 
@@ -135,7 +143,9 @@ def _capture(scene: Scene, settings: BenchSettings, console: Console) -> Path:
     return folder
 
 
-def _train(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings, console: Console) -> dict[str, Outcome]:
+def _train(
+    plan: Plan, captures: Mapping[str, Path], keys: Mapping[str, str], settings: BenchSettings, console: Console
+) -> dict[str, Outcome]:
     """Every run whose scene is there, trained or found finished."""
     done, tasks = dict[str, Outcome](), list[Task]()
     wanted = [run for run in plan.coarse + plan.runs if run.scene in captures]
@@ -144,7 +154,7 @@ def _train(plan: Plan, captures: Mapping[str, Path], settings: BenchSettings, co
     for run in wanted:
         _refuse_other_settings(settings, run)
     for run in wanted:
-        job = _job(run, plan, captures[run.scene], settings, threads)
+        job = _job(run, plan, captures[run.scene], keys[run.name], settings, threads)
         if _is_done(settings.output, run, job.key):
             done[run.name] = Outcome(run.name, "done")
             continue
@@ -210,14 +220,19 @@ def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
         )
 
 
-def _job(run: PlannedRun, plan: Plan, capture: Path, settings: BenchSettings, threads: int) -> Job:
+def _key(run: PlannedRun, plan: Plan, settings: BenchSettings) -> str:
+    """Of a run of this bench: its settings, what it is trained on and how it is measured."""
     scene = next(scene for scene in plan.scenes if scene.name == run.scene)
-    options = to_dict(_options(scene, settings))
-    measured = {"bins": settings.bins, "lpips": str(settings.lpips_weights)}
+    of = {"options": to_dict(_options(scene, settings)), "scene": dict(scene.synth or scene.contents) or scene.capture}
+    return run.key(of, {"bins": settings.bins, "lpips": str(settings.lpips_weights)})
+
+
+def _job(run: PlannedRun, plan: Plan, capture: Path, key: str, settings: BenchSettings, threads: int) -> Job:
+    scene = next(scene for scene in plan.scenes if scene.name == run.scene)
     return Job(
-        capture.resolve(), options, to_dict(run.config), run.stages, (settings.output / run.folder).resolve(),
-        None if run.coarse_from is None else (settings.output / run.coarse_from).resolve(),
-        run.key({"options": options, "scene": dict(scene.synth or scene.contents) or scene.capture}, measured),
+        capture.resolve(), to_dict(_options(scene, settings)), to_dict(run.config), run.stages,
+        (settings.output / run.folder).resolve(),
+        None if run.coarse_from is None else (settings.output / run.coarse_from).resolve(), key,
         settings.lpips_weights and settings.lpips_weights.resolve(), settings.bins, threads,
         threads if settings.jobs == 1 else 1, settings.redo,
         run.renders and run.renders.resolve(),

@@ -23,9 +23,10 @@ def notes_of(plan: Plan, results: Sequence[Result], lines: Sequence[Line], figur
         parts.append("![PSNR by visibility](groups.png)")
     parts.append(_fairness(plan))
     parts.append(_list("Groups by visibility", _groups(plan, results)))
-    lost = [each for each in results if each.state != "done"]
+    lost = [each for each in results if each.state != "done" or each.why]
     said = [f"{each.method} on {each.scene}, seed {each.seed}: {each.state}. {each.why}" for each in lost]
     parts.append(_list("Missing", [*said, *_not_rendered(plan)]))
+    parts.append(_list("Where the figures are from", _origins(results)))
     parts.append(_list("Methods", map(_method, plan.methods)))
     parts.append(_list("Scenes", [f"{scene.title}: {scene.note}" for scene in plan.scenes if scene.note]))
     if plan.table.name in QUOTED:
@@ -96,6 +97,20 @@ def _groups(plan: Plan, results: Sequence[Result]) -> list[str]:
         if of is not None:
             said.append(f"{scene.title}: {SEEN_BY[of.seen_by]}. {all_bounds_of(of)}")
     return said if len(said) > 1 else []
+
+
+def _origins(results: Sequence[Result]) -> list[str]:
+    """When and on what which runs were trained: of several machines only figures of the same one compare in seconds."""
+    runs: dict[str, dict[int, list[str]]] = {}
+    for each in results:
+        if each.origin:
+            runs.setdefault(each.origin, {}).setdefault(each.seed, []).append(f"{each.method} on {each.scene}")
+    if len(runs) == 1:
+        return [f"{next(iter(runs))}: all."]
+    return [
+        f"{origin}: " + "; ".join(f"seed {seed}: {', '.join(names)}" for seed, names in seeds.items()) + "."
+        for origin, seeds in runs.items()
+    ]
 
 
 def _method(method: Method) -> str:

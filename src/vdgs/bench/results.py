@@ -48,15 +48,24 @@ class Result:
     seen_by: str = ""
     #: The same by V as the paper counts it, of generated scenes: figures as `psnr@frusta0`.
     frusta: tuple[Mapping[str, Any], ...] = ()
+    #: Changes with everything that the result depends on, but for the version and the machine.
+    key: str = ""
+    #: When, on what and with which version it was trained (`origin.py`).
+    origin: str = ""
 
 
-def gather(plan: Plan, output: Path, ended: Mapping[str, Outcome]) -> list[Result]:
-    """The results of every (scene, method, seed) of a plan, from its run folders."""
+def gather(
+    plan: Plan, output: Path, ended: Mapping[str, Outcome], keys: Mapping[str, str], known: Mapping[str, Result]
+) -> list[Result]:
+    """The results of every (scene, method, seed) of a plan, from its run folders, or known by the keys of runs."""
     results = []
     for (scene, method, seed), run in plan.answers.items():
+        if keys[run.name] in known:
+            results.append(replace(known[keys[run.name]], scene=scene, method=method, seed=seed))
+            continue
         end = ended.get(run.name)
         state, why = (end.state, end.why) if end else ("missing", "")
-        result = Result(scene, method, seed, state, why, str(run.folder))
+        result = Result(scene, method, seed, state, why, str(run.folder), key=keys[run.name])
         if state == "done":
             try:
                 result = _read(output, run, result)
@@ -82,7 +91,8 @@ def _read(output: Path, planned: PlannedRun, result: Result) -> Result:
     by_frusta, _ = _groups(run.path / FRUSTA_FILE, "@frusta", figures)
     figures["unseen_share"] = measured.get("unseen_share")
     seen_by = measured["seen_by"] if bounds else ""
-    return replace(result, figures=figures, groups=bounds, seen_by=seen_by, frusta=by_frusta)
+    origin = record.get("origin", "")
+    return replace(result, figures=figures, groups=bounds, seen_by=seen_by, frusta=by_frusta, origin=origin)
 
 
 def _groups(file: Path, at: str, figures: dict[str, float | None]) -> tuple[tuple[dict[str, Any], ...], dict[str, Any]]:

@@ -150,6 +150,7 @@ def work(job: Job) -> None:
     """All stages of a job, noting how long each took; the record says done only at the end."""
     from rich.console import Console
 
+    from vdgs.bench.origin import origin
     from vdgs.kernels import set_threads
 
     set_threads(job.threads)
@@ -161,7 +162,7 @@ def work(job: Job) -> None:
         STAGES[name](working)
         record["seconds"][name] = record["seconds"].get(name, 0.0) + time.monotonic() - began
         write_json(job.output / RECORD, record)
-    write_json(job.output / RECORD, record | {"state": "done"})
+    write_json(job.output / RECORD, record | {"state": "done", "origin": origin(job.threads)})
 
 
 def _opened(job: Job) -> tuple[Any, Any]:

@@ -68,7 +68,7 @@ def photographs_of(views: Sequence[View]) -> list[Path]:
 def examine(question: Mapping[str, Any]) -> dict[str, Any]:
     """This machine's answer: its `node`, the `processor`'s instructions, and the `problems` that it sees, in words."""
     problems = [*_folder(question), *_files(question["files"]), *_code(question)]
-    return {"node": socket.gethostname(), "processor": _processor(), "problems": problems}
+    return {"node": socket.gethostname(), "processor": instructions(), "problems": problems}
 
 
 @cache
@@ -128,7 +128,8 @@ def _size(file: Path) -> int:
         return -1
 
 
-def _processor() -> str:
+def instructions() -> str:
+    """The instruction set that decides which kernels run here; without one of these, the machine's kind."""
     try:
         flags = PROCESSOR.read_text(encoding="ascii", errors="replace")
     except OSError:

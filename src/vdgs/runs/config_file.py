@@ -44,7 +44,7 @@ class ConfigFile:
     path: Path
 
     def write(self, settings: dict[str, Any], command: str | None = None) -> None:
-        header = {"vdgs": {"version": __version__, "commit": _commit()} | ({"command": command} if command else {})}
+        header = {"vdgs": {"version": __version__, "commit": commit()} | ({"command": command} if command else {})}
         write_text(self.path, yaml.safe_dump(header | settings, sort_keys=False, allow_unicode=True))
 
     def command(self) -> str | None:
@@ -100,7 +100,7 @@ def _makes_another(command: str, folder: Path) -> bool:
     return any(os.path.isabs(each) and os.path.realpath(each) != os.path.realpath(folder) for each in outputs)
 
 
-def _commit() -> str | None:
+def commit() -> str | None:
     """The commit of the checkout that this package runs from; None outside a checkout of vdgs."""
     root = Path(__file__).resolve().parents[3]
     if not (root / ".git").exists() or not (root / "native").exists():

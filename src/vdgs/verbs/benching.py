@@ -43,6 +43,9 @@ class BenchArguments:
     renders: tuple[str, ...] = ()
     """What other programs rendered of the test views, a row for each NAME=FOLDER (several after one --renders):
     FOLDER/SCENE/VIEW.png or FOLDER/SCENE/SEED/VIEW.png. Measured as all others (docs/bench.md)."""
+    known: tuple[Path, ...] = ()
+    """results.json of other benches, of this machine or of others (several after one --known): runs with the same
+    settings, seeds and scenes are taken from there and not trained, and the table says where each is from."""
     data: Path | None = None
     """Folder that holds the scenes with names which are not generated: residence-pixsfm, copr, ..."""
     scale_iterations: Annotated[float, Range(0, 1000, above=True)] = 1.0
@@ -76,7 +79,15 @@ def bench(arguments: list[str]) -> None:
     )  # fmt: skip
     run_bench(
         BenchSettings(
-            asked.table, asked.output, choices, asked.data, asked.jobs, asked.bins, asked.lpips_weights, asked.redo
+            asked.table,
+            asked.output,
+            choices,
+            asked.data,
+            asked.jobs,
+            asked.bins,
+            asked.lpips_weights,
+            asked.redo,
+            asked.known,
         ),
         open_console(asked.quiet),
     )

@@ -1,0 +1,80 @@
+"""Figures of runs that another bench trained, perhaps on another machine: its results.json (`--known`).
+
+A run is the same where its key is: the same settings, seed, scene and way of measuring. Its figures then stand in the
+table as if it had been trained here, and the table says where they are from. So a table of many hours is the work of
+several machines, or of several nights, and can be written again without training anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from vdgs.bench.plan import Plan
+from vdgs.bench.results import Result
+from vdgs.errors import VdgsError
+from vdgs.storage.files import read_json
+
+
+def read_known(files: Iterable[Path]) -> dict[str, Result]:
+    """Key -> result of every finished run that the files tell of; of several with one key the first.
+
+    Raises VdgsError for a file that cannot be read or is no results.json of a bench.
+    """
+    found: dict[str, Result] = {}
+    for file in files:
+        content = read_json(file)
+        try:
+            results = [_result(each) for each in content["results"]]
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise VdgsError(
+                f"--known {file}: is not what `vdgs bench` writes as results.json, or of an earlier version "
+                f"({type(error).__name__}: {error})"
+            ) from error
+        for each in results:
+            if each.state == "done":
+                found.setdefault(each.key, each)
+    return found
+
+
+def _result(plain: Mapping[str, Any]) -> Result:
+    result = Result(**{each.name: plain[each.name] for each in fields(Result)})
+    if not result.key or not isinstance(result.figures["psnr"], float):
+        raise ValueError("a run without key or figures")
+    return replace(result, groups=tuple(result.groups), frusta=tuple(result.frusta))
+
+
+def left_to_train(plan: Plan, keys: Mapping[str, str], known: Mapping[str, Result]) -> Plan:
+    """The plan without the runs that are known and without coarse stages that nothing else needs.
+
+    `keys`: name of a run -> its key.
+    """
+    runs = tuple(run for run in plan.runs if keys[run.name] not in known)
+    wanted = {run.coarse_from for run in runs}
+    coarse = tuple(run for run in plan.coarse if run.folder in wanted)
+    scenes = tuple(scene for scene in plan.scenes if any(run.scene == scene.name for run in runs))
+    return replace(plan, runs=runs, coarse=coarse, scenes=scenes)
+
+
+def on_the_same_pixels(results: Sequence[Result], known: Mapping[str, Result]) -> list[Result]:
+    """The results, known ones without their groups by visibility where these hold other pixels than those of the runs
+    that were trained here (of captures without truth, a model of each bench says what its groups are)."""
+    reference: dict[str, Result] = {}
+    for each in sorted(results, key=lambda result: result.key in known):  # those trained here first
+        if each.groups:
+            reference.setdefault(each.scene, each)
+    return [each if _grouped_alike(each, reference.get(each.scene)) else _ungrouped(each) for each in results]
+
+
+def _grouped_alike(result: Result, reference: Result | None) -> bool:
+    if reference is None or not result.groups:
+        return True
+    return (result.seen_by, list(result.groups)) == (reference.seen_by, list(reference.groups))
+
+
+def _ungrouped(result: Result) -> Result:
+    figures = {name: value for name, value in result.figures.items() if "@" not in name}
+    why = "Its groups by visibility are of other pixels than those of the runs here: it has none in this table."
+    return replace(result, figures=figures, groups=(), frusta=(), why=why)

@@ -1,0 +1,28 @@
+"""Where the figures of a run are from: the day, the machine and the version, in words for people."""
+
+from __future__ import annotations
+
+import platform
+from datetime import date
+from pathlib import Path
+
+from vdgs import __version__
+from vdgs.executors.fitness import instructions
+from vdgs.runs.config_file import commit
+
+_PROCESSORS = Path("/proc/cpuinfo")
+
+
+def origin(threads: int) -> str:
+    """This day and machine, and the commit (outside a checkout: the version) of this package."""
+    of = sha[:7] if (sha := commit()) else __version__
+    cores = f"{threads} thread{'s' * (threads > 1)}"
+    return f"{date.today().isoformat()}, {cores} of {_processor()} ({instructions()}), {of}"
+
+
+def _processor() -> str:
+    try:
+        named = [line for line in _PROCESSORS.read_text().splitlines() if line.startswith("model name")]
+    except OSError:
+        named = []
+    return named[0].partition(":")[2].strip() if named else platform.processor() or platform.machine()
