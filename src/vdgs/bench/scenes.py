@@ -84,8 +84,8 @@ def _in_the_lab(flight: str) -> Scene:
 
 def _regime(config: MethodConfig) -> MethodConfig:
     """Blocks draw whole photographs, so that every row makes exactly the steps that it says. Anchors start from sparse
-    points, as the paper's do: stereo is ours, and serves the very places that its claims are about. Their cells are four
-    pixels wide below the flight: in finer ones there are more Gaussians than photographs have pixels."""
+    points, as the paper's do: stereo is ours, and serves the very places that its claims are about. Their cells are
+    four pixels wide below the flight: in finer ones there are more Gaussians than photographs have pixels."""
     config = _few_cameras(config)
     anchors = replace(config.training.anchors, stereo=False, voxel=0.14)
     return replace(config, training=replace(config.training, anchors=anchors), block=replace(config.block, crop="off"))
