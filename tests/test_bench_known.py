@@ -73,7 +73,7 @@ def test_another_seed_is_trained_beside_it(data, there, tmp_path):
     results, said = bench(asked(data, tmp_path / "out", seeds=2, known=(there,)))
     assert "2 of 4 runs are known" in said
     assert {state for each in results.values() for state in [each.state]} == {"done"}
-    assert sorted(path.name for path in tmp_path.glob("out/runs/copr/*/*")) == ["1", "1"]
+    assert {path.name for path in tmp_path.glob("out/runs/copr/*/*")} == {"1"}
     text = (tmp_path / "out" / "table2" / "table.md").read_text()
     assert "1999-12-31, another machine: seed 0: coarse on copr, baseline on copr." in text
     assert results["baseline", 0].key != results["baseline", 1].key

@@ -208,6 +208,8 @@ def test_the_coarse_row_trains_nothing_of_its_own():
     assert plan.answers["tiny", "coarse", 0].coarse_from == shared.folder
     assert plan.answers["tiny", "coarse-as-long", 0].coarse_from is None
     assert plan.answers["tiny", "baseline", 0].coarse_from is None
+    # Whatever stands beside it: a table with blocks, later in the same folder, finds what blocks begin with.
+    assert make_plan("table2", Choices(scenes=("tiny",), seeds=1, methods=("coarse",))).coarse == (shared,)
 
 
 def test_a_shared_coarse_stage_does_not_depend_on_the_methods_asked_for():

@@ -198,11 +198,12 @@ def _planned(scene: Scene, method: Method, budget: Budget, base: MethodConfig, s
 
 
 def _share_coarse(planned: Sequence[PlannedRun]) -> tuple[list[PlannedRun], list[PlannedRun]]:
-    """The coarse stages that blocks begin with, as runs of their own, and the runs that take them over."""
+    """The coarse stages that blocks begin with, as runs of their own, and the runs that take them over. The row that
+    measures such a stage takes it over too, also where its blocks stand in another table of the folder."""
     shared: dict[str, PlannedRun] = {}
     for run in planned:
         digest = _coarse_digest(run)
-        if "blocks" in run.stages and digest not in shared:
+        if ("blocks" in run.stages or run.method == AS_BLOCKS_BEGIN) and digest not in shared:
             folder = Path("runs", run.scene, f"shared-coarse-{digest}", str(run.seed))
             # Nothing but what it depends on: which methods share it, and so are asked for, must not change it.
             alone = MethodConfig(training=run.config.training)
@@ -214,6 +215,10 @@ def _share_coarse(planned: Sequence[PlannedRun]) -> tuple[list[PlannedRun], list
         for run in planned
     ]
     return list(shared.values()), taken
+
+
+#: The method that is what blocks begin with.
+AS_BLOCKS_BEGIN = "coarse"
 
 
 def _coarse_digest(run: PlannedRun) -> str:
