@@ -11,8 +11,10 @@ from typing import Literal
 from vdgs.bench.definitions import Budget, Change
 from vdgs.settings.method import CompensationConfig, MergeConfig, MethodConfig, PartitionStrategy
 
-#: So many cameras has each block of the factorial: those that show it best.
-FACTORIAL_CAMERAS = 160
+#: So many cameras has each block of the factorial: every camera joins its best block, and each block is topped up to
+#: these. With as few as one block's share (160) the cameras of the least seen places join none: the dense ones show
+#: more of a block. What was left out, more than how it was cut, then made the difference (docs/findings.md).
+FACTORIAL_CAMERAS = 256
 
 
 def full(config: MethodConfig, _budget: Budget) -> MethodConfig:
@@ -158,7 +160,7 @@ def factorial(lambda_vis: float, added_to: Literal["mean", "sum"] | None, t_low:
 
     def change(config: MethodConfig, budget: Budget) -> MethodConfig:
         printed = with_printed_compensation(with_lambda_vis(lambda_vis)(config, budget), t_low=t_low)
-        equal = replace(printed.assignment, threshold=1.0, best_block=False, min_cameras=FACTORIAL_CAMERAS)
+        equal = replace(printed.assignment, threshold=1.0, min_cameras=FACTORIAL_CAMERAS)
         changed = replace(printed, assignment=equal)
         if added_to is None:
             return compensated(changed, enabled=False)

@@ -250,7 +250,8 @@ def _cell(lambda_vis: float, added_to: Literal["mean", "sum"] | None, t_low: flo
     grown = "plain growth" if added_to is None else f"compensation of {added_to}s, T_low = {t_low:g}"
     return Method(
         name, f"λ_vis = {lambda_vis:g}, {grown}", factorial(lambda_vis, added_to, t_low),
-        differs=f"each block has the {FACTORIAL_CAMERAS} cameras that show it best; β_g = 2, γ = 0.9",
+        differs=f"each block has {FACTORIAL_CAMERAS} cameras: those whose best block it is, and those that show it "
+        "best besides; β_g = 2, γ = 0.9",
     )  # fmt: skip
 
 
@@ -276,7 +277,7 @@ _EAGER = [
         Method(
             f"cell-1-threshold-{factor:g}", f"λ_vis = 1, plain growth at {factor:g} of the threshold",
             eager(factorial(1.0, None, FACTORIAL_T_LOW[0]), factor),
-            differs=f"each block has the {FACTORIAL_CAMERAS} cameras that show it best: read it against `cell-1-off`",
+            differs=f"each block has {FACTORIAL_CAMERAS} cameras: read it against `cell-1-off`",
         )
         for factor in EAGER
     ),
