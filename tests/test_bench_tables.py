@@ -26,7 +26,7 @@ def test_mean_and_spread():
     assert summarise([None]) is None
     both = difference({0: 2.0, 1: 3.0, 2: None}, {0: 1.0, 1: 1.0, 3: 9.0})
     assert both is not None
-    assert (both.mean, both.seeds) == (1.5, 2)
+    assert (both.mean, both.by_seed) == (1.5, (1.0, 2.0))
     assert both.spread == pytest.approx(math.sqrt(0.5))
     assert both.beyond_spread
     one = difference({0: 2.0}, {0: 1.0})
@@ -83,6 +83,9 @@ def test_the_verdict_asks_for_more_than_the_spread_and_allows_a_tenth():
     assert answers(made(nothing | {"full": (0.09, -0.11)})) == [False, False]  # the spread of seeds is 0.1
     assert answers(made(nothing | {"full": (0.5, 0.0)}, seeds=1), seeds=1) == [None, True]
     assert answers(made(nothing | {"full": (0.5, 0.0)}, method_failed="full")) == [None]
+    plan = make_plan("table2", Choices(scenes=("lab-uneven",), methods=("baseline", "full")))
+    least, _ = verdict(plan, made(nothing | {"full": (0.5, 0.0)}))
+    assert least.numbers == "+0.50 dB, spread 0.10, 3 seeds: +0.50, +0.50, +0.50"  # each against the same seed
 
 
 def test_rows_that_are_the_same_run_are_not_compared():

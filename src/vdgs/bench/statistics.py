@@ -43,11 +43,13 @@ def marks(values: Sequence[float | None], digits: int, higher_is_better: bool = 
 
 @dataclass(frozen=True)
 class Difference:
-    """Of two methods over the seeds that both have: mean, and the larger of their spreads (None: one seed)."""
+    """Of two methods over the seeds that both have: mean, the larger of their spreads (None: one seed), and the
+    difference of each seed. Methods that share a coarse stage differ by far less than seeds do, so that a difference
+    below the spread can still have the same sign in all of them."""
 
     mean: float
     spread: float | None
-    seeds: int
+    by_seed: tuple[float, ...]
 
     @property
     def beyond_spread(self) -> bool | None:
@@ -57,12 +59,14 @@ class Difference:
 
 def difference(ours: Mapping[int, float | None], theirs: Mapping[int, float | None]) -> Difference | None:
     """Ours - theirs, by seed. None without a common seed."""
-    seeds = [
-        seed for seed, value in ours.items()
-        if value is not None and theirs.get(seed) is not None
+    pairs = [
+        (value, other)
+        for seed, value in ours.items()
+        if value is not None and (other := theirs.get(seed)) is not None
     ]  # fmt: skip
-    mine, others = summarise(ours[seed] for seed in seeds), summarise(theirs[seed] for seed in seeds)
+    mine, others = (summarise(pair[side] for pair in pairs) for side in (0, 1))
     if mine is None or others is None:
         return None
     spreads = [each.spread for each in (mine, others) if each.spread is not None]
-    return Difference(mine.mean - others.mean, max(spreads, default=None), len(seeds))
+    by_seed = tuple(value - other for value, other in pairs)
+    return Difference(mine.mean - others.mean, max(spreads, default=None), by_seed)

@@ -100,5 +100,7 @@ def _by_seed(results: Sequence[Result], method: str, key: str) -> dict[int, floa
 
 
 def _numbers(each: Difference) -> str:
-    spread = "one seed, spread unknown" if each.spread is None else f"spread {each.spread:.2f}, {each.seeds} seeds"
-    return f"{each.mean:+.2f} dB, {spread}"
+    if each.spread is None:
+        return f"{each.mean:+.2f} dB, one seed, spread unknown"
+    seeds = ", ".join(f"{one:+.2f}" for one in each.by_seed)
+    return f"{each.mean:+.2f} dB, spread {each.spread:.2f}, {len(each.by_seed)} seeds: {seeds}"
