@@ -76,8 +76,10 @@ def _wait(folder: Path) -> None:
     signal.set_wakeup_fd(write)  # a signal that comes before this process waits is not missed
     signal.signal(signal.SIGUSR1, lambda *_: None)
     (folder / str(os.getpid())).touch()
-    os.read(arrived, 1)
-    signal.set_wakeup_fd(-1)
-    # What went on for another signal may be about to end when that of `Pause.end` comes. An interpreter that ends gives
-    # signals with handlers their default back, which kills; one that is ignored stays so.
-    signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+    try:
+        os.read(arrived, 1)
+    finally:  # the handler of another signal may raise
+        signal.set_wakeup_fd(-1)
+        # What went on for another signal may be about to end when that of `Pause.end` comes. An interpreter that ends
+        # gives signals with handlers their default back, which kills; one that is ignored stays so.
+        signal.signal(signal.SIGUSR1, signal.SIG_IGN)
