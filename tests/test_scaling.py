@@ -16,7 +16,7 @@ from vdgs.cameras import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.frustum import project
+from vdgs.model.frustum import Frusta, project
 from vdgs.model.ground import solid_cells, solid_cells_of_all
 from vdgs.model.groups import GROUP, Groups
 from vdgs.model.sizes import REACH, SPAN, largest_log_scales
@@ -69,6 +69,24 @@ def test_groups_lose_no_place_that_a_camera_holds(count: int) -> None:
         assert np.isin(inside.numpy(), rows.numpy()).all()
     if count > 10 * GROUP:
         assert asked < 0.5 * 40 * count, "a camera looks at the groups about its frustum only"
+
+
+@pytest.mark.parametrize("count", [1, GROUP, 12 * GROUP + 3])
+def test_many_cameras_asked_at_once_answer_as_each_alone(count: int) -> None:
+    places, cameras = site(count, 400.0), flight(40, 400.0)
+    cameras[7] = Camera(cameras[7].camera_from_world, 45.0, 50.0, 61.0, 30.0, 120, 80)
+    frusta = Frusta.of(cameras)
+    together = frusta.project(places)
+    alone = [project(places, camera) for camera in cameras]
+    inside = torch.stack([each.inside for each in alone])
+    assert torch.equal(together.inside, inside)
+    for name in ("column", "row", "depth", "distance"):
+        one_by_one = torch.stack([getattr(each, name) for each in alone])
+        torch.testing.assert_close(getattr(together, name)[inside], one_by_one[inside], rtol=1e-5, atol=1e-3)
+    seen = torch.zeros(len(cameras), count, dtype=torch.bool)
+    for rows, watching in Groups.of(places).watched(frusta):
+        seen[watching[:, None], rows] |= frusta.take(watching).project(places[rows]).inside
+    assert torch.equal(seen, inside), "no place is lost, and each is in one group"
 
 
 def test_a_camera_inside_a_group_and_coincident_places_are_held() -> None:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vdgs.cameras import NEAR, Camera
 from vdgs.kernels import choose
+from vdgs.model.frustum import Frusta
 
 #: Places in a group.
 GROUP = 256
@@ -41,16 +43,30 @@ class Groups:
 
         O(n / GROUP + what it returns).
         """
-        rigid = torch.as_tensor(camera.camera_from_world).to(self.centres)
-        local = self.centres @ rigid[:3, :3].T + rigid[:3, 3]
-        x, y, z = local.T
-        reach = self.radii + ROUNDING * (self.radii + self.centres.norm(dim=1) + rigid[:3, 3].norm())
-        held = z + reach > NEAR
-        for focal, side, along in (
-            (camera.fx, camera.cx, x), (-camera.fx, camera.width - camera.cx, x),
-            (camera.fy, camera.cy, y), (-camera.fy, camera.height - camera.cy, y),
-        ):  # fmt: skip
-            held &= focal * along + side * z > -reach * (focal**2 + side**2) ** 0.5
-        chosen = held.nonzero()
+        frustum = Frusta.of([camera], self.centres.device)
+        chosen = _may_hold(self.centres, self.radii, frustum)[0].nonzero()
         rows = (chosen * GROUP + torch.arange(GROUP, device=chosen.device)).reshape(-1)
         return self.order[rows[rows < len(self.order)]].sort().values
+
+    def watched(self, frusta: Frusta) -> Iterator[tuple[Int64[Tensor, " rows"], Int64[Tensor, " some"]]]:
+        """Group by group its places and the numbers of the cameras that may hold any of them: all that do, and few
+        others. O(c n / GROUP)."""
+        for number, rows in enumerate(self.order.split(GROUP)):
+            held = _may_hold(self.centres[number, None], self.radii[number, None], frusta)
+            yield rows, held[:, 0].nonzero().squeeze(1)
+
+
+def _may_hold(centres: Float[Tensor, "g 3"], radii: Float[Tensor, " g"], frusta: Frusta) -> Bool[Tensor, "c g"]:
+    """Whether frusta may touch balls."""
+    turn, shift = frusta.camera_from_world[:, :3, :3], frusta.camera_from_world[:, :3, 3]
+    local = centres @ turn.transpose(1, 2) + shift[:, None]
+    x, y, z = local.permute(2, 0, 1)
+    reach = radii + ROUNDING * (radii + centres.norm(dim=1) + shift.norm(dim=1)[:, None])
+    held = z + reach > NEAR
+    for focal, side, along in (
+        (frusta.fx, frusta.cx, x), (-frusta.fx, frusta.width - frusta.cx, x),
+        (frusta.fy, frusta.cy, y), (-frusta.fy, frusta.height - frusta.cy, y),
+    ):  # fmt: skip
+        length = (focal**2 + side**2).sqrt()[:, None]
+        held &= focal[:, None] * along + side[:, None] * z > -reach * length
+    return held

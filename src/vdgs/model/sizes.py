@@ -23,7 +23,7 @@ from torch import Tensor
 
 from vdgs.cameras import NEAR, Camera
 from vdgs.kernels.constants import ALPHA_MIN
-from vdgs.model.frustum import project
+from vdgs.model.frustum import Frusta, project
 from vdgs.model.groups import Groups
 
 #: Length of a Gaussian over the longer side of the picture, at most (choice: a Gaussian may lie nearer to a camera than
@@ -35,39 +35,38 @@ SPAN = 0.25
 SPREAD = 4.0
 #: From the middle of a Gaussian of opacity 1 to where it is no longer drawn, in standard deviations.
 REACH = math.sqrt(-2.0 * math.log(ALPHA_MIN))
+#: Cameras that a group of places asks at once: what this keeps in memory is small, whatever the flight.
+AT_ONCE = 1024
 
 
 def largest_log_scales(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
     """The logarithm of the largest standard deviation that Gaussians of anchors at these places may have, in units of
     the ground frame: what the nearest of the cameras (pinholes) that hold the place allows; where none holds it, the
-    nearest of all. Infinite without cameras. Time in proportion to what the cameras hold, O(n) memory."""
+    nearest of all. Infinite without cameras. Time in proportion to what the cameras hold, O(n + c) memory."""
     bound = torch.full_like(positions[:, 0], math.inf)
     if len(positions) == 0 or not cameras:
         return bound.log()
-    groups = Groups.of(positions)
-    for camera in cameras:
-        rows = groups.about(camera)
-        seen = project(positions[rows], camera)
-        rows, depth = rows[seen.inside], seen.depth[seen.inside]
-        bound[rows] = torch.minimum(bound[rows], _span(camera) * depth)
+    frusta = Frusta.of(cameras, positions.device)
+    for rows, watching in Groups.of(positions).watched(frusta):
+        for some in watching.split(AT_ONCE):
+            asked = frusta.take(some)
+            seen = asked.project(positions[rows])
+            allowed = torch.where(seen.inside, asked.span[:, None].to(positions) * seen.depth, math.inf)
+            bound[rows] = torch.minimum(bound[rows], allowed.amin(dim=0))
     rows = bound.isinf().nonzero().squeeze(1)
-    bound[rows] = _by_nearest(positions[rows], cameras)
+    bound[rows] = _by_nearest(positions[rows], cameras, frusta.span.cpu().numpy())
     return (bound * (SPAN / (2.0 * REACH))).log()
 
 
-def _span(camera: Camera) -> float:
-    """What the longer side of the picture spans at the unit of depth."""
-    return max(camera.width, camera.height) / max(camera.fx, camera.fy)
-
-
-def _by_nearest(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
+def _by_nearest(
+    positions: Float[Tensor, "n 3"], cameras: Sequence[Camera], spans: Float[np.ndarray, " c"]
+) -> Float[Tensor, " n"]:
     """The least span · distance over the cameras."""
     near = torch.full_like(positions[:, 0], math.inf)
     if len(positions) == 0:
         return near
     places = torch.nan_to_num(positions.detach()).cpu().numpy()
     # Of cameras that span alike the nearest counts: it is looked up, then measured as the held ones are.
-    spans = np.array([_span(camera) for camera in cameras])
     for span in np.unique(spans):
         alike = np.flatnonzero(spans == span)
         nearest = cKDTree(np.stack([cameras[int(index)].position for index in alike])).query(places, workers=1)[1]
