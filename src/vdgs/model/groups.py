@@ -49,11 +49,12 @@ class Groups:
         return self.order[rows[rows < len(self.order)]].sort().values
 
     def watched(self, frusta: Frusta) -> Iterator[tuple[Int64[Tensor, " rows"], Int64[Tensor, " some"]]]:
-        """Group by group its places and the numbers of the cameras that may hold any of them: all that do, and few
+        """The places of each group that any camera may hold, and the numbers of such cameras: all that do, and few
         others. O(c n / GROUP)."""
         for number, rows in enumerate(self.order.split(GROUP)):
-            held = _may_hold(self.centres[number, None], self.radii[number, None], frusta)
-            yield rows, held[:, 0].nonzero().squeeze(1)
+            held = _may_hold(self.centres[number, None], self.radii[number, None], frusta)[:, 0]
+            if held.any():
+                yield rows, held.nonzero().squeeze(1)
 
 
 def _may_hold(centres: Float[Tensor, "g 3"], radii: Float[Tensor, " g"], frusta: Frusta) -> Bool[Tensor, "c g"]:
