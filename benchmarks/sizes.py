@@ -2,8 +2,8 @@
 
     python benchmarks/sizes.py [--threads 1]
 
-New anchors of one decision of growth, all over a square of 640 m, under cameras tilted by 30 degrees. Both must agree bit
-for bit.
+New anchors of one decision of growth, all over a square of 640 m, under cameras tilted by 30 degrees. Both must agree
+bit for bit.
 """
 
 from __future__ import annotations
