@@ -74,6 +74,9 @@ def test_the_ablations_change_what_they_are_named_after():
     assert settings["no-blocking"].block.compensation.enabled
     off = replace(base.block.compensation, enabled=False)
     assert settings["no-anchor-generation"] == replace(base, block=replace(base.block, compensation=off))
+    for name in ("no-blocking", "no-blocking-as-long"):
+        crossed = replace(settings[name], block=replace(settings[name].block, compensation=off))
+        assert settings[f"{name}-plain"] == crossed
     assert settings["lambda-vis-0"].partition.lambda_vis == 0
     assert settings["t-low-0.3"].block.compensation.t_low == 0.3
     assert settings["beta-g-0.5"].block.compensation.beta_g == 0.5

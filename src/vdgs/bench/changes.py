@@ -58,6 +58,11 @@ def without_anchor_generation(config: MethodConfig, _budget: Budget) -> MethodCo
     return compensated(config, enabled=False)
 
 
+def growing_plainly(change: Change) -> Change:
+    """A method without compensated growth."""
+    return lambda config, budget: without_anchor_generation(change(config, budget), budget)
+
+
 def as_printed(config: MethodConfig, _budget: Budget) -> MethodConfig:
     """What the paper says of blocks, in place of the preset's own choices: frozen decoder, every photograph used alike
     and at its full size, the coarse stage's rates again, the last model and no mean, cameras above a share of 0.45, its
