@@ -16,16 +16,14 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from ceiling import drawn, picture, psnr, squares
 from machine import describe
-from vdgs.cameras import Camera
-from vdgs.captures.capture import View
+from vdgs.bench.seen import held_by_frusta
 from vdgs.captures.heights import camera_height
 from vdgs.model.visibility import visibility_of
 from vdgs.runs.opening import open_run
-from vdgs.synth.truth import Truth, load_truth
+from vdgs.synth.truth import load_truth
 
 BANDS = (1, 4, 16, 52, 128)
 
@@ -33,14 +31,6 @@ BANDS = (1, 4, 16, 52, 128)
 def seeds_of(method: Path) -> list[Path]:
     """The runs of a method, or the run itself."""
     return sorted(each for each in method.iterdir() if each.name.isdigit()) or [method]
-
-
-def held(truth: Truth, view: View, scale: float, cameras: list[Camera]) -> np.ndarray:
-    """V by frusta at the pixels of a view; NaN for sky."""
-    depth = scale * truth.depth_map(view)
-    places = view.camera.unproject(np.where(np.isfinite(depth), depth, 1.0)).reshape(-1, 3)
-    counted = visibility_of(torch.from_numpy(places), cameras).numpy().reshape(depth.shape)
-    return np.where(np.isfinite(depth), counted, np.nan)
 
 
 def spread(values: np.ndarray, sign: str = "") -> str:
@@ -65,7 +55,7 @@ def main() -> None:
     truth, scale = load_truth(capture.root), capture.ground.scale
     cameras = [view.camera for view in capture.train_views]
     views = (capture.test_views if asked.views == "test" else capture.train_views)[:: asked.every]
-    seen = [truth.visibility_map(v) if asked.by == "truth" else held(truth, v, scale, cameras) for v in views]
+    seen = [truth.visibility_map(v) if asked.by == "truth" else held_by_frusta(truth, v, scale, cameras) for v in views]
     counted = np.nan_to_num(np.concatenate([each.ravel() for each in seen]))
     away = np.concatenate([scale * truth.depth_map(view).ravel() for view in views]) / camera_height(capture)
     taken = [picture(view) for view in views]

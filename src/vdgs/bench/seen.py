@@ -3,7 +3,7 @@ or else as a reference model of the scene draws it. The same for all methods and
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from vdgs.cameras import Camera
-from vdgs.captures.capture import Capture
+from vdgs.captures.capture import Capture, View
 from vdgs.captures.facts import fingerprint
 from vdgs.captures.loading import load_capture
 from vdgs.evaluation.of_run import visibility_map
@@ -71,13 +71,19 @@ def seen_by_frusta(root: Path, options: CaptureOptions) -> Seen | None:
     cameras, unit = [view.camera for view in capture.train_views], capture.ground.scale
 
     def counted(camera: Camera) -> Float[np.ndarray, "h w"]:
-        depth = unit * truth.depth_map(views[camera.camera_from_world.tobytes()])
-        sky = ~np.isfinite(depth)
-        places = camera.unproject(np.where(sky, 1.0, depth)).reshape(-1, 3)
-        held = visibility_of(torch.from_numpy(places), cameras).numpy().reshape(depth.shape)
-        return np.where(sky, np.nan, held)
+        return held_by_frusta(truth, views[camera.camera_from_world.tobytes()], unit, cameras)
 
     return Seen(capture, counted, "frusta", f"by frusta: {parts}")
+
+
+def held_by_frusta(truth: Truth, view: View, unit: float, cameras: Sequence[Camera]) -> Float[np.ndarray, "h w"]:
+    """How many of the cameras hold the true surface at each pixel of a view; NaN for sky. `unit`: of the ground frame,
+    in a metre."""
+    depth = unit * truth.depth_map(view)
+    sky = ~np.isfinite(depth)
+    places = view.camera.unproject(np.where(sky, 1.0, depth)).reshape(-1, 3)
+    held = visibility_of(torch.from_numpy(places), cameras).numpy().reshape(depth.shape)
+    return np.where(sky, np.nan, held)
 
 
 def _known(root: Path, options: CaptureOptions) -> tuple[Truth, Capture, str] | None:

@@ -46,9 +46,6 @@ class Frusta:
         inner = np.array([[c.fx, c.fy, c.cx, c.cy, c.width, c.height] for c in cameras], np.float64)
         return Frusta(torch.from_numpy(rigid).to(device), *torch.from_numpy(inner).to(device).T.contiguous())
 
-    def __len__(self) -> int:
-        return len(self.fx)
-
     def take(self, chosen: Int64[Tensor, " some"]) -> Frusta:
         """Those of these numbers."""
         return Frusta(*(getattr(self, field.name)[chosen] for field in fields(self)))
@@ -59,29 +56,19 @@ class Frusta:
         return torch.maximum(self.width, self.height) / torch.maximum(self.fx, self.fy)
 
     def project(self, positions: Float[Tensor, "n 3"]) -> Projection:
-        """Where the points fall in each picture, [c, n]: the bits of `project` for each camera. O(c n)."""
+        """Where the points fall in each picture, [c, n]. O(c n)."""
         rigid = self.camera_from_world.to(positions)
         local = positions @ rigid[:, :3, :3].transpose(1, 2) + rigid[:, None, :3, 3]
         fx, fy, cx, cy, width, height = (
             each[:, None].to(positions) for each in (self.fx, self.fy, self.cx, self.cy, self.width, self.height)
         )
-        return _fall(local.permute(2, 0, 1).contiguous(), fx, fy, cx, cy, width, height)
+        x, y, depth = local.permute(2, 0, 1).contiguous()
+        divisor = depth.clamp(min=NEAR)
+        column, row = fx * x / divisor + cx, fy * y / divisor + cy
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (depth > NEAR)
+        return Projection(column, row, depth, (x * x + y * y + depth * depth).sqrt(), inside)
 
 
 def project(positions: Float[Tensor, "n 3"], camera: Camera) -> Projection:
-    """Where the points fall. O(n)."""
-    rigid = torch.as_tensor(camera.camera_from_world).to(positions)
-    local = (positions @ rigid[:3, :3].T + rigid[:3, 3]).T.contiguous()
-    return _fall(local, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-
-
-def _fall(
-    local: Float[Tensor, "3 *c n"],
-    fx: Tensor | float, fy: Tensor | float, cx: Tensor | float, cy: Tensor | float,
-    width: Tensor | int, height: Tensor | int,
-) -> Projection:  # fmt: skip
-    x, y, depth = local
-    divisor = depth.clamp(min=NEAR)
-    column, row = fx * x / divisor + cx, fy * y / divisor + cy
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (depth > NEAR)
-    return Projection(column, row, depth, (x * x + y * y + depth * depth).sqrt(), inside)
+    """Where the points fall in the picture of one camera. O(n)."""
+    return Projection(*(each[0] for each in Frusta.of([camera], positions.device).project(positions)))
