@@ -33,6 +33,11 @@ def seeds_of(method: Path) -> list[Path]:
     return sorted(each for each in method.iterdir() if each.name.isdigit()) or [method]
 
 
+def name_of(method: Path) -> str:
+    """The method's, and of a single run the seed, too."""
+    return f"{method.parent.name}/{method.name}" if method.name.isdigit() else method.name
+
+
 def spread(values: np.ndarray, sign: str = "") -> str:
     """Mean over seeds and, of several, their standard deviation."""
     deviation = f" ± {values.std(ddof=1):.2f}" if len(values) > 1 else ""
@@ -76,7 +81,7 @@ def main() -> None:
             looked_at = visibility_of(run.model.anchors.positions, cameras).numpy()
             standing.append(np.histogram(looked_at, ends)[0])
         of_seeds = np.array(figures)
-        print(f"{method.name:>26} " + "".join(f"{spread(each):>15}" for each in of_seeds.T))
+        print(f"{name_of(method):>26} " + "".join(f"{spread(each):>15}" for each in of_seeds.T))
         print(f"{'anchors':>26} " + "".join(f"{each:>15,.0f}" for each in np.mean(standing, axis=0)))
         if len(first) == len(of_seeds):
             print(f"{'difference':>26} " + "".join(f"{spread(each, '+'):>15}" for each in (of_seeds - first).T))
