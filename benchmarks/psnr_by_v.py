@@ -5,8 +5,9 @@
 METHOD is a folder of a bench, runs/SCENE/METHOD, that holds a run for each seed, or a run; the scene is a generated
 capture with its truth. V counts the training cameras whose frustum holds the true place at a pixel, as the paper does,
 or (`--by truth`, test views only) those that see it. For each band: its share of all pixels, the median distance along
-the viewing axis in camera heights, anchors that stand where so many frusta look, and PSNR in neutral colours: the mean
-over seeds, and the difference to the first method, each seed against itself, ± its standard deviation.
+the viewing axis in camera heights, anchors that stand where so many frusta look, with blocks how many cameras of its
+own block look at each, and PSNR in neutral colours: the mean over seeds, and the difference to the first method, each
+seed against itself, ± its standard deviation.
 """
 
 from __future__ import annotations
@@ -16,13 +17,17 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ceiling import drawn, picture, psnr, squares
 from machine import describe
 from vdgs.bench.seen import held_by_frusta
+from vdgs.cameras import Camera
 from vdgs.captures.heights import camera_height
 from vdgs.model.visibility import visibility_of
-from vdgs.runs.opening import open_run
+from vdgs.partition.blocks import places_of
+from vdgs.runs.cut import blocks_of, views_of_blocks
+from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.synth.truth import load_truth
 
 BANDS = (1, 4, 16, 52, 128)
@@ -42,6 +47,16 @@ def spread(values: np.ndarray, sign: str = "") -> str:
     """Mean over seeds and, of several, their standard deviation."""
     deviation = f" ± {values.std(ddof=1):.2f}" if len(values) > 1 else ""
     return f"{values.mean():{sign}.2f}{deviation}"
+
+
+def of_own_block(run: TrainedRun, cameras: list[Camera]) -> np.ndarray:
+    """For each anchor, how many cameras of the block that owns its place hold it. Raises RunError without blocks."""
+    positions = run.model.anchors.positions
+    owner, counted = blocks_of(run.folder).owner(places_of(positions.numpy())), np.zeros(len(positions))
+    for block, views in enumerate(views_of_blocks(run.folder, run.capture)):
+        own = owner == block
+        counted[own] = visibility_of(positions[torch.from_numpy(own)], [cameras[view] for view in views]).numpy()
+    return counted
 
 
 def main() -> None:
@@ -73,16 +88,21 @@ def main() -> None:
     print(f"{'distance':>26} " + "".join(f"{np.median(away[group]):>15.2f}" for group in groups))
     first = np.zeros(0)
     for method, runs in zip(asked.methods, folders, strict=True):
-        figures, standing = [], []
+        figures, standing, trained_by = [], [], []
         for path in runs:
             run = open_run(path)
             squared = squares([drawn(run, view) for view in views], taken)
             figures.append([psnr(squared[group]) for group in groups])
             looked_at = visibility_of(run.model.anchors.positions, cameras).numpy()
             standing.append(np.histogram(looked_at, ends)[0])
+            if run.name == "merged":
+                summed = np.histogram(looked_at, ends, weights=of_own_block(run, cameras))[0]
+                trained_by.append(summed / standing[-1])
         of_seeds = np.array(figures)
         print(f"{name_of(method):>26} " + "".join(f"{spread(each):>15}" for each in of_seeds.T))
         print(f"{'anchors':>26} " + "".join(f"{each:>15,.0f}" for each in np.mean(standing, axis=0)))
+        if trained_by:
+            print(f"{'cameras of own block':>26} " + "".join(f"{each:>15.1f}" for each in np.mean(trained_by, axis=0)))
         if len(first) == len(of_seeds):
             print(f"{'difference':>26} " + "".join(f"{spread(each, '+'):>15}" for each in (of_seeds - first).T))
         first = first if len(first) else of_seeds

@@ -150,11 +150,11 @@ def times_as_many_blocks(factor: float) -> Change:
     )
 
 
-def coarse_compensated(added_to: Literal["mean", "sum"]) -> Change:
-    """The coarse stage alone, grown with the paper's compensation (its Table III counts one block so)."""
+def coarse_compensated(compensation: CompensationConfig) -> Change:
+    """The coarse stage alone, grown with compensation (the paper's Table III counts one block so)."""
 
     def change(config: MethodConfig, _budget: Budget) -> MethodConfig:
-        return replace(config, training=replace(config.training, compensation=CompensationConfig(added_to=added_to)))
+        return replace(config, training=replace(config.training, compensation=compensation))
 
     return change
 

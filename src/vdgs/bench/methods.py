@@ -45,6 +45,7 @@ from vdgs.bench.changes import (
 )
 from vdgs.bench.definitions import COARSE_ONLY, EXPLICIT, Change, Method
 from vdgs.comparators.gaussians.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS
+from vdgs.settings.method import CompensationConfig
 
 LAMBDA_VIS = (0.0, 0.5, 1.0, 1.3)
 T_LOW = (0.05, 0.15, 0.20, 0.30)
@@ -179,13 +180,27 @@ _COARSE_COMPENSATED = [
     Method(
         f"coarse-compensated-{added_to}",
         f"coarse stage, compensation as printed, {added_to}s",
-        coarse_compensated(added_to),
+        coarse_compensated(CompensationConfig(added_to=added_to)),
         COARSE_ONLY,
         less="iterations of the coarse stage only",
         differs="to be read against `coarse`",
     )
     for added_to in ("mean", "sum")
 ]
+#: What compensation is made of: g, and the lower gate for what few cameras see, which is our choice.
+_COARSE_PARTS = [
+    Method(
+        "coarse-compensated-literal-gate", "coarse stage, compensation of means, gate as for all",
+        coarse_compensated(CompensationConfig(gate="literal")), COARSE_ONLY,
+        less="iterations of the coarse stage only", differs="to be read against `coarse-compensated-mean`",
+    ),
+    Method(
+        "coarse-lower-gate", "coarse stage, lower gate where few cameras look, g = 0",
+        coarse_compensated(CompensationConfig(beta_g=1e-9)), COARSE_ONLY,
+        less="iterations of the coarse stage only", differs="to be read against `coarse`; g is a billionth, since "
+        "the gate is lower only where g is above 0",
+    ),
+]  # fmt: skip
 _LONGER = [
     Method(
         f"longer-{factor}", f"VDGS (full), blocks {factor} times as long", with_longer_blocks(factor),
@@ -303,8 +318,8 @@ FACTORIAL = tuple(method.name for method in _FACTORIAL)
 METHODS: dict[str, Method] = {
     method.name: method
     for group in (
-        _ABLATIONS, _OTHERS, _BLOCKS, _EACH_AS_LONG, _COARSE_COMPENSATED, _LONGER, _CHOICES, _SWEEPS, _FACTORIAL,
-        _EAGER,
+        _ABLATIONS, _OTHERS, _BLOCKS, _EACH_AS_LONG, _COARSE_COMPENSATED, _COARSE_PARTS, _LONGER, _CHOICES, _SWEEPS,
+        _FACTORIAL, _EAGER,
     )
     for method in group
 }  # fmt: skip

@@ -28,8 +28,8 @@ _MORE_ANCHORS = (
     ),
     Group(
         "coarse stage alone",
-        ("coarse", "coarse-compensated-sum", "coarse-compensated-mean",
-         *(f"coarse-threshold-{factor:g}" for factor in EAGER)),
+        ("coarse", "coarse-compensated-sum", "coarse-compensated-mean", "coarse-compensated-literal-gate",
+         "coarse-lower-gate", *(f"coarse-threshold-{factor:g}" for factor in EAGER)),
     ),
 )  # fmt: skip
 _ABLATION = (
