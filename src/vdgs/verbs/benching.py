@@ -28,9 +28,9 @@ class BenchArguments:
 
     table: Positional[TableName]
     """table1 to table4: those of the paper; table3-each, factorial, coarse-compensation, more-anchors: where its
-    premise holds, each block trained as long, its choices crossed, its compensation without blocks, and against plain
-    growth of as many anchors; efficiency: its paragraph; longer: blocks that train two and four times as long; choices:
-    one choice of ours changed at a time; toy: a small one in a minute or two."""
+    premise holds, each block trained as long, its choices crossed, its compensation without blocks, and its parts
+    against plain growth at lower thresholds; efficiency: its paragraph; longer: blocks that train two and four times
+    as long; choices: one choice of ours changed at a time; toy: a small one in a minute or two."""
     output: Path
     """Folder for runs and results; new, or the one to continue."""
     seeds: Annotated[int | None, Range(1, 1000)] = None
