@@ -403,26 +403,40 @@ def test_blocks_that_train_are_shown_with_what_they_have(run, tmp_path):
 
 # ------------------------------------------------------------------------------------- a real browser
 
+#: Width and height of the browser's window.
+WINDOW = 1000, 700
+
+
+def in_window(visitor: Visitor) -> Camera | None:
+    """Where a visitor stands, with the pixels of the whole window: a browser that is short of time asks for fewer,
+    and shows them as large. None until it has laid out its window."""
+    camera = visitor.camera
+    if camera is None or camera.width / camera.height != pytest.approx(WINDOW[0] / WINDOW[1], rel=0.01):
+        return None
+    return camera.resized(*WINDOW)
+
+
+def beside_the_panel(picture: np.ndarray) -> np.ndarray:
+    """That part of a picture of the window, at a quarter of its size, where fewer pixels look the same."""
+    return cv2.resize(picture[250:650, 40:600], None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(int)
+
 
 @quiet
 @pytest.mark.skipif(browser() is None, reason="no Chromium on this machine (apt-get install chromium)")
 def test_a_browser_shows_the_scene(viewer):
     wait_until(lambda: not viewer.visitors)
-    with open_page(viewer.door.address(), 1000, 700) as page:
+    with open_page(viewer.door.address(), *WINDOW) as page:
         wait_until(lambda: viewer.visitors)
         (visitor,) = viewer.visitors.values()
-        wait_until(lambda: visitor.camera is not None and visitor.camera.width == 1000)
+        wait_until(lambda: in_window(visitor))
 
         def differs() -> float:
-            """From what the model shows from there, beside the panel."""
-            part = slice(250, 650), slice(40, 600)
-            seen, meant = page.screenshot(), expected(viewer, visitor.camera)
-            if seen.shape != meant.shape:  # the browser has just laid out its window, and asks anew
-                return math.inf
-            return float(np.abs(seen[part].astype(int) - meant[part]).mean())
+            """From what the model shows from there."""
+            seen, meant = page.screenshot(), expected(viewer, in_window(visitor))
+            return float(np.abs(beside_the_panel(seen) - beside_the_panel(meant)).mean())
 
         wait_until(lambda: differs() < 6)
-        camera = visitor.camera
+        camera = in_window(visitor)
         assert camera is not None
         page.click(340.0, 440.0)
         wait_until(lambda: "ground frame" in visitor.place._words.content)
@@ -438,22 +452,18 @@ def test_a_browser_shows_the_scene(viewer):
 @pytest.mark.skipif(browser() is None, reason="no Chromium on this machine (apt-get install chromium)")
 def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
     wait_until(lambda: not viewer.visitors)
-    part = slice(250, 650), slice(40, 600)  # beside the panel
-    with open_page(viewer.door.address(), 1000, 700) as page:
+    with open_page(viewer.door.address(), *WINDOW) as page:
         wait_until(lambda: viewer.visitors)
         (visitor,) = viewer.visitors.values()
-        wait_until(lambda: visitor.camera is not None and visitor.camera.width == 1000)
+        wait_until(lambda: in_window(visitor))
 
         def painted() -> np.ndarray:
-            """What the visitor should see now, beside the panel."""
-            camera = visitor.camera.resized(1000, 700)  # on a slow machine, the browser asks for fewer pixels
-            return quarter(visitor.errand(lambda: visitor.painter.paint(visitor.shown, camera, camera)))
-
-        def quarter(picture: np.ndarray) -> np.ndarray:
-            return cv2.resize(picture[part], None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(int)
+            """What the visitor should see now."""
+            camera = in_window(visitor)
+            return beside_the_panel(visitor.errand(lambda: visitor.painter.paint(visitor.shown, camera, camera)))
 
         def seen() -> np.ndarray:
-            return quarter(page.screenshot())
+            return beside_the_panel(page.screenshot())
 
         shown = {}
         for name in NAMES:
