@@ -13,6 +13,7 @@ processes that it starts itself, such as those of blocks (`forking`), unless it 
 
 from __future__ import annotations
 
+import gc
 import importlib
 import multiprocessing
 import os
@@ -41,8 +42,9 @@ GLANCE_SECONDS = 0.01
 
 #: What the server imports, as far as it is there; the last ones are what commands import when they need it.
 IMPORTED = [
-    "vdgs.verbs", "vdgs.pipeline", "vdgs.films.film", "vdgs.bench.bench", "vdgs.export.exporting", "sklearn.cluster",
-    "rasterio",
+    "vdgs.cli", "vdgs.verbs", "vdgs.pipeline", "vdgs.films.film", "vdgs.bench.bench", "vdgs.export.exporting",
+    "vdgs.stages.block", "vdgs.kernels.native", "vdgs.kernels.reference", "vdgs.kernels.differentiable",
+    "typeguard", "contourpy", "PIL.PngImagePlugin", "sklearn.cluster", "rasterio",
 ]  # fmt: skip
 # Only Linux forks safely what has imported this much.
 _PROCESSES = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
@@ -246,6 +248,7 @@ def _run(main: Callable[[], None], stdout: str, stderr: str, environment: dict[s
     for descriptor, file in ((1, stdout), (2, stderr)):
         os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), descriptor)
     os.environ.update(environment)
+    gc.freeze()  # what is imported stays: the collector need not look at it, nor the system copy it
     pause_where_asked()
     main()
 

@@ -6,6 +6,7 @@ Modules whose fixtures are expensive are marked as one group each (`xdist_group`
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,7 +53,10 @@ install_import_hook([module_name(file) for file in files_with_shapes()], "typech
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Refuse workers that do not keep groups together: each would make the expensive fixtures anew."""
+    """Let the garbage collector forget what was imported: stages call it often. Refuse workers that do not keep groups
+    together: each would make the expensive fixtures anew."""
+    gc.collect()
+    gc.freeze()
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return
     for item in session.items:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -64,29 +66,40 @@ class ConfigFile:
                 f"{self.path.parent}: is not a run folder (no config.yaml). Train first: vdgs run CAPTURE --output RUN"
             )
         try:
-            settings = yaml.safe_load(self.path.read_text(encoding="utf-8-sig"))
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            text = self.path.read_text(encoding="utf-8-sig")
+        except UnicodeDecodeError as error:
             raise RunError(f"{self.path}: is damaged, not valid YAML ({error})") from error
-        if not isinstance(settings, dict) or not {"capture", "training"} <= settings.keys():
-            raise RunError(f"{self.path}: is damaged or not of a vdgs run (no `capture` and `training`)")
-        settings.pop("vdgs", None)
-        capture = settings.pop("capture")
-        if not isinstance(capture, dict) or not isinstance(capture.get("path"), str):
-            raise RunError(f"{self.path}: is damaged: `capture` must be a group of settings with a path")
-        try:
-            return {"capture": capture} | to_dict(self._read(settings))
-        except (ValueError, TypeError) as error:
-            raise RunError(f"{self.path}: {error}. Write it as it was, or start a new --output.") from error
+        return deepcopy(_settings(self.path, text))
 
-    @staticmethod
-    def _read(settings: dict[str, Any]) -> MethodConfig:
-        """Raises ValueError for a setting that there is not, of another kind or out of its range."""
-        method = from_dict(MethodConfig, settings, "")
-        for section in SECTIONS[1:]:
-            for each in numbers(getattr(method, section), (section,)):
-                if each.value is not None and each.range is not None and not each.range.holds(each.value):
-                    raise ValueError(f"{'.'.join(each.path)} is {each.value}; it must be {each.range}")
-        return method
+
+@lru_cache(maxsize=4)
+def _settings(path: Path, text: str) -> dict[str, Any]:
+    """What the text of a file means. A command asks for its settings many times, and PyYAML takes tens of milliseconds
+    for each (its quick parser, in C, is no way out: brackets that are nested deeply end the process)."""
+    try:
+        settings = yaml.safe_load(text)
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise RunError(f"{path}: is damaged, not valid YAML ({error})") from error
+    if not isinstance(settings, dict) or not {"capture", "training"} <= settings.keys():
+        raise RunError(f"{path}: is damaged or not of a vdgs run (no `capture` and `training`)")
+    settings.pop("vdgs", None)
+    capture = settings.pop("capture")
+    if not isinstance(capture, dict) or not isinstance(capture.get("path"), str):
+        raise RunError(f"{path}: is damaged: `capture` must be a group of settings with a path")
+    try:
+        return {"capture": capture} | to_dict(_method(settings))
+    except (ValueError, TypeError) as error:
+        raise RunError(f"{path}: {error}. Write it as it was, or start a new --output.") from error
+
+
+def _method(settings: dict[str, Any]) -> MethodConfig:
+    """Raises ValueError for a setting that there is not, of another kind or out of its range."""
+    method = from_dict(MethodConfig, settings, "")
+    for section in SECTIONS[1:]:
+        for each in numbers(getattr(method, section), (section,)):
+            if each.value is not None and each.range is not None and not each.range.holds(each.value):
+                raise ValueError(f"{'.'.join(each.path)} is {each.value}; it must be {each.range}")
+    return method
 
 
 def _makes_another(command: str, folder: Path) -> bool:

@@ -7,6 +7,7 @@ import difflib
 import typing
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from types import UnionType
 from typing import Any
@@ -27,6 +28,12 @@ def to_dict(config: Any) -> dict[str, Any]:
     return plain(dataclasses.asdict(config))
 
 
+@cache
+def hints_of(kind: type) -> dict[str, Any]:
+    """What each field of a config class holds, with its notes: texts of the source, which take long to evaluate."""
+    return typing.get_type_hints(kind, include_extras=True)
+
+
 def differences(old: dict[str, Any], new: dict[str, Any], prefix: str = "") -> list[str]:
     """Lines that say which settings differ, e.g. `growth.threshold: 0.0002 -> 0.0004`."""
     lines = []
@@ -45,7 +52,7 @@ def from_dict(kind: type, values: Mapping[str, Any], where: str = "settings") ->
     Raises ValueError, naming the setting, for one that the class does not have or of another kind. `where` is the group
     that it all stands in.
     """
-    hints = typing.get_type_hints(kind, include_extras=True)
+    hints = hints_of(kind)
     unknown = sorted(values.keys() - hints.keys(), key=str)
     if unknown:
         raise ValueError(f"{where or 'this file'} has no {unknown[0]!r}{suggestion(str(unknown[0]), hints)}")

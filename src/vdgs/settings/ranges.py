@@ -17,6 +17,7 @@ from types import UnionType
 from typing import Any
 
 from vdgs.errors import VdgsError
+from vdgs.settings.plain import hints_of
 
 #: More than anything that is counted: iterations, anchors, photographs.
 MANY = 1_000_000_000
@@ -101,7 +102,7 @@ def refuse(settings: Any) -> None:
 
 def numbers(settings: Any, within: tuple[str, ...] = ()) -> Iterator[Number]:
     """Every number of a dataclass and of those in it. Where a field may hold one but does not, its value is None."""
-    hints = typing.get_type_hints(type(settings), include_extras=True)
+    hints = hints_of(type(settings))
     for field in dataclasses.fields(settings):
         value, hint = getattr(settings, field.name), hints[field.name]
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
