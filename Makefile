@@ -9,6 +9,8 @@ SOURCES = $(shell find native src/vdgs/kernels/shared -name "*.h" -o -name "*.cp
 
 # torch's threads block instead of spinning beside the kernels' own.
 export OMP_WAIT_POLICY = PASSIVE
+# What one process of the tests has compiled, the others find.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup demo test lint types clean
 

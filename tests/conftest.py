@@ -121,7 +121,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     if any(argument.partition("::")[0].endswith(".py") for argument in config.args):
         return 0
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MOST_WORKERS)
+    return min(cores + 1, MOST_WORKERS)  # one more: some tests wait for processes that start, and for browsers
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

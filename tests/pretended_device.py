@@ -19,7 +19,6 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes
-from torch.utils._pytree import tree_flatten
 
 import vdgs
 
@@ -83,7 +82,14 @@ class Memory:
 
 
 def tensors_in(values: Any) -> list[Tensor]:
-    return [each for each in tree_flatten(values)[0] if isinstance(each, Tensor)]
+    """Those among what an operation is given or makes. (Torch's own `tree_flatten` takes as long as the operation.)"""
+    if isinstance(values, Tensor):
+        return [values]
+    if isinstance(values, dict):
+        values = values.values()
+    elif not isinstance(values, list | tuple):
+        return []
+    return [tensor for each in values for tensor in tensors_in(each)]
 
 
 class Checked(TorchDispatchMode):
@@ -92,6 +98,10 @@ class Checked(TorchDispatchMode):
     def __init__(self, memory: Memory) -> None:
         super().__init__()
         self.memory = memory
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        return False  # nothing is compiled: what keeps the compiler out takes longer than most operations
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         given = tensors_in((args, kwargs))

@@ -270,7 +270,7 @@ def test_the_gradient_is_that_of_finite_differences():
 
 
 def test_photographs_of_unequal_brightness_are_told_from_the_scene():
-    config = replace(CONFIG, iterations=600, rates=replace(CONFIG.rates, exposure=(0.005, 5e-4)))
+    config = replace(CONFIG, iterations=300, rates=replace(CONFIG.rates, exposure=(0.005, 5e-4)))
     config = replace(config, anchors=replace(config.anchors, appearance=0))
     state, unequal = fitted(config)
     plain = run(start(config), replace(stage(config), images=Unequal()))

@@ -21,7 +21,7 @@ from vdgs.runs.visibility import visibility_of_run
 
 #: As few and as small as lets anchors grow, blocks train and PSNR say something.
 SETTINGS = (
-    "--preset", "laptop", "--iterations", "60", "--anchors.offsets", "2", "--anchors.voxel", "0.8",
+    "--preset", "laptop", "--iterations", "40", "--anchors.offsets", "2", "--anchors.voxel", "0.8",
     "--rates.features", "0.03", "0.03", "--growth.start", "10", "--growth.statistics-from", "0",
     "--growth.gate", "0.05", "--growth.interval", "10", "--growth.max-anchors", "200",
 )  # fmt: skip
