@@ -102,7 +102,8 @@ def refuse(settings: Any) -> None:
 
 def numbers(settings: Any, within: tuple[str, ...] = ()) -> Iterator[Number]:
     """Every number of a dataclass and of those in it. Where a field may hold one but does not, its value is None."""
-    hints = hints_of(type(settings))
+    kind: type = type(settings)
+    hints = hints_of(kind)
     for field in dataclasses.fields(settings):
         value, hint = getattr(settings, field.name), hints[field.name]
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
