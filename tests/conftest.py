@@ -1,8 +1,8 @@
 """Shared by all tests: shapes are checked at run time, nothing depends on the clock, figures need no screen.
 
 The whole suite runs on all cores (pytest-xdist, one worker more than those, at most four); single files run here and
-now, without workers.
-Modules whose fixtures are expensive are marked as one group each (`xdist_group`): one worker runs them.
+now, without workers. Modules whose fixtures are expensive are marked as one group each (`xdist_group`): one worker runs
+them.
 """
 
 from __future__ import annotations

@@ -52,11 +52,23 @@ def test_one_process_at_a_time(tmp_path):
         pass
 
 
-@pytest.mark.parametrize("text", ["", "capture: [", "- 1\n- 2", "\x00\x01"])
+@pytest.mark.parametrize(
+    "text",
+    ["", "capture: [", "- 1\n- 2", "\x00\x01", "capture: 2026-13-45", pytest.param("[" * 100_000, id="nested deeply")],
+)
 def test_a_damaged_config_is_named(tmp_path, text):
     (tmp_path / "config.yaml").write_text(text)
     with pytest.raises(RunError, match=r"config\.yaml"):
         RunFolder(tmp_path).settings()
+
+
+def test_who_changes_the_settings_that_were_read_changes_none_of_the_run(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    run.begin(settings())
+    run.settings()["training"]["seed"] = 5
+    assert run.settings() == settings()
+    run.config.write(settings(seed=7))
+    assert run.settings() == settings(seed=7)
 
 
 def test_not_a_run(tmp_path):
