@@ -1,12 +1,14 @@
 """Where the time of one whole training step goes: cull, decode, rasterise, loss, its way back to the
 splats, from them to anchors that move, statistics.
 
-    python benchmarks/step.py [--threads 2] [--visible 20000]
+    python benchmarks/step.py [--threads 2] [--visible 20000] [--own 0.125]
 
 A random anchor scene seen from above, in which all anchors are visible, with about half of the opacities positive
-(what a fresh decoder gives). Prints the median of each phase. Memory is the slope of the peak resident size of fresh
-processes over the number of anchors: of those in view, with all that a step makes of them, and of those out of view;
-and for a model half in view the whole process without what it imports. Saving is what it adds to the resident size.
+(what a fresh decoder gives). Prints the median of each phase. With `--own` it is the step of a block: this share of
+the anchors, to the left, is trained, the others are drawn and never move. Memory is the slope of the peak resident size
+of fresh processes over the number of anchors: of those in view, with all that a step makes of them, and of those out of
+view; and for a model half in view the whole process without what it imports. Saving is what it adds to the resident
+size.
 """
 
 from __future__ import annotations
@@ -30,18 +32,19 @@ import torch
 from machine import describe
 from vdgs.cameras import Camera
 from vdgs.kernels import choose, set_threads
+from vdgs.kernels.types import OrderedSplats
 from vdgs.memory.process import forget_peak, peak_memory_bytes
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.model.render import decode_rows_to_train, visible_rows
 from vdgs.settings.method import TrainConfig
 from vdgs.storage.checkpoints import save_state
-from vdgs.training import Stage, start_state, to_saved
+from vdgs.training import Stage, Surroundings, start_state, to_saved
 from vdgs.training.optimiser import rates_at
 from vdgs.training.step import draw_view, move_anchors
 from vdgs.training.target import Target
 
-PHASES = ("cull", "decode", "rasterise", "loss", "solid", "backward", "move", "statistics")
+PHASES = ("cull", "decode", "around", "rasterise", "loss", "solid", "backward", "move", "statistics")
 
 
 def scene(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Anchors, Camera]:
@@ -81,7 +84,7 @@ def timed_phase(
 
 def one_step(
     state: Any, camera: Camera, target: torch.Tensor, step: int, times: dict[str, list[float]],
-    synchronise: Callable[[], None] | None = None,
+    synchronise: Callable[[], None] | None = None, surroundings: Surroundings | None = None,
 ) -> tuple[int, int]:  # fmt: skip
     """The work of vdgs.training.train_step, phase by phase, where the anchors are; `synchronise` waits for it."""
     device = state.anchors.positions.device
@@ -94,7 +97,8 @@ def one_step(
     with torch.no_grad():
         rows = timed("cull", lambda: visible_rows(state.anchors, camera))
         waiting = [timed("decode", lambda: decode_rows_to_train(state.anchors, rows, weights, camera))]
-        view = timed("rasterise", lambda: draw_view(waiting.pop(), camera, torch.zeros(3, device=device)))
+        around = timed("around", lambda: None if surroundings is None else decoded(surroundings, camera))
+        view = timed("rasterise", lambda: draw_view(waiting.pop(), camera, torch.zeros(3, device=device), around))
     view.image.requires_grad_(True)
 
     def loss() -> torch.Tensor:
@@ -119,6 +123,12 @@ def one_step(
     return len(rows), len(view.source)
 
 
+def decoded(surroundings: Surroundings, camera: Camera) -> OrderedSplats:
+    """What lies around a block, as the view sees it."""
+    anchors, weights = surroundings.anchors, surroundings.decoder.for_image(0)
+    return decode_rows_to_train(anchors, visible_rows(anchors, camera), weights, camera)
+
+
 def prepare(
     visible: int, width: int, height: int, hidden: int = 0, device: torch.device | None = None
 ) -> tuple[Any, Camera, torch.Tensor]:
@@ -132,11 +142,23 @@ def prepare(
     return state, camera, target.to(device)
 
 
-def measure(visible: int, width: int, height: int, repeats: int) -> None:
+def cut(state: Any, own: float) -> tuple[Any, Surroundings]:
+    """The training of the leftmost share of the anchors, and the others, which stay."""
+    x = state.anchors.positions[:, 0]
+    left = x < torch.quantile(x, own)
+    nothing: Any = None
+    block = start_state(state.anchors.select(left), state.decoder, Stage(TrainConfig(), nothing, 1, 1.0, 1.0))
+    return block, Surroundings(state.anchors.select(~left), state.decoder.copy())
+
+
+def measure(visible: int, width: int, height: int, repeats: int, own: float) -> None:
     state, camera, target = prepare(visible, width, height)
+    surroundings = None
+    if own < 1:
+        state, surroundings = cut(state, own)
     times: dict[str, list[float]] = {phase: [] for phase in PHASES}
     for step in range(1, repeats + 4):
-        seen, splats = one_step(state, camera, target, step, times)
+        seen, splats = one_step(state, camera, target, step, times, surroundings=surroundings)
     medians = {phase: stats.median(values[3:]) for phase, values in times.items()}
     total = stats.median(sum(step) for step in zip(*(values[3:] for values in times.values()), strict=True))
     parts = "  ".join(f"{phase} {value:.1f}" for phase, value in medians.items())
@@ -177,6 +199,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--visible", type=int, default=20_000)
+    parser.add_argument("--own", type=float, default=1.0)
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--peak", type=int, nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -186,8 +209,9 @@ def main() -> None:
     set_threads(arguments.threads)
     print(describe())
     for width, height in ((400, 300), (800, 600)):
-        measure(arguments.visible, width, height, arguments.repeats)
-    report_memory()
+        measure(arguments.visible, width, height, arguments.repeats, arguments.own)
+    if arguments.own == 1:
+        report_memory()
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -9,7 +10,24 @@ import torch
 from torch import Tensor
 
 from vdgs.kernels.runs import Runs
-from vdgs.kernels.types import OrderedSplats, Splats
+from vdgs.kernels.types import OrderedSplats, RasterPullback, Splats
+
+
+def first_gradients_are_those_of_all(
+    pullback: Callable[[], RasterPullback], splats: int, width: int, height: int
+) -> None:
+    """Assert that the way back of a picture gives the first splats the bits that it gives them among all."""
+    g = torch.Generator().manual_seed(5)
+    by_image, by_alpha = torch.randn(height, width, 3, generator=g), torch.randn(height, width, generator=g)
+    whole = pullback()(by_image, by_alpha)
+    for count in sorted({0, min(1, splats), splats // 30, splats // 3, splats}):
+        room = torch.full((count, 2), torch.nan), torch.full((count, 3), torch.nan)
+        *found, background = pullback()(by_image, by_alpha, over=room, count=count)
+        assert found[0] is room[0]
+        assert found[1] is room[1]
+        assert torch.equal(background, whole.background)
+        for few, all_of_them in zip(found, whole, strict=False):
+            assert few is all_of_them is None or torch.equal(few, all_of_them[:count])
 
 
 def splats_of(tensors: tuple[Tensor, ...]) -> tuple[Splats, Tensor]:

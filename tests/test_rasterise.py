@@ -6,6 +6,7 @@ import gc
 import inspect
 import os
 import threading
+from dataclasses import fields
 from functools import cache
 
 import numpy as np
@@ -16,10 +17,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from native_choice import on_threads
-from rasterise_scenes import Scene, make_scene, splats_of
+from rasterise_scenes import Scene, first_gradients_are_those_of_all, make_scene, splats_of
 from vdgs.kernels import constants
 from vdgs.kernels.native.module import load, supported
-from vdgs.kernels.native.rasterise import rasterise, shares
+from vdgs.kernels.native.rasterise import rasterise, rasterise_vjp, shares
 from vdgs.kernels.reference.rasterise import rasterise as reference
 from vdgs.kernels.reference.shares import shares as twin
 from vdgs.kernels.types import Raster, Splats
@@ -106,6 +107,33 @@ def test_picture_and_gradients_equal_the_reference(name: str, isa: str) -> None:
     for a, e in zip(scene.tensors, exact_gradients, strict=True):
         # A mean or conic is known to 6e-8; a splat seen edge-on multiplies that.
         assert_close(a.grad, e, 2e-3 if name == "edge-on" else 5e-5)
+
+
+@pytest.mark.parametrize("isa", ISAS)
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("depth", [False, True])
+def test_gradients_of_the_first_splats_alone_have_the_bits_that_they_have_among_all(name: str, isa: str, depth: bool):
+    scene = SCENES[name]
+    size, module = (scene.width, scene.height), load(isa)
+    splats, background = splats_of(tuple(tensor.detach() for tensor in scene.tensors))
+    first_gradients_are_those_of_all(
+        lambda: rasterise_vjp(splats, background, *size, depth=depth, module=module)[1], len(splats.depths), *size
+    )
+
+
+@pytest.mark.parametrize("isa", ISAS)
+@pytest.mark.parametrize("order", ["as they come", "near first", "far first"])
+def test_so_they_have_in_several_slabs(order: str, isa: str):
+    scene = crowd(True)
+    splats, background = splats_of(tuple(tensor.detach() for tensor in scene.tensors))
+    if order != "as they come":
+        rows = splats.depths.argsort(descending=order == "far first")
+        splats = Splats(*(getattr(splats, field.name)[rows] for field in fields(Splats)))
+    module = load(isa)
+    assert rasterise_vjp(splats, background, 20, 18, module=module)[1].frame.statistics["slabs"] > 1  # type: ignore
+    first_gradients_are_those_of_all(
+        lambda: rasterise_vjp(splats, background, 20, 18, module=module)[1], len(splats.depths), 20, 18
+    )
 
 
 @pytest.mark.parametrize("isa", ISAS)

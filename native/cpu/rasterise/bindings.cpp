@@ -76,7 +76,8 @@ void py_backward(std::shared_ptr<Frame> frame, const nb::tuple& background, std:
                  std::optional<MutableFloats> depths, MutableFloats background_gradient) {
   const auto pointer = [](const std::optional<Floats>& a) { return a ? a->data() : nullptr; };
   const PictureGradients in{pointer(image), pointer(alpha), pointer(depth)};
-  const SplatGradients out{means.data(),
+  const SplatGradients out{static_cast<int64_t>(opacities.shape(0)),
+                           means.data(),
                            conics.data(),
                            colours.data(),
                            opacities.data(),

@@ -35,7 +35,7 @@ struct alignas(64) Record {
   float best_x_per_y;  // -b/a
   float opacity;
   uint32_t columns, rows;  // tiles of the splat's box: first | last << 16; none if columns is kNoTiles
-  uint32_t unused;
+  uint32_t splat;          // row of the input
 };
 constexpr uint32_t kNoTiles = 1;  // first 1, last 0
 static_assert(sizeof(Record) == 64);
@@ -169,7 +169,7 @@ void scatter_entries(const TileGrid& grid, Slab& slab);
 
 void forward_tiles(Frame& frame, Slab& slab, bool last, const float background[3], const Picture& out,
                    bool counting);
-void backward_tiles(Frame& frame, const float background[3], const PictureGradients& in);
+void backward_tiles(Frame& frame, const float background[3], const PictureGradients& in, int64_t count);
 void reduce_gradients(Frame& frame, const SplatGradients& out);
 void share_tiles(Frame& frame, const float* lacking);
 void reduce_shares(Frame& frame, float* pixels, float* missing);

@@ -86,7 +86,7 @@ void backward(Frame& frame, const float background[3], const PictureGradients& i
               const SplatGradients& out) {
   const std::lock_guard<std::mutex> lock(frame.mutex);
   Stopwatch watch;
-  backward_tiles(frame, background, in);
+  backward_tiles(frame, background, in, out.count);
   frame.seconds[kBackward] = watch.lap();
   reduce_gradients(frame, out);
   frame.seconds[kReduce] = watch.lap();

@@ -50,8 +50,9 @@ struct PictureGradients {
   const float* depth;
 };
 
-// All overwritten, zero for splats that were not drawn.
+// Of the first `count` splats, which may be all. All overwritten, zero for splats that were not drawn.
 struct SplatGradients {
+  int64_t count;
   float* means;
   float* conics;
   float* colours;

@@ -47,7 +47,8 @@ VDGS_INLINE void derive(Sixteen& s, const TileGrid& grid) {
   store(s.rows, pack(zero_unless(drawn, rows.first), zero_unless(drawn, rows.last)));
 }
 
-Record record_of(const Sixteen& s, int k, const float* colour, float depth) {
+Record record_of(const Sixteen& s, int k, const Splats& splats, int32_t splat) {
+  const float* colour = splats.colours + 3 * static_cast<int64_t>(splat);
   const bool finite = std::fabs(colour[0]) + std::fabs(colour[1]) + std::fabs(colour[2]) < __builtin_inff();
   const uint32_t columns = finite ? static_cast<uint32_t>(s.columns[k]) : kNoTiles;
   return {s.x[k],
@@ -57,13 +58,13 @@ Record record_of(const Sixteen& s, int k, const float* colour, float depth) {
           s.vy[k],
           s.log2_opacity[k],
           {colour[0], colour[1], colour[2]},
-          depth,
+          splats.depths[splat],
           s.best_y[k],
           s.best_x[k],
           s.opacity[k],
           columns,
           static_cast<uint32_t>(s.rows[k]),
-          0};
+          static_cast<uint32_t>(splat)};
 }
 
 }  // namespace
@@ -75,9 +76,7 @@ void make_records(const Splats& splats, const TileGrid& grid, const SlabPart& pa
     const int32_t* splat = part.splat.data() + i;
     gather_splats(splats, splat, n, sixteen);
     derive(sixteen, grid);
-    for (int k = 0; k < n; ++k)
-      records[i + k] =
-          record_of(sixteen, k, splats.colours + 3 * static_cast<int64_t>(splat[k]), splats.depths[splat[k]]);
+    for (int k = 0; k < n; ++k) records[i + k] = record_of(sixteen, k, splats, splat[k]);
   }
 }
 

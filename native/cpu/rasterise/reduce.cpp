@@ -1,4 +1,6 @@
 // Gradients and shares of the splats from the sums of their entries, added in a fixed order.
+#include <algorithm>
+
 #include "cpu/rasterise/frame.h"
 #include "simd/simd.h"
 #include "cpu/sums.h"
@@ -20,10 +22,10 @@ void clear(const SplatGradients& out, int64_t begin, int64_t end) {
 constexpr uint32_t kNowhere = UINT32_MAX;
 alignas(64) constexpr float kZeros[32] = {};
 
-// Adds up the entries of every splat of a part, front to back, as they lie in the tiles. The total takes the
+// Adds up the entries of the first picks of a part, front to back, as they lie in the tiles. The total takes the
 // place of the splat's first entry; part.scratch says of each pick where that is.
 template <size_t kStride>
-void add_entries(const Slab& slab, SlabPart& part) {
+void add_entries(const Slab& slab, SlabPart& part, uint32_t picks) {
   constexpr uint32_t kAhead = 24;
   const uint32_t *first = part.first.data(), *where = part.where.data();
   const uint32_t n_entries = static_cast<uint32_t>(part.n_entries);
@@ -33,6 +35,7 @@ void add_entries(const Slab& slab, SlabPart& part) {
   const auto row = [&](uint32_t k) { return touched[where[k]] ? sums + where[k] * kStride : kZeros; };
   DepthKey* total_of = part.scratch.reserve(static_cast<size_t>(part.count));
   for (int64_t i = 0; i < part.count; ++i) {
+    if (part.order[i].pick >= picks) continue;
     // The first kStride lanes; in the others is what lies behind a row, which nobody reads.
     F16 total = splat(0.0f);
     for (uint32_t k = first[i]; k < first[i + 1]; ++k) {
@@ -70,16 +73,18 @@ VDGS_INLINE void write_gradients(const Record& r, const float* sum, int64_t i, c
   if (out.depths) out.depths[i] = sum[kSumDepth];
 }
 
-// Adds up what the entries of all splats came to, and calls write(record, total, i) for each splat i that was drawn.
+// Adds up what the entries of the first n splats came to, and calls write(record, total, i) for each splat i of
+// them that was drawn.
 template <size_t kStride, class Write>
-void reduce(Frame& frame, const Write& write) {
+void reduce(Frame& frame, int64_t n, const Write& write) {
   for (int s = 0; s < frame.n_slabs; ++s) {
     Slab& slab = *frame.slabs[s];
     parallel_for(slab.n_parts, [&](int64_t p) {
       SlabPart& part = *slab.parts[p];
-      add_entries<kStride>(slab, part);
+      const int32_t* splat = part.splat.data();  // ascending
+      const size_t count = static_cast<size_t>(std::lower_bound(splat, splat + part.count, n) - splat);
+      add_entries<kStride>(slab, part, static_cast<uint32_t>(count));
       constexpr size_t kAhead = 16;
-      const size_t count = static_cast<size_t>(part.count);
       const auto total = [&](size_t k) {
         const uint32_t place = part.scratch[k].pick;
         return place == kNowhere ? kZeros : slab.sums + place * kStride;
@@ -90,17 +95,16 @@ void reduce(Frame& frame, const Write& write) {
           __builtin_prefetch(total(k + kAhead) + kStride - 1);
         }
         const Record& record = slab.records[static_cast<size_t>(part.begin) + k];
-        if (record.columns != kNoTiles) write(record, total(k), static_cast<int64_t>(part.splat[k]));
+        if (record.columns != kNoTiles) write(record, total(k), static_cast<int64_t>(splat[k]));
       }
     });
   }
 }
 
-// Calls clear(begin, end) for the splats, part by part.
+// Calls clear(begin, end) for n splats, part by part.
 template <class Clear>
-void clear_all(const Frame& frame, const Clear& clear) {
-  parallel_parts(frame.n_splats, n_parts(frame.n_splats, 16384),
-                 [&](int, int64_t begin, int64_t end) { clear(begin, end); });
+void clear_all(int64_t n, const Clear& clear) {
+  parallel_parts(n, n_parts(n, 16384), [&](int, int64_t begin, int64_t end) { clear(begin, end); });
 }
 
 }  // namespace
@@ -116,12 +120,12 @@ void room_for_sums(Frame& frame, size_t stride) {
 }
 
 void reduce_gradients(Frame& frame, const SplatGradients& out) {
-  clear_all(frame, [&](int64_t begin, int64_t end) { clear(out, begin, end); });
+  clear_all(out.count, [&](int64_t begin, int64_t end) { clear(out, begin, end); });
   const auto write = [&](const Record& r, const float* sum, int64_t i) { write_gradients(r, sum, i, out); };
   if (frame.with_depth)
-    reduce<n_sums(true)>(frame, write);
+    reduce<n_sums(true)>(frame, out.count, write);
   else
-    reduce<n_sums(false)>(frame, write);
+    reduce<n_sums(false)>(frame, out.count, write);
   for (size_t c = 0; c < 3; ++c) {
     double sum = 0;
     for (size_t tile = 0; tile < static_cast<size_t>(frame.grid.tiles()); ++tile)
@@ -131,12 +135,12 @@ void reduce_gradients(Frame& frame, const SplatGradients& out) {
 }
 
 void reduce_shares(Frame& frame, float* pixels, float* missing) {
-  clear_all(frame, [&](int64_t begin, int64_t end) {
+  clear_all(frame.n_splats, [&](int64_t begin, int64_t end) {
     const size_t n = static_cast<size_t>(end - begin);
     std::memset(pixels + begin, 0, 4 * n);
     std::memset(missing + 3 * begin, 0, 12 * n);
   });
-  reduce<kShares>(frame, [&](const Record&, const float* sum, int64_t i) {
+  reduce<kShares>(frame, frame.n_splats, [&](const Record&, const float* sum, int64_t i) {
     pixels[i] = sum[0];
     for (int64_t c = 0; c < 3; ++c) missing[3 * i + c] = sum[1 + c];
   });

@@ -53,18 +53,20 @@ def pulled_back(
         alpha: Tensor | None = None,
         depth: Tensor | None = None,
         over: tuple[Tensor, Tensor] | None = None,
+        count: int | None = None,
     ) -> RasterGradients:
         made = {"image": image, "alpha": alpha, "depth": depth}
         received = {name: gradient for name, gradient in made.items() if gradient is not None}
-        found = torch.autograd.grad(
+        *by_splats, by_background = torch.autograd.grad(
             [getattr(drawn, name) for name in received], leaves, list(received.values()),
             allow_unused=True, materialize_grads=True,
         )  # fmt: skip
-        for place, gradient in zip(over or (), found, strict=False):
+        by_means, by_conics, by_colours, by_opacities, by_depths = (each[:count] for each in by_splats)
+        for place, gradient in zip(over or (), (by_means, by_conics), strict=False):
             place.copy_(gradient)
-        means, conics = over or found[:2]
-        of_depths = None if drawn.depth is None else found[4]
-        return RasterGradients(means, conics, found[2], found[3], of_depths, found[5])
+        means, conics = over or (by_means, by_conics)
+        of_depths = None if drawn.depth is None else by_depths
+        return RasterGradients(means, conics, by_colours, by_opacities, of_depths, by_background)
 
     shown_depth = None if drawn.depth is None else drawn.depth.detach()
     return Raster(drawn.image.detach(), drawn.alpha.detach(), shown_depth, drawn.median_depth), pullback

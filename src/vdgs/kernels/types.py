@@ -250,10 +250,12 @@ class RasterPullback(Protocol):
         alpha: Tensor | None = None,
         depth: Tensor | None = None,
         over: tuple[Tensor, Tensor] | None = None,
+        count: int | None = None,
     ) -> RasterGradients:
         """Gradients by image [h,w,3], alpha [h,w] and depth [h,w]; None is zero. To be called once.
 
-        Those of means_px and conics overwrite the contiguous tensors `over` [m,2] and [m,3], if given.
+        Those of the first `count` splats (None: of all m). Those of means_px and conics overwrite the contiguous
+        tensors `over` [count,2] and [count,3], if given.
         """
         ...
 

@@ -45,7 +45,7 @@ class TrainingView:
     #: Mean volume of the splats; NaN if there are none.
     volume: Float[Tensor, ""]
     pullback: RasterPullback
-    #: What the gradients of means_px and conics, of these splats and then of those around them, may overwrite.
+    #: What the gradients of means_px and conics of these splats may overwrite.
     room: tuple[Tensor, Tensor]
 
     @torch.no_grad()
@@ -59,12 +59,12 @@ class TrainingView:
         """Gradients of a loss: `image` by the picture, `alpha` by its alpha and `depth` by its depth (None: zero),
         `volume_weight` by the mean volume. Call it once."""
         m = len(self.source)
-        means_px, conics, colours, opacities, depths, _ = self.pullback(image, alpha, depth, over=self.room)
+        found = self.pullback(image, alpha, depth, over=self.room, count=m)
         # In float32, as autograd divides.
         volume = float(torch.tensor(volume_weight) / m) if m else 0.0
         return SplatGradients(
-            means_px[:m], conics[:m], colours[:m], opacities[:m], volume, self.source, self.colours, self.opacities,
-            None if depth is None or depths is None else depths[:m],
+            found.means_px, found.conics, found.colours, found.opacities, volume, self.source, self.colours,
+            self.opacities, None if depth is None else found.depths,
         )  # fmt: skip
 
 
@@ -78,12 +78,12 @@ def draw_view(
 ) -> TrainingView:
     """Draw the splats of trained anchors with those `around` them, on request with depth. The tensors of `splats` are
     the view's from now on: their memory is used again."""
-    drawn = splats if around is None else splats.joined(around)
+    m, drawn = len(splats.source), splats if around is None else splats.joined(around)
     kernels = choose(drawn.means_px.device)
     raster, pullback = kernels.rasterise_vjp(drawn, background, camera.width, camera.height, depth=depth)
     return TrainingView(
         raster.image, raster.alpha, raster.depth, splats.source, splats.colours, splats.opacities,
-        splats.volume, pullback, (drawn.means_px, drawn.conics),
+        splats.volume, pullback, (drawn.means_px[:m], drawn.conics[:m]),
     )  # fmt: skip
 
 

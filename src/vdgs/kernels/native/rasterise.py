@@ -104,8 +104,9 @@ class _Pullback:
         alpha: Tensor | None = None,
         depth: Tensor | None = None,
         over: tuple[Tensor, Tensor] | None = None,
+        count: int | None = None,
     ) -> RasterGradients:
-        n = self.count
+        n = self.count if count is None else count
         means, conics = over or (torch.empty(n, 2), torch.empty(n, 3))
         colours, opacities, background = torch.empty(n, 3), torch.empty(n), torch.empty(3)
         depths = torch.empty(n) if self.with_depth else None
