@@ -1,6 +1,6 @@
-"""Constants of the image formation model, shared by every implementation.
+"""Constants of the image formation model and the loss, shared by every implementation.
 
-They are repeated in kernels/shared/image_formation.h; a test holds the two against each other.
+The former are repeated in kernels/shared/image_formation.h; a test holds the two against each other.
 """
 
 #: A splat contributes to a pixel where its alpha is at least this.
@@ -15,3 +15,5 @@ MEDIAN_TRANSMITTANCE = 0.5
 DILATION_PX2 = 0.3
 #: The Jacobian of the projection is taken no further out than this many half-angles of the frustum.
 FRUSTUM_MARGIN = 1.3
+#: Side of the Gaussian window of SSIM (Wang et al. 2004).
+SSIM_WINDOW_PX = 11

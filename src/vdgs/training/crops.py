@@ -40,6 +40,10 @@ WHOLE_EVERY = 4
 MOST_STEPS = 4.0
 
 
+#: Left, top, right, bottom of a part of a picture in pixels: [left, right).
+Box = tuple[int, int, int, int]
+
+
 @dataclass(frozen=True)
 class Crop:
     """A rectangle in a photograph, its sides as shares of the width and height."""
@@ -54,8 +58,8 @@ class Crop:
         """Share of the photograph's pixels."""
         return (self.right - self.left) * (self.bottom - self.top)
 
-    def pixels(self, width: int, height: int) -> tuple[int, int, int, int]:
-        """Left, top, right, bottom in a photograph of that size, at least one pixel wide and high: [left, right)."""
+    def pixels(self, width: int, height: int) -> Box:
+        """Where it is in a photograph of that size, at least one pixel wide and high."""
         left, top = (math.floor(share * size) for share, size in ((self.left, width), (self.top, height)))
         left, top = min(left, width - 1), min(top, height - 1)
         return left, top, max(math.ceil(self.right * width), left + 1), max(math.ceil(self.bottom * height), top + 1)

@@ -21,14 +21,16 @@ from vdgs.model.render import decode_rows, decode_rows_to_train, visible_rows
 from vdgs.model.sizes import SPREAD
 from vdgs.training.averaging import Average, counts_in_mean
 from vdgs.training.background import background_at
+from vdgs.training.crops import Box
 from vdgs.training.growing import grow, reorder
 from vdgs.training.objective import compare
 from vdgs.training.optimiser import rates_at
+from vdgs.training.reach import part_reached
 from vdgs.training.schedule import downscale_at, view_at
 from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
 from vdgs.training.state import Stage, StepReport, TrainingState
 from vdgs.training.step import coast_anchors, draw_view, move_anchors
-from vdgs.training.target import target_at
+from vdgs.training.target import box_at, part_of, target_at
 from vdgs.training.thinning import thinned
 
 #: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
@@ -49,16 +51,17 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     config, iteration = stage.config, state.iteration
     downscale = downscale_at(iteration, config)
     view = view_at(iteration, stage.image_count, config.seed, stage.shares)
-    target = target_at(stage, view, downscale, iteration)
-    camera = target.camera
+    box = box_at(stage, view, downscale, iteration)
+    camera = part_of(stage.images.camera(view, downscale), box)
 
     rows = visible_rows(state.anchors, camera)
     weights = state.decoder.for_image(appearance_at(stage, view))
-    around = _surroundings(stage, view, camera)
     background = background_at(stage, iteration)
     with torch.no_grad():
         splats = _splats(state, stage, rows, weights, camera)
-        drawn = draw_view(splats, camera, background, around, stage.draws_depth)
+        target = target_at(stage, view, downscale, _narrowed(box, part_reached(stage, splats, camera), splats))
+        around = _surroundings(stage, view, target.camera)
+        drawn = draw_view(splats, target.camera, background, around, stage.draws_depth)
     compared = compare(drawn, target, state.decoder, appearance_at(stage, view), config)
     volume_weight, loss = _volume_weight(stage), compared.loss
     if volume_weight and len(drawn.source):
@@ -94,6 +97,15 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     _smooth(state, value, psnr)
     state.whole = True
     return report
+
+
+def _narrowed(box: Box, part: Box | None, splats: TrainingSplats) -> Box:
+    """The part of a box as a part of the whole picture; splats of the box are moved there."""
+    if part is None:
+        return box
+    left, top, right, bottom = part
+    splats.means_px.sub_(splats.means_px.new_tensor([left, top]))
+    return box[0] + left, box[1] + top, box[0] + right, box[1] + bottom
 
 
 def _splats(

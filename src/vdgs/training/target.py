@@ -10,7 +10,7 @@ from torch import Tensor
 from vdgs.cameras import Camera
 from vdgs.kernels.moving import upload
 from vdgs.model.ground import at_size
-from vdgs.training.crops import WHOLE, crop_at
+from vdgs.training.crops import Box, crop_at
 from vdgs.training.depths import PixelDepths
 from vdgs.training.state import Stage
 
@@ -55,25 +55,33 @@ class Target:
         return (shown * (root - NEARLY_OPAQUE**0.5)).sum(), shown / (-2.0 * root)
 
 
-def target_at(stage: Stage, view: int, downscale: int, iteration: int) -> Target:
-    """What iteration (from 0) is to draw of a view, on the stage's device."""
+def box_at(stage: Stage, view: int, downscale: int, iteration: int) -> Box:
+    """The part of a view that iteration (from 0) is to draw."""
+    camera = stage.images.camera(view, downscale)
+    return crop_at(stage.crops, view, iteration).pixels(camera.width, camera.height)
+
+
+def target_at(stage: Stage, view: int, downscale: int, box: Box) -> Target:
+    """A part of a view's photograph, and what is asked of it, on the stage's device."""
     image, mask = stage.images.get(view, downscale)
-    camera = whole = stage.images.camera(view, downscale)
-    crop, inside = crop_at(stage.crops, view, iteration), (slice(None), slice(None))
+    whole, (left, top, right, bottom) = stage.images.camera(view, downscale), box
+    camera, inside = part_of(whole, box), (slice(top, bottom), slice(left, right))
     # Counted and cut where the photograph is, before it is brought to the device.
     of_whole = counted_in(mask, whole)
-    if crop != WHOLE:
-        left, top, right, bottom = crop.pixels(whole.width, whole.height)
-        inside, camera = (slice(top, bottom), slice(left, right)), whole.cropped(left, top, right, bottom)
     mask = None if mask is None else mask[inside]
-    counted = of_whole if crop == WHOLE else counted_in(mask, camera)
+    counted = of_whole if camera is whole else counted_in(mask, camera)
     image = upload(image[inside], stage.device)
     mask = None if mask is None else upload(mask, stage.device)
     return Target(
         image, mask, _ground(stage, view, mask, inside, whole), camera,
-        share=counted / max(of_whole, 1) if crop != WHOLE else 1.0, counted=max(counted, 1),
+        share=1.0 if camera is whole else counted / max(of_whole, 1), counted=max(counted, 1),
         depths=_depths(stage, view, mask, camera), seldom=_seldom(stage, view, inside, whole),
     )  # fmt: skip
+
+
+def part_of(whole: Camera, box: Box) -> Camera:
+    """The camera of a part of a picture; itself for all of it."""
+    return whole if box == (0, 0, whole.width, whole.height) else whole.cropped(*box)
 
 
 def counted_in(mask: UInt8[Tensor, "h w"] | None, camera: Camera) -> int:

@@ -13,10 +13,10 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from vdgs.kernels.constants import SSIM_WINDOW_PX
 from vdgs.kernels.types import Photometric
 
-#: Side of the SSIM window and its standard deviation, in pixels.
-WINDOW_PX = 11
+#: Standard deviation of the SSIM window in pixels.
 SIGMA_PX = 1.5
 C1 = 0.01**2
 C2 = 0.03**2
@@ -66,7 +66,7 @@ def ssim_map(
 
 def window(dtype: torch.dtype = torch.float64) -> Float[Tensor, "taps"]:
     """The separable Gaussian window, of sum 1."""
-    offset = torch.arange(WINDOW_PX, dtype=torch.float64) - WINDOW_PX // 2
+    offset = torch.arange(SSIM_WINDOW_PX, dtype=torch.float64) - SSIM_WINDOW_PX // 2
     weight = torch.exp(-(offset**2) / (2 * SIGMA_PX**2))
     return (weight / weight.sum()).to(dtype)
 
@@ -95,7 +95,7 @@ def _unit_range(image: Tensor) -> Float[Tensor, "h w c"]:
 
 
 def _blur(planes: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
-    weight, half = window(planes.dtype).to(planes.device), WINDOW_PX // 2
+    weight, half = window(planes.dtype).to(planes.device), SSIM_WINDOW_PX // 2
     rows = conv2d(planes[:, None], weight[None, None, None, :], padding=(0, half))
     return conv2d(rows, weight[None, None, :, None], padding=(half, 0))[:, 0]
 
