@@ -90,8 +90,8 @@ def test_a_step_moves_a_block_as_if_it_had_drawn_all(monkeypatch, crop, decoder)
 
 def test_a_block_with_nothing_around_it_draws_all(monkeypatch):
     stage, state = block_stage(BlockConfig())
-    alone = replace(stage, surroundings=Surroundings(stage.surroundings.anchors.select(torch.zeros(0, dtype=torch.int64)), state.decoder))
-    camera, sizes, draw = stage.images.camera(0), [], loop.draw_view
-    monkeypatch.setattr(loop, "draw_view", lambda *given: sizes.append((given[1].width, given[1].height)) or draw(*given))
-    train_step(state, alone)
-    assert sizes == [(camera.width, camera.height)]
+    nothing = stage.surroundings.anchors.select(torch.zeros(0, dtype=torch.int64))
+    camera, drawn, draw = stage.images.camera(0), [], loop.draw_view
+    monkeypatch.setattr(loop, "draw_view", lambda *given: drawn.append(given[1]) or draw(*given))
+    train_step(state, replace(stage, surroundings=Surroundings(nothing, state.decoder)))
+    assert [(each.width, each.height) for each in drawn] == [(camera.width, camera.height)]

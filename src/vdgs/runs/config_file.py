@@ -18,7 +18,7 @@ from vdgs import __version__
 from vdgs.errors import RunError
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import differences, from_dict, to_dict
-from vdgs.settings.ranges import numbers, option
+from vdgs.settings.ranges import option, outside
 from vdgs.storage.files import write_text
 
 #: The parts of config.yaml.
@@ -96,9 +96,8 @@ def _method(settings: dict[str, Any]) -> MethodConfig:
     """Raises ValueError for a setting that there is not, of another kind or out of its range."""
     method = from_dict(MethodConfig, settings, "")
     for section in SECTIONS[1:]:
-        for each in numbers(getattr(method, section), (section,)):
-            if each.value is not None and each.range is not None and not each.range.holds(each.value):
-                raise ValueError(f"{'.'.join(each.path)} is {each.value}; it must be {each.range}")
+        for each in outside(getattr(method, section), (section,)):
+            raise ValueError(f"{'.'.join(each.path)} is {each.value}; it must be {each.range}")
     return method
 
 

@@ -86,11 +86,7 @@ def option(path: tuple[str, ...]) -> str:
 
 def problems(settings: Any, within: tuple[str, ...] = ()) -> list[str]:
     """One sentence for every number outside its range; empty if there is none. `within` names the groups around it."""
-    return [
-        f"{each.option} {each.value}: must be {each.range}"
-        for each in numbers(settings, within)
-        if each.value is not None and each.range is not None and not each.range.holds(each.value)
-    ]
+    return [f"{each.option} {each.value}: must be {each.range}" for each in outside(settings, within)]
 
 
 def refuse(settings: Any) -> None:
@@ -98,6 +94,13 @@ def refuse(settings: Any) -> None:
     found = problems(settings)
     if found:
         raise VdgsError(found[0] if len(found) == 1 else "\n  ".join(["These do not work:", *found]))
+
+
+def outside(settings: Any, within: tuple[str, ...] = ()) -> Iterator[Number]:
+    """Every number that is outside its range."""
+    for each in numbers(settings, within):
+        if each.value is not None and each.range is not None and not each.range.holds(each.value):
+            yield each
 
 
 def numbers(settings: Any, within: tuple[str, ...] = ()) -> Iterator[Number]:
