@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 
-from block_support import block_stage
+from block_support import block_stage, coarse
+from checkerboard import Photographs
 from rasterise_scenes import make_scene, splats_of
 from vdgs.kernels import choose
 from vdgs.kernels.reach import box_reached
 from vdgs.kernels.types import Splats
 from vdgs.settings.method import BlockConfig
-from vdgs.training import Surroundings, loop, start_state, train_step
+from vdgs.training import Stage, Surroundings, TrainingState, loop, start_state, train_step
 from vdgs.training.crops import Crop
 
 SCENES = {
@@ -52,40 +53,74 @@ def test_splats_that_are_not_drawn_open_no_box():
     assert box_reached(Splats(*(getattr(splats, name)[:0] for name in vars(splats))), 61, 47) is None
 
 
-def stepped(monkeypatch: pytest.MonkeyPatch, crop: Crop | None, narrow: bool, decoder: str = "frozen"):
-    """A block after its first step, and how large the picture was that it drew."""
-    stage, state = block_stage(BlockConfig())
-    stage = replace(stage, frozen_decoder=decoder == "frozen", crops=crop and (crop,) * stage.image_count)
-    west = state.anchors.select(state.anchors.positions[:, 0] < -2.6)
-    small = replace(west, log_scales=torch.full_like(west.log_scales, -2.0))
-    state = start_state(small, state.decoder, stage)
-    drawn = []
+@dataclass
+class Stepped:
+    """A block after its first step, how large the picture was that it drew, and how many splats around it took part."""
+
+    state: TrainingState
+    pixels: int
+    around: int
+
+
+class Masked(Photographs):
+    """Photographs of which a corner does not count."""
+
+    def get(self, index: int, downscale: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+        image, _ = super().get(index, downscale)
+        mask = torch.ones(image.shape[:2], dtype=torch.uint8)
+        mask[:14, :17] = 0
+        return image, mask
+
+
+def step(monkeypatch: pytest.MonkeyPatch, stage: Stage, own: bool, narrowing: bool) -> Stepped:
+    """The westernmost anchors, small, are the block; the others strew their Gaussians far over it and beyond."""
+    anchors, decoder = coarse()
+    west = anchors.positions[:, 0] < -2.6
+    small = anchors.select(west)
+    small = replace(small, log_scales=torch.full_like(small.log_scales, -2.0))
+    others = anchors.select(~west)
+    others = replace(others, offsets=8 * others.offsets)
+    stage = replace(stage, frozen_decoder=not own, surroundings=Surroundings(others, decoder.copy()))
+    state, drawn = start_state(small, decoder, stage), []
     with monkeypatch.context() as patch:
-        if not narrow:
-            patch.setattr(loop, "part_reached", lambda *_: None)
+        if not narrowing:
+            patch.setattr(loop, "narrow", lambda stage, splats, camera, box: box)
         draw = loop.draw_view
-        patch.setattr(loop, "draw_view", lambda *given: drawn.append(given[1]) or draw(*given))
+        patch.setattr(loop, "draw_view", lambda *given: drawn.append(given) or draw(*given))
         train_step(state, stage)
-    (camera,) = drawn
-    return state, (camera.width, camera.height)
+    ((_, camera, _, around, _),) = drawn
+    return Stepped(state, camera.width * camera.height, len(around.depths))
 
 
-@pytest.mark.parametrize("crop", [None, Crop(0.1, 0.1, 0.95, 0.9)], ids=["whole", "part"])
-@pytest.mark.parametrize("decoder", ["frozen", "own"])
-def test_a_step_moves_a_block_as_if_it_had_drawn_all(monkeypatch, crop, decoder):
-    found, (width, height) = stepped(monkeypatch, crop, True, decoder)
-    expected, (full_width, full_height) = stepped(monkeypatch, crop, False, decoder)
-    assert width * height < 0.9 * full_width * full_height
+def stages() -> dict[str, Stage]:
+    stage, _ = block_stage(BlockConfig())
+    ground = [torch.ones(3, 4, dtype=torch.bool)] * stage.image_count
+    opaque = replace(stage.config, loss=replace(stage.config.loss, alpha_weight=0.05, background_noise=0.3))
+    return {
+        "whole": stage,
+        "part": replace(stage, crops=(Crop(0.1, 0.1, 0.95, 0.9),) * stage.image_count),
+        "masked": replace(stage, images=Masked()),
+        "opaque": replace(stage, config=opaque, ground=ground),
+    }
+
+
+@pytest.mark.parametrize("name", stages())
+@pytest.mark.parametrize("own", [False, True], ids=["shared decoder", "own decoder"])
+def test_a_step_moves_a_block_as_if_it_had_drawn_all(monkeypatch, name, own):
+    found, expected = (step(monkeypatch, stages()[name], own, narrowing) for narrowing in (True, False))
+    assert found.pixels < 0.9 * expected.pixels
+    assert 10 < found.around < expected.around
+    ours, theirs = found.state, expected.state
     # Adam's first moments are a tenth of the gradients.
-    for ours, theirs in (
-        *((found.optimiser.anchors.first[name], each) for name, each in expected.optimiser.anchors.first.items()),
-        *((found.optimiser.decoder.first[name], each) for name, each in expected.optimiser.decoder.first.items()),
-        (found.statistics.gradient, expected.statistics.gradient),
+    for one, other in (
+        *((ours.optimiser.anchors.first[name], each) for name, each in theirs.optimiser.anchors.first.items()),
+        *((ours.optimiser.decoder.first[name], each) for name, each in theirs.optimiser.decoder.first.items()),
+        (ours.statistics.gradient, theirs.statistics.gradient),
     ):  # fmt: skip
-        assert torch.allclose(ours, theirs, rtol=1e-3, atol=1e-5 * float(theirs.abs().max()))
-    assert float(expected.statistics.gradient.max()) > 0
+        assert torch.allclose(one, other, rtol=1e-3, atol=1e-5 * float(other.abs().max()))
+    assert float(theirs.statistics.gradient.max()) > 0
     for name in ("drawn", "opacity", "seen"):
-        assert torch.equal(getattr(found.statistics, name), getattr(expected.statistics, name))
+        assert torch.equal(getattr(ours.statistics, name), getattr(theirs.statistics, name))
 
 
 def test_a_block_with_nothing_around_it_draws_all(monkeypatch):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Int32
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 from vdgs.kernels.constants import ALPHA_MIN
@@ -12,6 +12,12 @@ from vdgs.kernels.types import Splats
 
 @torch.no_grad()
 def reach_px(splats: Splats) -> Int32[Tensor, "m 2"]:
+    """`reach` in whole pixels, rounded up; what is larger than any picture is cut."""
+    return reach(splats).clamp(max=2.0**20).to(torch.int32)
+
+
+@torch.no_grad()
+def reach(splats: Splats) -> Float[Tensor, "m 2"]:
     """How far from its centre, in x and y, a splat's alpha is at least 1/255; 0 for one that is not to be drawn.
 
     Those are the splats of which a number is not finite, or whose conic is not positive definite. On the ellipse
@@ -27,18 +33,18 @@ def reach_px(splats: Splats) -> Int32[Tensor, "m 2"]:
     drawn = rows.isfinite().all(dim=1) & (a > 0) & (c > 0) & (determinant > 0) & (opacities >= ALPHA_MIN)
     level = 2 * torch.log(opacities.clamp(min=ALPHA_MIN) / ALPHA_MIN)
     squares = torch.stack([c, a], dim=1) * (level / determinant).to(level.dtype)[:, None]
-    # Rounded up, and a pixel for what rounding makes of the other numbers; what is larger covers every picture.
-    reach = torch.ceil(torch.sqrt(squares)).clamp(max=2.0**20) + 1
-    return torch.where(drawn[:, None], reach, torch.zeros_like(reach)).to(torch.int32)
+    # A pixel more for what rounding makes of the other numbers.
+    far = torch.ceil(torch.sqrt(squares)) + 1
+    return torch.where(drawn[:, None], far, torch.zeros_like(far))
 
 
 @torch.no_grad()
 def box_reached(splats: Splats, width: int, height: int) -> tuple[int, int, int, int] | None:
     """Left, top, right, bottom of the pixels of a picture that splats may reach, [left, right); None if they reach
     none. Asks for numbers: a card is waited for."""
-    reach, size = reach_px(splats), splats.means_px.new_tensor([width, height])
-    low, high = splats.means_px - reach, splats.means_px + reach
-    inside = ((reach > 0) & (high > 0) & (low < size)).all(dim=1)
+    far, size = reach(splats), splats.means_px.new_tensor([width, height])
+    low, high = splats.means_px - far, splats.means_px + far
+    inside = ((far > 0) & (high > 0) & (low < size)).all(dim=1)
     if not inside.any():
         return None
     first = low[inside].amin(dim=0).floor().clamp(min=0)

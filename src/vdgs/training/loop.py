@@ -21,11 +21,10 @@ from vdgs.model.render import decode_rows, decode_rows_to_train, visible_rows
 from vdgs.model.sizes import SPREAD
 from vdgs.training.averaging import Average, counts_in_mean
 from vdgs.training.background import background_at
-from vdgs.training.crops import Box
 from vdgs.training.growing import grow, reorder
 from vdgs.training.objective import compare
 from vdgs.training.optimiser import rates_at
-from vdgs.training.reach import part_reached
+from vdgs.training.reach import narrow
 from vdgs.training.schedule import downscale_at, view_at
 from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
 from vdgs.training.state import Stage, StepReport, TrainingState
@@ -59,8 +58,8 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     background = background_at(stage, iteration)
     with torch.no_grad():
         splats = _splats(state, stage, rows, weights, camera)
-        target = target_at(stage, view, downscale, _narrowed(box, part_reached(stage, splats, camera), splats))
-        around = _surroundings(stage, view, target.camera)
+        target = target_at(stage, view, downscale, narrow(stage, splats, camera, box))
+        around = _surroundings(stage, view, camera, target.camera)
         drawn = draw_view(splats, target.camera, background, around, stage.draws_depth)
     compared = compare(drawn, target, state.decoder, appearance_at(stage, view), config)
     volume_weight, loss = _volume_weight(stage), compared.loss
@@ -99,15 +98,6 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     return report
 
 
-def _narrowed(box: Box, part: Box | None, splats: TrainingSplats) -> Box:
-    """The part of a box as a part of the whole picture; splats of the box are moved there."""
-    if part is None:
-        return box
-    left, top, right, bottom = part
-    splats.means_px.sub_(splats.means_px.new_tensor([left, top]))
-    return box[0] + left, box[1] + top, box[0] + right, box[1] + bottom
-
-
 def _splats(
     state: TrainingState, stage: Stage, rows: Tensor, weights: DecoderWeights, camera: Camera
 ) -> TrainingSplats:
@@ -120,13 +110,14 @@ def _splats(
 
 
 @torch.no_grad()
-def _surroundings(stage: Stage, view: int, camera: Camera) -> OrderedSplats | None:
-    """The splats of the frozen anchors around a block: drawn, but out of autograd's sight."""
+def _surroundings(stage: Stage, view: int, camera: Camera, part: Camera) -> OrderedSplats | None:
+    """The splats in a part of a view of the frozen anchors around a block: drawn, but out of autograd's sight."""
     around = stage.surroundings
     if around is None or not len(around.anchors):
         return None
     weights = around.decoder.for_image(appearance_at(stage, view))
-    return decode_rows_to_train(around.anchors, visible_rows(around.anchors, camera), weights, camera)
+    # Of anchors that the whole view shows: one that strews its Gaussians may stand beside the part that they cover.
+    return decode_rows_to_train(around.anchors, visible_rows(around.anchors, camera), weights, part)
 
 
 def appearance_at(stage: Stage, view: int) -> int:

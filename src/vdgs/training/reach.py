@@ -13,16 +13,27 @@ from vdgs.training.state import Stage
 MARGIN_PX = SSIM_WINDOW_PX - 1
 
 
-def part_reached(stage: Stage, splats: Splats, camera: Camera) -> Box | None:
-    """The part of a stage's view that its splats reach and what the loss looks at beside it, in pixels; None: all of
-    it, or nearly so.
+def narrow(stage: Stage, splats: Splats, camera: Camera, box: Box) -> Box:
+    """What is to be drawn of a box of a view, which `camera` shows, so that gradients of a stage's splats in it are the
+    same but for rounding. The means of the splats, in pixels of the box, become pixels of that, in place.
 
-    The gradients of the splats are the same, but for rounding. What is asked of depth are means over all points that
-    a view shows, so such views are drawn as a whole; and a card would be waited for.
+    What is asked of depth are means over all points that a view shows, so such views are drawn as a whole; and a card
+    would be waited for.
     """
     around = stage.surroundings
     if around is None or not len(around.anchors) or stage.draws_depth or stage.device.type != "cpu":
-        return None
+        return box
+    part = part_reached(splats, camera)
+    if part is None:
+        return box
+    left, top, right, bottom = part
+    splats.means_px.sub_(splats.means_px.new_tensor([left, top]))
+    return box[0] + left, box[1] + top, box[0] + right, box[1] + bottom
+
+
+def part_reached(splats: Splats, camera: Camera) -> Box | None:
+    """The part of a picture that splats reach, with what the loss looks at beside it; None: all of it, nearly all, or
+    none."""
     reached = box_reached(splats, camera.width, camera.height)
     if reached is None:
         return None
