@@ -11,11 +11,11 @@ from block_support import block_stage, coarse
 from checkerboard import Photographs
 from rasterise_scenes import make_scene, splats_of
 from vdgs.kernels import choose
-from vdgs.kernels.reach import box_reached
 from vdgs.kernels.types import Splats
 from vdgs.settings.method import BlockConfig
 from vdgs.training import Stage, Surroundings, TrainingState, loop, start_state, train_step
 from vdgs.training.crops import Crop
+from vdgs.training.reach import box_reached
 
 SCENES = {
     "ordinary": make_scene(40, 61, 47),

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
+import torch
+
 from vdgs.cameras import Camera
-from vdgs.kernels.constants import SSIM_WINDOW_PX
-from vdgs.kernels.reach import box_reached
+from vdgs.kernels.constants import ALPHA_MIN, SSIM_WINDOW_PX
 from vdgs.kernels.types import Splats
 from vdgs.training.crops import NEARLY_ALL, Box
 from vdgs.training.state import Stage
 
 #: A pixel is in windows of SSIM around others, which look as far again.
 MARGIN_PX = SSIM_WINDOW_PX - 1
+#: What rounding may hide of how far a splat reaches.
+SLACK_PX = 1.0
 
 
 def narrow(stage: Stage, splats: Splats, camera: Camera, box: Box) -> Box:
@@ -42,4 +47,27 @@ def part_reached(splats: Splats, camera: Camera) -> Box | None:
     right, bottom = min(right + MARGIN_PX, camera.width), min(bottom + MARGIN_PX, camera.height)
     if (right - left) * (bottom - top) >= NEARLY_ALL * camera.width * camera.height:
         return None
+    return left, top, right, bottom
+
+
+@torch.no_grad()
+def box_reached(splats: Splats, width: int, height: int) -> Box | None:
+    """The pixels of a picture in which splats may have an alpha of 1/255; None if there are none.
+
+    On the ellipse a dx² + 2 b dx dy + c dy² = q, dx² reaches q c / (a c - b²). Of splats that are not drawn, because
+    they are faint, not finite or not positive definite, that is NaN, which lies nowhere.
+    """
+    a, b, c = splats.conics.unbind(dim=1)
+    # In double the products are exact: of a splat seen edge-on little else is left.
+    determinant = a.double() * c - b.double().square()
+    level = 2 * torch.log(splats.opacities / ALPHA_MIN)
+    scale = (level / determinant).to(level.dtype)
+    reach = torch.stack([c * scale, a * scale], dim=1).sqrt_().add_(SLACK_PX)
+    low, high, size = splats.means_px - reach, splats.means_px + reach, reach.new_tensor([width, height])
+    outside = ~((high > 0) & (low < size)).all(dim=1, keepdim=True)
+    first = low.masked_fill_(outside, math.inf).amin(dim=0).floor().clamp(min=0) if len(low) else size
+    if not bool((first < size).all()):
+        return None
+    last = torch.minimum(high.masked_fill_(outside, -math.inf).amax(dim=0).ceil(), size)
+    (left, top), (right, bottom) = first.int().tolist(), last.int().tolist()
     return left, top, right, bottom

@@ -14,13 +14,13 @@ from contextlib import redirect_stdout
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 from vdgs.errors import VdgsError
 from vdgs.kernels.checking import check_splats
+from vdgs.kernels.constants import ALPHA_MIN
 from vdgs.kernels.differentiable import pulled_back
-from vdgs.kernels.reach import reach_px
 from vdgs.kernels.types import Raster, RasterPullback, Splats
 
 #: Side of gsplat's tiles, in pixels (its default).
@@ -82,6 +82,27 @@ def rasterise_vjp(
         return rasterise(splats, background, width, height, depth=depth, engine=engine)
 
     return pulled_back(draw, splats, background)
+
+
+@torch.no_grad()
+def reach_px(splats: Splats) -> Int32[Tensor, "m 2"]:
+    """How far from its centre, in x and y, a splat's alpha is at least 1/255; 0 for one that is not to be drawn.
+
+    Those are the splats of which a number is not finite, or whose conic is not positive definite. On the ellipse
+    a dx² + 2 b dx dy + c dy² = q, dx² reaches q c / (a c - b²).
+    """
+    opacities = splats.opacities
+    rows = torch.cat(
+        [splats.means_px, splats.conics, splats.colours, opacities[:, None], splats.depths[:, None]], dim=1
+    )
+    a, b, c = splats.conics.unbind(dim=1)
+    determinant = a * c - b * b
+    drawn = rows.isfinite().all(dim=1) & (a > 0) & (c > 0) & (determinant > 0) & (opacities >= ALPHA_MIN)
+    level = 2 * torch.log(opacities.clamp(min=ALPHA_MIN) / ALPHA_MIN)
+    squares = torch.stack([c, a], dim=1) * (level / determinant)[:, None]
+    # Rounded up, and a pixel for what rounding makes of the other numbers; what is larger covers every picture.
+    reach = torch.ceil(torch.sqrt(squares)).clamp(max=2.0**20) + 1
+    return torch.where(drawn[:, None], reach, torch.zeros_like(reach)).to(torch.int32)
 
 
 def load() -> Any:
