@@ -34,7 +34,9 @@ def training_section(shown: Shown) -> Html:
     logs = [(f"block {index}", block_colour(index), source.lines(f"{name}/log.jsonl")) for index, name in names]
     statuses = [(f"block {index}", source.record(f"{name}/status.json")) for index, name in names]
     parts.append(_curves(logs))
-    if not any(records for _, _, records in logs) and not source.exists(*(f"{name}/log.jsonl" for _, name in names)):
+    if any(records for _, _, records in logs):
+        parts.append(paragraph("PSNR and loss of a block are those of the parts of photographs that show it.", "facts"))
+    elif not source.exists(*(f"{name}/log.jsonl" for _, name in names)):
         parts.append(paragraph("No block has a log yet.", "absent"))
     parts.append(_states([("coarse", source.record("coarse/status.json")), *statuses], shown))
     parts += _growth(logs)

@@ -1,4 +1,5 @@
-"""What people see of the progress: the loss and the PSNR of training views, smoothed."""
+"""What people see of the progress: the loss and the PSNR of training views, smoothed; of a block, of the parts of
+views that it draws."""
 
 from __future__ import annotations
 

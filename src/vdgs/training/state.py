@@ -57,7 +57,7 @@ class TrainingState:
     compensation: Compensation | None = None
     #: Mean of the last models, once it has begun (`averaging.counts_in_mean`).
     average: Average | None = None
-    #: Smoothed loss, the smallest it has been, smoothed PSNR of training views.
+    #: Smoothed loss, the smallest it has been, smoothed PSNR: of what is drawn of training views.
     loss: float = math.nan
     best_loss: float = math.inf
     psnr: float = math.nan
@@ -157,7 +157,7 @@ class Stage:
     appearance_of: Sequence[int] | None = None
     #: How often each view is used, in proportion; None: all alike.
     shares: tuple[float, ...] | None = None
-    #: The part of each view that is drawn; None: all of all.
+    #: The part of each view to be drawn, or of that what a block's splats reach (`training.reach`); None: all of all.
     crops: tuple[Crop, ...] | None = None
     #: Where the arithmetic is done. Photographs and places come to it.
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))

@@ -148,20 +148,20 @@ class _Pullback:
         entries, (height, width) = self.entries, self.transmittance.shape
         wanted = [None if g is None else g.contiguous() for g in (image, alpha, depth)]
         first = slice(count)
-        moved = ctypes.c_longlong(len(means[first]))
+        kept = ctypes.c_longlong(len(means[first]))
         sums = means.new_zeros(len(entries.owners), SUMS)
         picture: list[Argument] = [self.raster.image, self.transmittance, self.last, self.raster.depth]
         self.program.launch(
             "rasterise_backward", (-(-width // TILE_PX), -(-height // TILE_PX)), (THREADS,), *self.splats,
             entries.owners, entries.order, entries.bounds, ctypes.c_int(width), ctypes.c_int(height), *picture,
-            *wanted, moved, sums,
+            *wanted, kept, sums,
         )  # fmt: skip
         by_means, by_conics = over or (torch.empty_like(means[first]), torch.empty_like(conics[first]))
         by_colours, by_opacities = torch.empty_like(colours[first]), torch.empty_like(opacities[first])
         by_depths = None if self.raster.depth is None else torch.empty_like(depths[first])
         self.program.launch(
             "gather_gradients", _over(len(means)), (THREADS,), *self.splats, entries.splats,
-            ctypes.c_longlong(len(means)), entries.ends, sums, moved, by_means, by_conics, by_colours, by_opacities,
+            ctypes.c_longlong(len(means)), entries.ends, sums, kept, by_means, by_conics, by_colours, by_opacities,
             by_depths,
         )  # fmt: skip
         if wanted[0] is None:

@@ -108,6 +108,8 @@ class _Pullback:
     ) -> RasterGradients:
         n = self.count if count is None else count
         means, conics = over or (torch.empty(n, 2), torch.empty(n, 3))
+        if not 0 <= n <= self.count or not len(means) == len(conics) == n:
+            raise ValueError(f"gradients of {n} splats of {self.count} do not fit into {len(means)} and {len(conics)}")
         colours, opacities, background = torch.empty(n, 3), torch.empty(n), torch.empty(3)
         depths = torch.empty(n) if self.with_depth else None
         found = RasterGradients(means, conics, colours, opacities, depths, background)

@@ -242,7 +242,7 @@ rasterise_forward(const float* means, const float* conics, const float* colours,
 }
 
 // A block a tile. Gradients by image, alpha and depth may be null; `sums` [entries, kSums] hold zeros, and go on to do so
-// for all splats but the first `moved`, whose gradients alone are wanted.
+// for all splats but the first `kept`, whose gradients alone are wanted.
 //
 // With `value` = colour . gradient (+ depth): the light behind a splat, as the gradient sees it, is what the whole pixel
 // shows without what is in front of it and itself: no transmittance has to be divided out of what was multiplied.
@@ -250,9 +250,9 @@ extern "C" __global__ void __launch_bounds__(kThreads, 4)
 rasterise_backward(const float* means, const float* conics, const float* colours, const float* opacities,
                    const float* depths, const int* owners, const long long* order, const long long* bounds, int width,
                    int height, const float* image, const float* transmittance, const int* last, const float* depth,
-                   const float* by_image, const float* by_alpha, const float* by_depth, long long moved, float* sums) {
+                   const float* by_image, const float* by_alpha, const float* by_depth, long long kept, float* sums) {
   __shared__ Entry batch[kBatch];
-  __shared__ bool wanted_of[kBatch];
+  __shared__ bool keeps[kBatch];  // whether the sums of an entry are wanted
   __shared__ long long slots[kBatch];
   __shared__ float parts[kWarps][kBatch][kSums];
   const Splats splats{means, conics, colours, opacities, depths};
@@ -283,7 +283,7 @@ rasterise_backward(const float* means, const float* conics, const float* colours
       slots[threadIdx.x] = order[first + begin + threadIdx.x];
       const int owner = owners[slots[threadIdx.x]];
       read_entry(splats, owner, batch[threadIdx.x]);
-      wanted_of[threadIdx.x] = owner < moved;
+      keeps[threadIdx.x] = owner < kept;
     }
     __syncthreads();
     for (int i = 0; i < size; ++i) {
@@ -314,14 +314,14 @@ rasterise_backward(const float* means, const float* conics, const float* colours
           }
         }
       }
-      if (!wanted_of[i]) continue;  // the same for all threads
+      if (!keeps[i]) continue;  // the same for all threads
       float sum = 0.0f;
       if (__any_sync(kAllLanes, counts)) sum = add_over_warp(values);
       if (lane % 2 == 0 && lane / 2 < kSums) parts[warp][i][lane / 2] = sum;
     }
     __syncthreads();
     for (int k = threadIdx.x; k < size * kSums; k += kThreads) {
-      if (!wanted_of[k / kSums]) continue;
+      if (!keeps[k / kSums]) continue;
       float total = 0.0f;
       for (int w = 0; w < kWarps; ++w) total += parts[w][k / kSums][k % kSums];
       sums[slots[k / kSums] * kSums + k % kSums] = total;
@@ -329,16 +329,16 @@ rasterise_backward(const float* means, const float* conics, const float* colours
   }
 }
 
-// A thread a splat, in their `order`. Gradients are those of the first `moved` rows; they may overwrite means and conics;
+// A thread a splat, in their `order`. Gradients are those of the first `kept` rows; they may overwrite means and conics;
 // `by_depths` may be null.
 extern "C" __global__ void __launch_bounds__(kThreads)
 gather_gradients(const float* means, const float* conics, const float* colours, const float* opacities,
                  const float* depths, const int* order, long long count, const long long* ends, const float* sums,
-                 long long moved, float* by_means, float* by_conics, float* by_colours, float* by_opacities, float* by_depths) {
+                 long long kept, float* by_means, float* by_conics, float* by_colours, float* by_opacities, float* by_depths) {
   const long long place = static_cast<long long>(blockIdx.x) * kThreads + threadIdx.x;
   if (place >= count) return;
   const long long i = order ? order[place] : place;
-  if (i >= moved) return;
+  if (i >= kept) return;
   float total[kSums] = {};
   for (long long entry = place ? ends[place - 1] : 0; entry < ends[place]; ++entry)
     for (int k = 0; k < kSums; ++k) total[k] += sums[entry * kSums + k];
