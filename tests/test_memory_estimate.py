@@ -20,8 +20,19 @@ from rich.console import Console
 
 from captures_support import tiny_scene, write_colmap
 from cli_support import entry_point, vdgs
-from vdgs.memory.estimate import Need, advice, bytes_per_anchor, describe, estimate
+from vdgs.memory.estimate import (
+    COMPENSATED_GROWTH,
+    GROWTH,
+    Need,
+    advice,
+    bytes_per_anchor,
+    describe,
+    estimate,
+    most_growth,
+)
 from vdgs.memory.process import available_bytes, is_out_of_memory
+from vdgs.settings.method import CompensationConfig
+from vdgs.settings.presets import PRESETS
 from vdgs.watching import anchors as watching
 from vdgs.watching import memory_notes
 from vdgs.watching.memory_notes import announce
@@ -36,6 +47,7 @@ needs = st.builds(
     images_bytes=st.integers(0, 10**11),
     surroundings=st.integers(0, 10**7),
     averaged=st.booleans(),
+    growth=st.floats(1, 20),
 )
 
 
@@ -52,6 +64,14 @@ def test_what_is_more_takes_more(need):
     for name in ("anchors", "offsets", "pixels", "images_bytes", "surroundings"):
         assert estimate(replace(need, **{name: 2 * getattr(need, name)})).total >= found.total
     assert estimate(replace(need, max_anchors=need.anchors)).total == estimate(replace(need, max_anchors=1)).total
+
+
+def test_growth_below_a_fixed_threshold_is_expected_to_be_large():
+    """On a real capture nearly all anchors are seen by fewer than a fifth of the cameras."""
+    growths = {name: most_growth(preset.block.compensation) for name, preset in PRESETS.items()}
+    assert growths == {"paper": COMPENSATED_GROWTH, "literal": COMPENSATED_GROWTH, "laptop": GROWTH}
+    lowest = CompensationConfig(t_low_quantile=0.25)
+    assert most_growth(lowest) == most_growth(PRESETS["paper"].training.compensation) == GROWTH
 
 
 @given(needs)

@@ -20,7 +20,7 @@ from vdgs.captures.reconstruction import read_reconstruction
 from vdgs.errors import VdgsError
 from vdgs.executors.pieces import default_jobs
 from vdgs.kernels import threads as threads_available
-from vdgs.memory.estimate import GROWTH, Need, estimate, in_gb
+from vdgs.memory.estimate import GROWTH, Need, estimate, in_gb, most_growth
 from vdgs.memory.process import available_bytes
 from vdgs.partition.cut import SEEN, choose_block_count
 from vdgs.runs.beginning import reads_otherwise, run_settings
@@ -136,7 +136,7 @@ def _plan(capture: Capture, method: MethodConfig, asked: RunRequest) -> Plan:
     each = estimate(
         Need(
             in_block, block_limit(method.block, in_block, need.grown), need.offsets, SEEN, 0, 0,
-            surroundings=need.grown - in_block,
+            surroundings=need.grown - in_block, growth=most_growth(method.block.compensation),
         )
     ).total  # fmt: skip
     jobs = asked.jobs or default_jobs(blocks, threads_available(), available_bytes(), each)[0]

@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from vdgs.settings.method import CompensationConfig
+
 Kind = Literal["coarse", "block"]
 
 #: A process of vdgs with everything imported.
@@ -21,6 +23,9 @@ STEP_BYTES_PER_OFFSET = 155
 MEASURED_BYTES_PER_PIXEL, LPIPS_BYTES_PER_PIXEL = 400, 2000
 #: Anchors may grow to so many times their number where nothing limits them (choice; real captures: 1.2 to 3).
 GROWTH = 3.0
+#: ... where growth is compensated below a fixed T_low, under which nearly all of a real capture is (choice; blocks of
+#: seneca had 6 and 12 times as many after a ninth of the steps of preset `paper`: docs/findings.md).
+COMPENSATED_GROWTH = 15.0
 #: Numbers of an anchor apart from its offsets: place, feature, log-scales.
 PLAIN_FLOATS = 3 + 32 + 6
 #: ... of which a mean of models holds all but the place, which never moves.
@@ -31,7 +36,7 @@ PLACE_FLOATS = 3
 class Need:
     """What training works on, as far as memory is concerned."""
 
-    #: Anchors when it starts, and at most (0: no limit, `GROWTH` times as many).
+    #: Anchors when it starts, and at most (0: no limit, `growth` times as many).
     anchors: int
     max_anchors: int
     #: Gaussians of an anchor.
@@ -46,11 +51,13 @@ class Need:
     surroundings: int = 0
     #: Whether training ends with a mean of models, which is kept beside the grown anchors.
     averaged: bool = False
+    #: How many times their number anchors may become where nothing limits them: `most_growth`.
+    growth: float = GROWTH
 
     @property
     def grown(self) -> int:
         """Anchors at the end: `max_anchors` stops growth and removes nothing."""
-        free = round(GROWTH * self.anchors)
+        free = round(self.growth * self.anchors)
         return max(self.anchors, min(free, self.max_anchors)) if self.max_anchors else free
 
 
@@ -83,6 +90,11 @@ class Advice:
 
     def __str__(self) -> str:
         return f"{self.setting} saves about {in_gb(self.saves)}"
+
+
+def most_growth(config: CompensationConfig) -> float:
+    """How many times their number anchors may become where nothing limits them."""
+    return COMPENSATED_GROWTH if config.enabled and not config.t_low_quantile else GROWTH
 
 
 def bytes_per_anchor(offsets: int, seen: float) -> float:

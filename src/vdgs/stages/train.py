@@ -16,7 +16,7 @@ from vdgs.executors.errand import Errand, Wish
 from vdgs.executors.fitness import Question, photographs_of
 from vdgs.executors.kinds import BLOCKS
 from vdgs.executors.placement import Share
-from vdgs.memory.estimate import Need, estimate
+from vdgs.memory.estimate import Need, estimate, most_growth
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_capture
@@ -126,5 +126,6 @@ def _block_bytes(run: RunFolder) -> int:
     need = Need(
         anchors=max(anchors), max_anchors=limit, offsets=method.training.anchors.offsets,
         seen=SEEN, pixels=0, images_bytes=0, surroundings=sum(anchors) - max(anchors),
+        growth=most_growth(method.block.compensation),
     )  # fmt: skip
     return estimate(need).total

@@ -8,7 +8,7 @@ import numpy as np
 import psutil
 from rich.console import Console
 
-from vdgs.memory.estimate import Advice, Kind, Need, advice, describe, estimate, in_gb
+from vdgs.memory.estimate import Advice, Kind, Need, advice, describe, estimate, in_gb, most_growth
 from vdgs.memory.process import available_bytes
 from vdgs.model.render import visible_rows
 from vdgs.training import Stage, TrainingState
@@ -39,6 +39,7 @@ def need_of(state: TrainingState, stage: Stage) -> Need:
         images_bytes=min(photographs, getattr(stage.images, "budget_bytes", photographs)),
         surroundings=0 if stage.surroundings is None else len(stage.surroundings.anchors),
         averaged=config.average > 0,
+        growth=most_growth(config.compensation),
     )
 
 
