@@ -6,10 +6,9 @@ splats, from them to anchors that move, statistics.
 A random anchor scene seen from above, in which all anchors are visible, with about half of the opacities positive
 (what a fresh decoder gives). Prints the median of each phase. With `--own` it is the step of a block: this share of
 the anchors, to the left, is trained, the others are drawn and never move (all of the view, of which training draws what
-the block's splats reach). Memory is the slope of the peak resident size
-of fresh processes over the number of anchors: of those in view, with all that a step makes of them, and of those out of
-view; and for a model half in view the whole process without what it imports. Saving is what it adds to the resident
-size.
+the block's splats reach). Memory is the slope of the peak resident size of fresh processes over the number of anchors:
+of those in view, with all that a step makes of them, and of those out of view; and for a model half in view the whole
+process without what it imports. Saving is what it adds to the resident size.
 """
 
 from __future__ import annotations
