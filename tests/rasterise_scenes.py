@@ -13,7 +13,7 @@ from vdgs.kernels.runs import Runs
 from vdgs.kernels.types import OrderedSplats, RasterPullback, Splats
 
 
-def first_gradients_are_those_of_all(
+def assert_first_gradients_are_those_of_all(
     pullback: Callable[[], RasterPullback], splats: int, width: int, height: int
 ) -> None:
     """Assert that the way back of a picture gives the first splats the bits that it gives them among all."""

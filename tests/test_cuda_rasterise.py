@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from cuda_on_host import ORDERS, HostDriver, Stuck, build_on_host, host_compiler
-from rasterise_scenes import Scene, first_gradients_are_those_of_all, in_runs, make_scene, splats_of
+from rasterise_scenes import Scene, assert_first_gradients_are_those_of_all, in_runs, make_scene, splats_of
 from test_cuda_compiling import needs_nvrtc
 from test_rasterise import assert_close, assert_same_picture, loss_of
 from vdgs.kernels.cuda.driver import cuda_driver
@@ -200,7 +200,7 @@ class TestMeaning:
     def test_gradients_of_the_first_splats_alone_have_the_bits_that_they_have_among_all(self, name, library):
         scene, program = SCENES[name], Program("rasterise.cu", HostDriver(library), PROGRAM.headers)
         size, (splats, background) = (scene.width, scene.height), splats_of([each.detach() for each in scene.tensors])
-        first_gradients_are_those_of_all(
+        assert_first_gradients_are_those_of_all(
             lambda: rasterise_vjp(splats, background, *size, program=program)[1], len(splats.depths), *size
         )
 

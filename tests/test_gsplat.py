@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import gsplat_stand_in
-from rasterise_scenes import first_gradients_are_those_of_all, make_scene, splats_of
+from rasterise_scenes import assert_first_gradients_are_those_of_all, make_scene, splats_of
 from test_rasterise import assert_close, loss_of, smooth
 from vdgs.errors import VdgsError
 from vdgs.kernels.gsplat import rasterise, rasterise_vjp
@@ -78,7 +78,9 @@ def test_the_way_back_gives_what_training_asks_for():
 def test_gradients_of_the_first_splats_are_those_that_they_have_among_all():
     scene = SCENES["ordinary"]
     size, (splats, background) = (scene.width, scene.height), splats_of(scene.tensors)
-    first_gradients_are_those_of_all(lambda: rasterise_vjp(splats, background, *size)[1], len(splats.depths), *size)
+    assert_first_gradients_are_those_of_all(
+        lambda: rasterise_vjp(splats, background, *size)[1], len(splats.depths), *size
+    )
 
 
 def test_unsuitable_arguments_are_refused():

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from native_choice import on_threads
-from rasterise_scenes import Scene, first_gradients_are_those_of_all, make_scene, splats_of
+from rasterise_scenes import Scene, assert_first_gradients_are_those_of_all, make_scene, splats_of
 from vdgs.kernels import constants
 from vdgs.kernels.native.module import load, supported
 from vdgs.kernels.native.rasterise import rasterise, rasterise_vjp, shares
@@ -116,7 +116,7 @@ def test_gradients_of_the_first_splats_alone_have_the_bits_that_they_have_among_
     scene = SCENES[name]
     size, module = (scene.width, scene.height), load(isa)
     splats, background = splats_of(tuple(tensor.detach() for tensor in scene.tensors))
-    first_gradients_are_those_of_all(
+    assert_first_gradients_are_those_of_all(
         lambda: rasterise_vjp(splats, background, *size, depth=depth, module=module)[1], len(splats.depths), *size
     )
 
@@ -131,7 +131,7 @@ def test_so_they_have_in_several_slabs(order: str, isa: str):
         splats = Splats(*(getattr(splats, field.name)[rows] for field in fields(Splats)))
     module = load(isa)
     assert rasterise_vjp(splats, background, 20, 18, module=module)[1].frame.statistics["slabs"] > 1  # type: ignore
-    first_gradients_are_those_of_all(
+    assert_first_gradients_are_those_of_all(
         lambda: rasterise_vjp(splats, background, 20, 18, module=module)[1], len(splats.depths), 20, 18
     )
 
