@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from captures_support import TinyScene, data_folder, render_plane, tiny_scene, write_colmap, write_images
 from vdgs.captures.checks import check_images
@@ -325,6 +326,29 @@ def test_truncated_jpegs_are_found_too(folder, scene):
     (folder / "images" / name).write_bytes(data[: len(data) // 2])
     with pytest.raises(CaptureError, match="truncated"):
         check_images(load_capture(folder, UP))
+
+
+def test_grey_photographs_and_masks_of_sixteen_bits_pass_the_check(folder, scene):
+    """PNG and TIFF of either byte order; one of a single colour is told, and 32 bits are refused on sight."""
+    first, second, third, *_ = sorted(scene.cameras)
+    deep = {name: (render_plane(scene.cameras[name])[..., 0].astype(np.uint16)) * 257 for name in (first, second)}
+    cv2.imwrite(str(folder / "images" / first), deep[first])
+    (folder / "images" / second).unlink()
+    tiff = (folder / "images" / second).with_suffix(".tif")
+    Image.frombytes("I;16B", (64, 48), deep[second].astype(">u2").tobytes()).save(tiff)
+    cv2.imwrite(str(folder / "images" / third), np.full((48, 64), 40_000, np.uint16))
+    keep = np.zeros((48, 64), np.uint16)
+    keep[:, :32] = 65_535
+    (folder / "masks").mkdir()
+    cv2.imwrite(str(folder / "masks" / first), keep)
+    checked = check_images(load_capture(folder, UP))
+    assert (checked.files, checked.masked_share) == (13, pytest.approx(0.5 / 12))
+    assert [each for each in checked.warnings if "one colour only" in each] == [
+        f"photographs of one colour only, which teach nothing but that: 1 ({third})."
+    ]
+    Image.fromarray(deep[second].astype(np.int32)).save(tiff)
+    with pytest.raises(CaptureError, match=r"\.tif: has the colour mode I; convert it to 8-bit RGB"):
+        load_capture(folder, UP)
 
 
 def test_a_header_that_is_no_image_is_named(folder, scene):

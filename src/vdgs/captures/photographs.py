@@ -30,7 +30,7 @@ ROUNDING_PX = 1.0
 #: A mask keeps what is at least so bright, of 255; an alpha channel what is at least so opaque (choice).
 MASK_LEVEL = 128
 #: Pillow's modes that we know how to bring to 8-bit RGB.
-KNOWN_MODES = {"RGB", "RGBA", "L", "LA", "P", "1", "I;16", "I;16B", "I;16L", "I"}
+KNOWN_MODES = {"RGB", "RGBA", "L", "LA", "P", "1", "I;16", "I;16B", "I;16L"}
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,9 @@ def read_header(path: Path) -> Header:
     """Size and mode without decoding. Raises `CaptureError` for unreadable, huge, tiny or CMYK images."""
     try:
         with pillow_quietly(), Image.open(path) as image:
-            header = Header(image.width, image.height, image.mode)
+            # Mode I is 32 bits a pixel, but for PNG files of 16 bits as older versions of Pillow open them.
+            mode = "I;16" if (image.mode, image.format) == ("I", "PNG") else image.mode
+            header = Header(image.width, image.height, mode)
     except FileNotFoundError:
         raise CaptureError(f"{path}: no such image.") from None
     except Exception as error:  # Pillow's parsers raise many kinds on damaged headers
@@ -199,11 +201,19 @@ def verify(path: Path) -> Verified:
             if image.format == "JPEG":
                 image.draft(image.mode, (max(1, image.width // 8), max(1, image.height // 8)))
             image.load()
-            ranges = [image.getchannel(band).getextrema() for band in image.getbands() if band != "A"]
+            ranges = [_extremes(image, band) for band in image.getbands() if band != "A"]
             transparent = "A" in image.getbands() or "transparency" in image.info
     except Exception as error:  # any complaint of a decoder is what we came for
         raise CaptureError(f"{path}: {error}") from None
     return Verified(any(high != low for low, high in ranges), transparent)
+
+
+def _extremes(image: Image.Image, band: str) -> tuple[float, float]:
+    """The smallest and the largest value of a band; Pillow's own way knows no 16 bits."""
+    if len(image.getbands()) == 1:
+        values = np.asarray(image)
+        return values.min(), values.max()
+    return image.getchannel(band).getextrema()  # type: ignore[return-value]
 
 
 def share_kept(photograph: Path, mask: Path | None, may_be_transparent: bool) -> float:
