@@ -112,6 +112,43 @@ def test_intrinsics_per_frame_splits_and_masks(tmp_path, scene):
     assert all(view.mask_path == tmp_path / "masks" / "one.png" for view in capture.views)
 
 
+def test_frames_in_no_list_are_left_out_and_told(tmp_path, scene):
+    """As nerfstudio takes its lists: those are the training and the test photographs, and there are no others."""
+    names = [f"images/{name}" for name in sorted(scene.cameras)]
+    lists = {"train_filenames": names[:8], "val_filenames": names[8:9], "test_filenames": names[9:10]}
+    write_transforms(tmp_path, scene, **lists)
+    for split in ("auto", "explicit"):
+        capture = load_capture(tmp_path, CaptureOptions(split=split))
+        assert [f"images/{view.name}" for view in capture.train_views] == names[:8]
+        assert [f"images/{view.name}" for view in capture.test_views] == names[8:10]
+        assert [each for each in capture.warnings if "none of the capture's lists" in each] == [
+            "2 of 12 photographs stand in none of the capture's lists of training and test photographs and are left "
+            "out (frame_010.png, frame_011.png). --split every uses them all."
+        ]
+    every = load_capture(tmp_path, CaptureOptions(split="every"))
+    assert (len(every.views), every.warnings) == (12, ())
+    (tmp_path / "mine.txt").write_text("frame_011\n")
+    mine = load_capture(tmp_path, CaptureOptions(test_list=tmp_path / "mine.txt"))
+    assert (len(mine.views), [view.name for view in mine.test_views]) == (12, ["frame_011.png"])
+    assert mine.warnings == ()
+
+
+@pytest.mark.parametrize(("key", "side"), [("train_filenames", "train"), ("test_filenames", "test")])
+def test_a_side_without_a_list_takes_the_frames_that_the_other_leaves(tmp_path, scene, key, side):
+    names = sorted(scene.cameras)
+    write_transforms(tmp_path, scene, **{key: [f"images/{name}" for name in names[3:7]]})
+    capture = load_capture(tmp_path)
+    assert [view.name for view in capture.views if view.split == side] == names[3:7]
+    assert (len(capture.views), capture.warnings) == (12, ())
+
+
+def test_lists_of_what_is_no_frame_are_refused(tmp_path, scene):
+    write_transforms(tmp_path, scene, train_filenames=["images/frame_000.JPG"], test_filenames=["images/else.png"])
+    with pytest.raises(CaptureError, match=r"1 names in its lists .*--split every\.\n  images/else\.png"):
+        load_capture(tmp_path)
+    assert len(load_capture(tmp_path, CaptureOptions(split="every")).views) == 12
+
+
 def test_angles_stand_in_for_focal_lengths(tmp_path, scene):
     camera = next(iter(scene.cameras.values()))
     content = write_transforms(tmp_path, scene)

@@ -61,7 +61,7 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
         if not seen.any():
             raise CaptureError(f"{root}: the chosen {options.max_images} photographs see no points; use more.")
     explicit = {photo.view.name: photo.view.split for photo in photographs}
-    views = choose_splits(root, views, explicit, options)
+    views = choose_splits(root, views, explicit, options, warnings)
     return Capture(
         root=root, source=source.source, images=source.images, views=tuple(views), points=points,
         point_colours=colours, ground=ground, warnings=(*warnings, *ground_warnings),

@@ -1,7 +1,8 @@
 """Which photographs train and which test.
 
 A capture may bring its own lists, `test.txt` and `validation.txt` beside its photographs' folder, one name a line.
-Photographs of either list never train; those of `validation.txt` are used with `--validation` only.
+Photographs of either list never train; those of `validation.txt` are used with `--validation` only. Formats may say
+it too; where one says it of some photographs only, the others are left out, as nerfstudio does.
 """
 
 from __future__ import annotations
@@ -31,9 +32,13 @@ def nearest_to_middle(views: list[View], count: int) -> list[View]:
 
 
 def choose_splits(
-    root: Path, views: list[View], explicit: Mapping[str, Split | None], options: CaptureOptions
+    root: Path,
+    views: list[View],
+    explicit: Mapping[str, Split | None],
+    options: CaptureOptions,
+    warnings: list[str],
 ) -> list[View]:
-    """The views in name order, each with its split, without those that are kept for the other purpose.
+    """The views in name order, each with its split, without those that are kept for the other purpose or for none.
 
     `explicit` names every photograph of the capture (`views` may be some of them) with the split that its format
     gives it. Raises `CaptureError` if a side stays empty or a list names what is no photograph.
@@ -41,7 +46,14 @@ def choose_splits(
     views = sorted(views, key=lambda view: view.name)
     names = Names({name: root / name for name in explicit})
     splits = _splits(root, views, explicit, options, names)
-    chosen = [replace(view, split=split) for view, split in zip(views, splits, strict=True)]
+    chosen = [replace(view, split=split) for view, split in zip(views, splits, strict=True) if split is not None]
+    unlisted = [view.name for view, split in zip(views, splits, strict=True) if split is None]
+    if unlisted:
+        shown = ", ".join(unlisted[:5]) + (", ..." if len(unlisted) > 5 else "")
+        warnings.append(
+            f"{len(unlisted)} of {len(views)} photographs stand in none of the capture's lists of training and test "
+            f"photographs and are left out ({shown}). --split every uses them all."
+        )
     own = root / VALIDATION_LIST
     if own.is_file() and options.split != "every":
         chosen = _with_validation_list(chosen, _listed(own, names, some=options.validation), options.validation)
@@ -59,8 +71,9 @@ def choose_splits(
 
 def _splits(
     root: Path, views: list[View], explicit: Mapping[str, Split | None], options: CaptureOptions, names: Names
-) -> list[Split]:
-    """The split of each view: by the list asked for, the capture's list, its format, or every n-th."""
+) -> list[Split | None]:
+    """The split of each view: by the list asked for, the capture's list, its format (None where that knows others
+    only), or every n-th."""
     listed = options.test_list
     if listed is None and (root / TEST_LIST).is_file():
         listed = root / TEST_LIST
@@ -68,12 +81,12 @@ def _splits(
         if listed is not None:
             tests = _listed(listed, names, some=True)
             return ["test" if view.name in tests else "train" for view in views]
-        if all(explicit.get(view.name) is not None for view in views):
-            return ["test" if explicit[view.name] == "test" else "train" for view in views]
+        if any(split is not None for split in explicit.values()):
+            return [explicit[view.name] for view in views]
     if options.split == "explicit":
         raise CaptureError(
             f"{root}: --split explicit, but the capture brings no split of its own (train/ and val/ "
-            f"folders, or {TEST_LIST}). Name the test photographs with --test-list, or use --split every."
+            f"folders, lists in transforms.json, or {TEST_LIST}). Name the test photographs with --test-list, or use --split every."
         )
     return ["test" if index % options.test_every == 0 else "train" for index in range(len(views))]
 

@@ -25,8 +25,9 @@ class CaptureOptions:
     test_list: Path | None = None
     """Text file with the names of the test photographs, one a line. Default: test.txt in the capture folder, if any."""
     split: SplitMode = "auto"
-    """auto: the capture's own split or test list where there is one, else every n-th;
-    explicit: insist on it; every: always every n-th."""
+    """auto: the capture's own split or test list where there is one, else every n-th (where transforms.json lists
+    training and test photographs, those in neither list are left out); explicit: insist on it;
+    every: always every n-th."""
     validation: bool = False
     """Leave the test photographs out altogether and test on those named in validation.txt of the capture folder
     instead, or where there is none on every n-th training photograph: for choosing settings without looking at the

@@ -25,6 +25,7 @@ from vdgs.captures.formats.json_poses import (
 from vdgs.captures.formats.ply import read_point_cloud
 from vdgs.captures.formats.source import SourceCapture, SourceView, duplicates, listing, rigid, safe_name
 from vdgs.captures.formats.sparse_points import find_sparse_points
+from vdgs.captures.photographs import Names
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
 
@@ -32,8 +33,8 @@ from vdgs.settings.capture import CaptureOptions
 def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     """The capture described by `root`/transforms.json.
 
-    Raises `CaptureError` for missing images, non-rigid poses, unsafe names, and where no point cloud is
-    found.
+    Raises `CaptureError` for missing images, non-rigid poses, unsafe names, lists of what is no frame, and where no
+    point cloud is found.
     """
     file = root / "transforms.json"
     content = read_json(file)
@@ -41,7 +42,7 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     names = [_name(frame, file, root) for frame in frames]
     folder = _common_folder(names)
     chosen = options.images or folder
-    splits = _splits(content, file, root)
+    splits = _splits(content, names, file, root, options)
     undo = _undo_applied(content, file)
     views = []
     for frame, name in zip(frames, names, strict=True):
@@ -90,17 +91,35 @@ def _image(path: Path) -> Path:
     raise CaptureError(f"{path}: no such image, though transforms.json names it. Copy it there, or see --images.")
 
 
-def _splits(content: dict[str, Any], file: Path, root: Path) -> dict[str, Split]:
-    """Splits by file_path where train_filenames and val_filenames or test_filenames are given."""
+def _splits(
+    content: dict[str, Any], names: list[str], file: Path, root: Path, options: CaptureOptions
+) -> dict[str, Split]:
+    """Splits by file_path (`names`) where train_filenames and val_filenames or test_filenames are given.
+
+    Frames in no list have none; where one side has no list at all, it takes them (choice). Raises `CaptureError`
+    where lists that are not ignored name what is no frame.
+    """
     splits: dict[str, Split] = {}
     sides: tuple[tuple[str, Split], ...] = (
         ("train_filenames", "train"), ("val_filenames", "test"), ("test_filenames", "test"),
     )  # fmt: skip
+    frames, sides_listed, unknown = Names({name: root / name for name in names}), set[Split](), list[str]()
     for key, side in sides:
-        names = content.get(key) or []
-        if not isinstance(names, list):
+        listed = content.get(key) or []
+        if not isinstance(listed, list):
             raise CaptureError(f"{file}: {key!r} must be a list of names.")
-        splits.update({safe_name(str(name), file, f"name in {key}", root): side for name in names})
+        found = {str(name): frames.find(safe_name(str(name), file, f"name in {key}", root)) for name in listed}
+        splits.update({name: side for name in found.values() if name is not None})
+        unknown += [name for name, frame in found.items() if frame is None]
+        sides_listed |= {side} if listed else set()
+    if unknown and options.split != "every":
+        raise CaptureError(
+            f"{file}: {len(unknown)} names in its lists of training and test photographs are not among its frames. "
+            f"Mend the lists, or ignore them with --split every.{listing(unknown)}"
+        )
+    if len(sides_listed) == 1:
+        rest: Split = "train" if "test" in sides_listed else "test"
+        return {name: splits.get(name, rest) for name in names}
     return splits
 
 
