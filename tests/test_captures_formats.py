@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -147,6 +148,74 @@ def test_lists_of_what_is_no_frame_are_refused(tmp_path, scene):
     with pytest.raises(CaptureError, match=r"1 names in its lists .*--split every\.\n  images/else\.png"):
         load_capture(tmp_path)
     assert len(load_capture(tmp_path, CaptureOptions(split="every")).views) == 12
+
+
+def shifted_by_nerfstudio() -> np.ndarray:
+    """A world_from_source of ns-process-data, and more than its turn of axes."""
+    applied = np.eye(4)[[0, 2, 1, 3]]
+    applied[2] *= -1
+    applied[:3, 3] = [1.0, 2.0, 3.0]
+    return applied
+
+
+def test_a_model_beside_transforms_json_is_read_and_told(tmp_path, scene):
+    """A folder of ns-process-data: the same cameras twice, and tracks in the model."""
+    write_transforms(tmp_path, scene, shifted_by_nerfstudio())
+    write_colmap(tmp_path, scene, sparse="colmap/sparse/0", tracks=True)
+    capture = load_capture(tmp_path, CaptureOptions(up="z"))
+    assert capture.source == "colmap"
+    assert all(view.sightings is not None for view in capture.views)
+    assert capture.warnings == (
+        "the COLMAP model in colmap/sparse/0 is read; transforms.json beside it is not (--format transforms reads that "
+        "instead).",
+    )
+    asked = load_capture(tmp_path, CaptureOptions(up="z", format="transforms"))
+    assert (asked.source, asked.warnings) == ("transforms", ())
+    assert_sees_the_scene(asked, scene)
+    assert load_capture(tmp_path, CaptureOptions(up="z", format="colmap")).warnings == ()
+    (tmp_path / "transforms.json").write_text("{")  # of no matter where it is not read
+    assert load_capture(tmp_path).source == "colmap"
+    with pytest.raises(CaptureError, match=r"--format matrixcity, but .* It holds: colmap, transforms\."):
+        load_capture(tmp_path, CaptureOptions(format="matrixcity"))
+
+
+@pytest.mark.parametrize("says", ["lists of training and test photographs", "masks"])
+def test_transforms_json_is_read_where_it_says_what_a_model_cannot(tmp_path, scene, says):
+    names = [f"images/{name}" for name in sorted(scene.cameras)]
+    content = write_transforms(tmp_path, scene)
+    if says == "masks":
+        for frame in content["frames"]:
+            frame["mask_path"] = "kept/mask.png"
+        write_images(tmp_path / "kept", replace(scene, cameras={"mask.png": scene.cameras["frame_002.png"]}))
+    else:
+        content |= {"train_filenames": names[:7], "test_filenames": names[7:]}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    write_colmap(tmp_path, scene, sparse="colmap/sparse/0")
+    capture = load_capture(tmp_path)
+    assert capture.source == "transforms"
+    assert capture.warnings == (
+        f"transforms.json is read, for its {says}; the COLMAP model in colmap/sparse/0 is not (--format colmap reads "
+        "that instead).",
+    )
+    if says == "masks":
+        assert {view.mask_path for view in capture.views} == {tmp_path / "kept" / "mask.png"}
+    else:
+        assert len(capture.test_views) == 5
+    (tmp_path / "images" / "frame_003.png").unlink()
+    with pytest.raises(CaptureError, match=r"no such image(?s:.)*--format colmap"):
+        load_capture(tmp_path)
+
+
+def test_points_of_a_model_stand_in_for_a_missing_cloud(tmp_path, scene):
+    """As older nerfstudio left folders: poses moved by applied_transform, a model that is not, and no cloud."""
+    write_transforms(tmp_path, scene, shifted_by_nerfstudio(), ply_file_path=None)
+    (tmp_path / "sparse_pc.ply").unlink()
+    with pytest.raises(CaptureError, match=r"brings no 3D points.* as sparse/0 .* and give --format transforms\."):
+        load_capture(tmp_path)
+    write_colmap(tmp_path, moved(scene, 3.0, np.eye(3)[[1, 2, 0]], np.ones(3)), images=None)
+    capture = load_capture(tmp_path, CaptureOptions(up="z", format="transforms"))
+    assert_sees_the_scene(capture, scene)
+    np.testing.assert_allclose(to_source(capture.ground, capture.points), scene.points, atol=1e-6)
 
 
 def test_angles_stand_in_for_focal_lengths(tmp_path, scene):

@@ -23,7 +23,7 @@ from vdgs.storage.files import write_json
 
 def settings(**changes) -> dict:
     method = to_dict(PRESETS["laptop"])
-    return {"capture": {"path": "/data/a"}} | method | {"training": method["training"] | changes}
+    return {"capture": {"format": "auto", "path": "/data/a"}} | method | {"training": method["training"] | changes}
 
 
 def test_the_same_settings_continue(tmp_path):
@@ -31,6 +31,16 @@ def test_the_same_settings_continue(tmp_path):
     run.begin(settings())
     run.begin(settings())
     assert run.settings() == settings()
+
+
+def test_a_run_from_before_an_option_of_captures_continues(tmp_path):
+    run, before = RunFolder(tmp_path / "run"), settings() | {"capture": {"path": "/data/a"}}
+    run.config.write(before)
+    run.begin(settings())
+    assert run.settings() == settings()
+    assert run.keys() == stage_keys(before)
+    with pytest.raises(RunError, match="--format: auto -> colmap"):
+        run.begin(settings() | {"capture": {"format": "colmap", "path": "/data/a"}})
 
 
 def test_changed_settings_are_refused_with_the_difference(tmp_path):

@@ -223,7 +223,8 @@ def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
 def _key(run: PlannedRun, plan: Plan, settings: BenchSettings) -> str:
     """Of a run of this bench: its settings, what it is trained on and how it is measured."""
     scene = next(scene for scene in plan.scenes if scene.name == run.scene)
-    of = {"options": to_dict(_options(scene, settings)), "scene": dict(scene.synth or scene.contents) or scene.capture}
+    options = counted("capture", to_dict(_options(scene, settings)))
+    of = {"options": options, "scene": dict(scene.synth or scene.contents) or scene.capture}
     return run.key(of, {"bins": settings.bins, "lpips": str(settings.lpips_weights)})
 
 

@@ -9,17 +9,13 @@ import numpy as np
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
-from vdgs.captures.formats.colmap import count_images, find_models, partial_model, read_colmap
-from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
-from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
 from vdgs.captures.formats.source import SourceCapture, listing
-from vdgs.captures.formats.transforms import read_transforms
 from vdgs.captures.ground import find_ground_frame, transform_pose
 from vdgs.captures.matching import FoundView, find_photographs
 from vdgs.captures.outputs import refuse_among_files
 from vdgs.captures.photographs import LEAST_SIDE_PX
 from vdgs.captures.precision import rounding_of
-from vdgs.captures.reconstruction import is_reconstruction
+from vdgs.captures.reading import read_source
 from vdgs.captures.sightings import Sightings
 from vdgs.captures.splits import choose_splits, nearest_to_middle
 from vdgs.captures.undistortion import ImageFile, undistort
@@ -42,7 +38,7 @@ def load_capture(path: Path, options: CaptureOptions | None = None) -> Capture:
     if not root.is_dir():
         raise CaptureError(f"{root}: no such folder. Give the folder that holds images/ and sparse/.")
     _check_options(options)
-    source = _read(root, options)
+    source = read_source(root, options)
     warnings = list(source.warnings)
     source = _without_bad_points(source, warnings)
     photographs = find_photographs(root, source, options, warnings)
@@ -77,72 +73,7 @@ def _check_options(options: CaptureOptions) -> None:
             raise CaptureError(f"{flag} {folder}: must be a folder inside the capture, such as images_4.")
 
 
-# ------------------------------------------------------------------------------------------- reading
-
-
-def _read(root: Path, options: CaptureOptions) -> SourceCapture:
-    """The capture in whichever format the folder is."""
-    if is_mega_nerf(root):
-        return read_mega_nerf(root, options)
-    if pose_files(root):
-        return read_matrixcity(root, options)
-    models = find_models(root)
-    if models:
-        return _read_colmap(root, models, options)
-    if (root / "transforms.json").is_file():
-        return read_transforms(root, options)
-    if is_reconstruction(root):
-        raise CaptureError(
-            f"{root}: is not finished: vdgs sfm was stopped. The command that began it goes on "
-            f"with it (its photographs, --output {root})."
-        )
-    raise CaptureError(
-        f"{root}: not a capture. {partial_model(root)}Looked for a COLMAP model (sparse/0/cameras.bin and "
-        "images.bin, or .txt), transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json "
-        f"(MatrixCity). Photographs alone become one first: vdgs sfm {root} --output CAPTURE"
-    )
-
-
-def _read_colmap(root: Path, models: list[Path], options: CaptureOptions) -> SourceCapture:
-    warnings = []
-    folder = max(models, key=count_images)
-    distinct = [model for model in models if model.resolve() != folder.resolve()]
-    if distinct:
-        sizes = ", ".join(f"{model.relative_to(root)} ({count_images(model)})" for model in models)
-        warnings.append(f"several sparse models: {sizes} images; the biggest is used.")
-    images, image_warnings = image_folder(root, options)
-    model = read_colmap(folder)
-    if not model.views:
-        raise CaptureError(f"{folder}: the model holds no registered images. Run the reconstruction again.")
-    if not len(model.points):
-        raise CaptureError(
-            f"{folder}: the model holds no 3D points, from which the scene starts. Keep points3D.bin beside "
-            "images.bin, or triangulate: colmap point_triangulator."
-        )
-    return SourceCapture(
-        "colmap", images, model.views, model.points, model.colours,
-        image_folders=(root / images,), warnings=(*warnings, *image_warnings),
-    )  # fmt: skip
-
-
-def image_folder(root: Path, options: CaptureOptions) -> tuple[str, list[str]]:
-    """The image folder relative to `root`: the one asked for, else images, else the largest images_N."""
-    if options.images is not None:
-        if not (root / options.images).is_dir():
-            present = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
-            raise CaptureError(f"{root / options.images}: no such folder. Present: {', '.join(present) or 'none'}.")
-        return Path(options.images).as_posix(), []
-    if (root / "images").is_dir():
-        return "images", []
-    shrunk = {
-        int(entry.name.removeprefix("images_")): entry.name
-        for entry in root.glob("images_*")
-        if entry.is_dir() and entry.name.removeprefix("images_").isdigit()
-    }
-    if not shrunk:
-        raise CaptureError(f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there.")
-    name = shrunk[min(shrunk)]
-    return name, [f"no images/ folder; {name} is used instead (--images chooses)."]
+# -------------------------------------------------------------------------------------------- points
 
 
 def _without_bad_points(source: SourceCapture, warnings: list[str]) -> SourceCapture:

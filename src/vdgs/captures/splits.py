@@ -85,8 +85,8 @@ def _splits(
             return [explicit[view.name] for view in views]
     if options.split == "explicit":
         raise CaptureError(
-            f"{root}: --split explicit, but the capture brings no split of its own (train/ and val/ "
-            f"folders, lists in transforms.json, or {TEST_LIST}). Name the test photographs with --test-list, or use --split every."
+            f"{root}: --split explicit, but the capture brings no split of its own (train/ and val/ folders, lists in "
+            f"transforms.json, or {TEST_LIST}). Name the test photographs with --test-list, or use --split every."
         )
     return ["test" if index % options.test_every == 0 else "train" for index in range(len(views))]
 

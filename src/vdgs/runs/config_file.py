@@ -16,6 +16,7 @@ import yaml
 
 from vdgs import __version__
 from vdgs.errors import RunError
+from vdgs.runs.keys import SINCE
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import differences, from_dict, to_dict
 from vdgs.settings.ranges import option, outside
@@ -87,7 +88,7 @@ def _settings(path: Path, text: str) -> dict[str, Any]:
     if not isinstance(capture, dict) or not isinstance(capture.get("path"), str):
         raise RunError(f"{path}: is damaged: `capture` must be a group of settings with a path")
     try:
-        return {"capture": capture} | to_dict(_method(settings))
+        return {"capture": SINCE["capture"] | capture} | to_dict(_method(settings))
     except (ValueError, TypeError) as error:
         raise RunError(f"{path}: {error}. Write it as it was, or start a new --output.") from error
 

@@ -26,6 +26,7 @@ DEPENDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 #: setting has it, keys do not mention it, so that a newer version takes older runs for finished, as they are. Nor do
 #: they mention a group in which nothing else is left.
 SINCE: dict[str, dict[str, Any]] = {
+    "capture": {"format": "auto"},
     "training": {
         "sampling": "even",
         "average": 0.0,

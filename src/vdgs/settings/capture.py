@@ -10,12 +10,16 @@ from vdgs.settings.ranges import MANY, Range
 
 UpAxis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 SplitMode = Literal["auto", "explicit", "every"]
+Format = Literal["auto", "colmap", "transforms", "mega-nerf", "matrixcity"]
 
 
 @dataclass(frozen=True)
 class CaptureOptions:
     """How to read a folder of photographs with cameras."""
 
+    format: Format = "auto"
+    """What to read where a folder holds captures of several formats. auto: of a COLMAP model and transforms.json the
+    model, unless transforms.json lists training and test photographs or names masks."""
     images: str | None = None
     """Image folder to use, such as images_4. Default: images, or where absent the largest images_N."""
     downscale: Annotated[float, Range(1, 1000)] = 1.0

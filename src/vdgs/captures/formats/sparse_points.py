@@ -19,15 +19,15 @@ AGREEMENT = 0.02
 
 
 def find_sparse_points(
-    root: Path, poses: Mapping[str, np.ndarray], what: str, aliases: Mapping[str, str] | None = None
+    root: Path, poses: Mapping[str, np.ndarray], what: str, aliases: Mapping[str, str] | None = None, option: str = ""
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points [n, 3] float64 in the world of `poses` (camera-from-world by image name) and colours [n, 3]
     uint8.
 
     Taken from a PLY file in that world, else from a COLMAP model of the same photographs, which may live
     in any world: it is brought over by the similarity between the camera centres that both have. `aliases`
-    maps names in the COLMAP model to names in `poses`. Raises `CaptureError` if there is nothing, or
-    nothing that fits.
+    maps names in the COLMAP model to names in `poses`; `option` is what the command line needs beside a model, so
+    that its cameras do not replace `poses`. Raises `CaptureError` if there is nothing, or nothing that fits.
     """
     for name in POINT_CLOUDS:
         if (root / name).is_file():
@@ -36,9 +36,8 @@ def find_sparse_points(
     if not models:
         raise CaptureError(
             f"{root}: {what} brings no 3D points, from which the scene starts. Put a point cloud in the "
-            "same world "
-            f"there as {POINT_CLOUDS[0]}, or a COLMAP model of the same photographs as sparse/0 (colmap "
-            "feature_extractor, exhaustive_matcher, then mapper or point_triangulator)."
+            f"same world there as {POINT_CLOUDS[0]}, or a COLMAP model of the same photographs as sparse/0 (colmap "
+            f"feature_extractor, exhaustive_matcher, then mapper or point_triangulator){option}."
         )
     folder = max(models, key=count_images)
     model = read_colmap(folder)

@@ -29,14 +29,33 @@ from vdgs.captures.photographs import Names
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
 
+FILE = "transforms.json"
+#: Its lists of photographs, and the side that each is of.
+LISTS: tuple[tuple[str, Split], ...] = (
+    ("train_filenames", "train"), ("val_filenames", "test"), ("test_filenames", "test"),
+)  # fmt: skip
+
+
+def only_it_says(file: Path) -> str:
+    """What a transforms.json says that a COLMAP model of its cameras cannot, for people; nothing if it says none of
+    that, or cannot be read."""
+    try:
+        content = read_json(file)
+        masked = any(frame.get("mask_path") for frame in frames_of(content, file))
+    except CaptureError:
+        return ""
+    lists = "lists of training and test photographs" if any(content.get(key) for key, _ in LISTS) else ""
+    return " and ".join(filter(None, (lists, "masks" if masked else "")))
+
 
 def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
-    """The capture described by `root`/transforms.json.
+    """The capture described by `root`/transforms.json. Points come from the file that it names, else as
+    `find_sparse_points` finds them.
 
     Raises `CaptureError` for missing images, non-rigid poses, unsafe names, lists of what is no frame, and where no
     point cloud is found.
     """
-    file = root / "transforms.json"
+    file = root / FILE
     content = read_json(file)
     frames = frames_of(content, file)
     names = [_name(frame, file, root) for frame in frames]
@@ -44,12 +63,13 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     chosen = options.images or folder
     splits = _splits(content, names, file, root, options)
     undo = _undo_applied(content, file)
-    views = []
+    views, poses = list[SourceView](), dict[str, np.ndarray]()
     for frame, name in zip(frames, names, strict=True):
         short = name.removeprefix(folder + "/") if folder else name
         image = _image(root / chosen / short)
         world_from_camera = matrix_of(frame.get("transform_matrix"), file, f"frame {name!r}") @ OPENGL_FROM_OPENCV
-        pose = np.linalg.inv(undo(rigid(world_from_camera, file, f"frame {name!r}")))
+        in_file = rigid(world_from_camera, file, f"frame {name!r}")
+        pose, poses[short] = np.linalg.inv(undo(in_file)), np.linalg.inv(in_file)
         intrinsics = intrinsics_of(frame, content, image, file)
         mask = frame.get("mask_path")
         mask_path = root / safe_name(str(mask), file, "mask_path", root) if mask else None
@@ -57,7 +77,7 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     twice = duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{file}: the same image occurs more than once.{listing(twice)}")
-    points, colours = _points(root, content, file, views)
+    points, colours = _points(root, content, file, poses)
     homogeneous = np.tile(np.eye(4), (len(points), 1, 1))
     homogeneous[:, :3, 3] = points
     moved = undo(homogeneous)[:, :3, 3]
@@ -100,11 +120,8 @@ def _splits(
     where lists that are not ignored name what is no frame.
     """
     splits: dict[str, Split] = {}
-    sides: tuple[tuple[str, Split], ...] = (
-        ("train_filenames", "train"), ("val_filenames", "test"), ("test_filenames", "test"),
-    )  # fmt: skip
     frames, sides_listed, unknown = Names({name: root / name for name in names}), set[Split](), list[str]()
-    for key, side in sides:
+    for key, side in LISTS:
         listed = content.get(key) or []
         if not isinstance(listed, list):
             raise CaptureError(f"{file}: {key!r} must be a list of names.")
@@ -141,9 +158,11 @@ def _undo_applied(content: dict[str, Any], file: Path) -> Callable[[np.ndarray],
     return undo
 
 
-def _points(root: Path, content: dict[str, Any], file: Path, views: list[SourceView]) -> tuple[np.ndarray, np.ndarray]:
-    """Points in the world of the file (before `applied_transform` is undone)."""
+def _points(
+    root: Path, content: dict[str, Any], file: Path, poses: dict[str, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and `poses` (camera-from-world by name) in the world of the file, before `applied_transform` is undone."""
     ply = content.get("ply_file_path")
     if ply is not None:
         return read_point_cloud(root / safe_name(str(ply), file, "ply_file_path", root))
-    return find_sparse_points(root, {view.name: view.camera_from_world for view in views}, "transforms.json")
+    return find_sparse_points(root, poses, FILE, option=" and give --format transforms")
