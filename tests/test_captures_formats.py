@@ -16,7 +16,9 @@ from hypothesis import strategies as st
 from captures_support import TinyScene, moved, tiny_scene, to_source, write_colmap, write_images, write_ply
 from layouts_support import DRB, OPENGL, halves, matrixcity_frames, write_matrixcity, write_mega_nerf
 from vdgs.captures.capture import Capture
+from vdgs.captures.formats.json_poses import intrinsics_of
 from vdgs.captures.formats.ply import read_point_cloud
+from vdgs.captures.formats.source import Intrinsics
 from vdgs.captures.loading import load_capture
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
@@ -228,6 +230,17 @@ def test_angles_stand_in_for_focal_lengths(tmp_path, scene):
     assert_sees_the_scene(load_capture(tmp_path), scene)
 
 
+@pytest.mark.parametrize("says", [
+    {"is_fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}, {"camera_model": "OPENCV_FISHEYE", "is_fisheye": True},
+])  # fmt: skip
+def test_fisheyes_are_read_as_such(says):
+    """nerfstudio names the model; instant-ngp knows `is_fisheye` and no model. Both mean k1...k4 of OpenCV's."""
+    lens = {"fl_x": 50.0, "fl_y": 51.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48}
+    lens |= {"k1": 0.04, "k2": 0.03, "k3": 0.02, "k4": 0.01}
+    found = intrinsics_of({}, lens | says, Path("a.png"), Path("transforms.json"))
+    assert found == Intrinsics("OPENCV_FISHEYE", (50.0, 51.0, 32.0, 24.0, 0.04, 0.03, 0.02, 0.01), 64, 48)
+
+
 def frame(pose: np.ndarray, path: str = "images/frame_000.png") -> dict:
     return {"file_path": path, "transform_matrix": pose.tolist()}
 
@@ -245,6 +258,11 @@ def frame(pose: np.ndarray, path: str = "images/frame_000.png") -> dict:
         ({"k1": 0.2}, "lens distortion"),
         ({"camera_model": "OPENCV_FISHEYE"}, "lens distortion"),
         ({"camera_model": "EQUIRECTANGULAR"}, "not supported"),
+        ({"camera_model": "FISHEYE624"}, "'FISHEYE624' is not supported; undistort"),
+        ({"camera_model": "THIN_PRISM_FISHEYE"}, "'THIN_PRISM_FISHEYE' is not supported; undistort"),
+        ({"camera_model": "OPENCV", "is_fisheye": True}, "is_fisheye contradicts the camera model OPENCV"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.01}, "p1, p2 of a fisheye"),
+        ({"ftheta_p0": 0.0}, "'ftheta_p0' describes is not supported"),
         ({"ply_file_path": "../../cloud.ply"}, "inside the capture"),
         ({"ply_file_path": None}, None),
         ({"applied_transform": (3 * np.eye(4)[:3]).tolist()}, "orthonormal"),

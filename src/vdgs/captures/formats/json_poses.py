@@ -90,13 +90,18 @@ def intrinsics_of(frame: dict[str, Any], common: dict[str, Any], image: Path, fi
     if fx is None or fy is None:
         raise CaptureError(f"{file}: no focal length for {image.name} (fl_x or camera_angle_x).")
     head = (fx, fy, get("cx", width / 2) or 0.0, get("cy", height / 2) or 0.0)
-    model, tail = _lens(str(values.get("camera_model", "OPENCV")), {k: get(k, 0.0) or 0.0 for k in _LENS}, file)
+    model, tail = _lens(_camera_model(values, file), {k: get(k, 0.0) or 0.0 for k in _LENS}, file)
     if not (0 < width < 1e6 and 0 < height < 1e6):
         raise CaptureError(f"{file}: {image.name} has an image size of {width}x{height}. Mend w and h.")
     return check_intrinsics(Intrinsics(model, (*head, *tail), int(width), int(height)), file, image.name)
 
 
 _LENS = ("k1", "k2", "k3", "k4", "p1", "p2")
+#: Camera models that bend by radial and tangential polynomials, if at all, and fisheyes that k1...k4 describe.
+_PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"}
+_FISHEYE = {"OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"}
+#: Keys by which instant-ngp names lenses that are no camera model here.
+_OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular")
 
 
 def _focal(side: float, angle: float | None) -> float | None:
@@ -104,12 +109,32 @@ def _focal(side: float, angle: float | None) -> float | None:
     return side / 2 / math.tan(angle / 2) if angle is not None and 0 < angle < math.pi else None
 
 
+def _camera_model(values: dict[str, Any], file: Path) -> str:
+    """The camera model in capitals: nerfstudio's `camera_model`, or what instant-ngp says by keys of its own."""
+    model = str(values.get("camera_model") or "OPENCV").upper()
+    for key in _OTHER_LENSES:
+        if values.get(key) is not None and values[key] is not False:
+            raise CaptureError(f"{file}: the lens that {key!r} describes is not supported; undistort to PINHOLE first.")
+    if not values.get("is_fisheye") or model in _FISHEYE:
+        return model
+    if values.get("camera_model"):
+        raise CaptureError(
+            f"{file}: is_fisheye contradicts the camera model {model}. Remove is_fisheye, or write OPENCV_FISHEYE."
+        )
+    return "OPENCV_FISHEYE"
+
+
 def _lens(model: str, k: dict[str, float], file: Path) -> tuple[str, tuple[float, ...]]:
     """COLMAP's model and its distortion parameters for nerfstudio's keys."""
-    if "FISHEYE" in model.upper():
+    if model in _FISHEYE:
+        if k["p1"] or k["p2"]:
+            raise CaptureError(f"{file}: the lens parameters p1, p2 of a fisheye are not supported; undistort first.")
         return "OPENCV_FISHEYE", (k["k1"], k["k2"], k["k3"], k["k4"])
-    if model.upper() not in {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL"}:
-        raise CaptureError(f"{file}: the camera model {model!r} is not supported; undistort to PINHOLE first.")
+    if model not in _PERSPECTIVE:
+        raise CaptureError(
+            f"{file}: the camera model {model!r} is not supported; undistort the images to PINHOLE first (fisheyes of "
+            "other models than OPENCV_FISHEYE: colmap image_undistorter)."
+        )
     if not any(k.values()):
         return "PINHOLE", ()
     if k["k4"]:
