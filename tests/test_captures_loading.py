@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tracemalloc
 
 import cv2
 import numpy as np
@@ -13,12 +14,14 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from captures_support import TinyScene, data_folder, render_plane, tiny_scene, write_colmap, write_images
+from vdgs.captures import undistortion
 from vdgs.captures.checks import check_images
 from vdgs.captures.formats.source import Intrinsics, SourceView
 from vdgs.captures.images import load_picture
 from vdgs.captures.loading import load_capture
 from vdgs.captures.matching import fit_to_image, scaled
 from vdgs.captures.photographs import decode_photograph
+from vdgs.captures.undistortion import ImageFile, pinhole_for, sampling_map
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
 
@@ -403,6 +406,42 @@ def test_undistorting_gives_the_pinhole_picture(tmp_path, model, extra):
     again = load_capture(tmp_path, up(undistort=True))
     assert len(again.views) == len(written) == 4
     assert all(file.stat().st_mtime_ns == time for file, time in written.items())
+
+
+def test_the_map_of_a_lens_is_made_once_for_all_its_photographs(tmp_path, monkeypatch):
+    """Two lenses in turn, as a rig of two cameras takes them; nothing is made where all is written already."""
+    lenses = [Intrinsics("SIMPLE_RADIAL", (58.0, 32.0, 24.0, bend), 64, 48) for bend in (-0.1, -0.05)]
+    plain = Intrinsics("PINHOLE", (58.0, 58.0, 32.0, 24.0), 64, 48)
+    picture = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+    photographs = []
+    for index, lens in enumerate([*lenses, plain] * 4):
+        file = tmp_path / f"{index:02d}.png"
+        assert cv2.imwrite(str(file), picture)
+        photographs.append(ImageFile(file.name, file, None, lens))
+    asked = []
+    monkeypatch.setattr(undistortion, "sampling_map", lambda *lens: asked.append(lens[0]) or sampling_map(*lens))
+    straight = undistortion.undistort(tmp_path / "straight", photographs)
+    assert asked == lenses
+    assert [photo.name for photo in straight] == [photo.name for photo in photographs]
+    for photo, before in zip(straight, photographs, strict=True):  # each by its own lens, whose sizes differ
+        lens = before.intrinsics
+        assert photo.intrinsics == (pinhole_for(lens) if lens.distorted else lens)
+        assert decode_photograph(photo.path)[0].shape[1::-1] == (photo.intrinsics.width, photo.intrinsics.height)
+    assert undistortion.undistort(tmp_path / "straight", photographs) == straight
+    assert asked == lenses
+
+
+def test_a_map_takes_little_more_memory_than_itself(monkeypatch):
+    lens = Intrinsics("OPENCV", (900.0, 905.0, 640.0, 480.0, -0.1, 0.02, 0.004, -0.003), 1280, 960)
+    pinhole = pinhole_for(lens)
+    tracemalloc.start()
+    whole = sampling_map(lens, pinhole)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert whole.shape == (pinhole.height, pinhole.width, 2)
+    assert peak < whole.nbytes + 100 * undistortion.STRIP_PX
+    monkeypatch.setattr(undistortion, "STRIP_PX", 7 * pinhole.width)
+    np.testing.assert_array_equal(sampling_map(lens, pinhole), whole)
 
 
 @pytest.mark.capture

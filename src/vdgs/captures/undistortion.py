@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,9 @@ from vdgs.captures.photographs import decode_mask, decode_photograph
 from vdgs.errors import CaptureError
 
 JPEG_QUALITY = 95
+THREADS = 2
+#: Pixels of a sampling map that are made at once.
+STRIP_PX = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -37,16 +43,25 @@ def undistort(folder: Path, photographs: list[ImageFile]) -> list[ImageFile]:
     distortion pass through. Raises `CaptureError` if the folder cannot be written or an image cannot be
     decoded.
     """
-    targets = {photo.intrinsics: pinhole_for(photo.intrinsics) for photo in photographs if photo.intrinsics.distorted}
+    bent = [photo for photo in photographs if photo.intrinsics.distorted]
+    targets = {lens: pinhole_for(lens) for lens in dict.fromkeys(photo.intrinsics for photo in bent)}
+    # Lens by lens, so that few maps are kept at a time, however many lenses there are.
+    numbers = {lens: number for number, lens in enumerate(targets)}
+    bent.sort(key=lambda photo: numbers[photo.intrinsics])
+    lock, kept = threading.Lock(), lru_cache(THREADS)(sampling_map)
+
+    def map_of(lens: Intrinsics) -> np.ndarray:
+        with lock:  # whoever needs the same one waits for it
+            return kept(lens, targets[lens])
 
     def one(photo: ImageFile) -> ImageFile:
-        target = targets.get(photo.intrinsics)
-        return photo if target is None else _undistort_one(folder, photo, target)
+        return _undistort_one(folder, photo, targets[photo.intrinsics], map_of)
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with ThreadPoolExecutor(2) as pool:
-            return list(pool.map(one, photographs))
+        with ThreadPoolExecutor(THREADS) as pool:
+            straight = dict(zip((photo.name for photo in bent), pool.map(one, bent), strict=True))
+        return [straight.get(photo.name, photo) for photo in photographs]
     except OSError as error:
         raise CaptureError(
             f"{folder}: cannot be written ({error.strerror or error}). "
@@ -73,18 +88,25 @@ def pinhole_for(intrinsics: Intrinsics) -> Intrinsics:
 def sampling_map(distorted: Intrinsics, pinhole: Intrinsics) -> np.ndarray:
     """Where each pixel of the pinhole picture lies in the distorted one, [h, w, 2] float32.
 
-    In OpenCV's convention: pixel centres are at 0.5 here and at 0 in `cv2.remap`.
+    In OpenCV's convention: pixel centres are at 0.5 here and at 0 in `cv2.remap`. Made a few rows at a time: all at
+    once would take eight times the memory of the map.
     """
     (fx, fy), (cx, cy) = pinhole.focal, pinhole.principal_point
     x = (np.arange(pinhole.width) + 0.5 - cx) / fx
-    y = (np.arange(pinhole.height) + 0.5 - cy) / fy
-    rays = np.stack([*np.broadcast_arrays(x[None], y[:, None]), np.ones((len(y), len(x)))], axis=-1)
-    pixels = np.asarray(_colmap(distorted).img_from_cam(rays.reshape(-1, 3)), dtype=np.float64)
-    pixels = np.where(np.isfinite(pixels), pixels, -1e6)  # behind a fisheye's rim: outside
-    return (pixels - 0.5).reshape(pinhole.height, pinhole.width, 2).astype(np.float32)
+    lens, rows = _colmap(distorted), max(1, STRIP_PX // pinhole.width)
+    found = np.empty((pinhole.height, pinhole.width, 2), np.float32)
+    for first in range(0, pinhole.height, rows):
+        y = (np.arange(first, min(first + rows, pinhole.height)) + 0.5 - cy) / fy
+        rays = np.stack([*np.broadcast_arrays(x[None], y[:, None]), np.ones((len(y), len(x)))], axis=-1)
+        pixels = np.asarray(lens.img_from_cam(rays.reshape(-1, 3)), dtype=np.float64)
+        pixels = np.where(np.isfinite(pixels), pixels, -1e6)  # behind a fisheye's rim: outside
+        found[first : first + rows] = (pixels - 0.5).reshape(len(y), len(x), 2)
+    return found
 
 
-def _undistort_one(folder: Path, photo: ImageFile, pinhole: Intrinsics) -> ImageFile:
+def _undistort_one(
+    folder: Path, photo: ImageFile, pinhole: Intrinsics, map_of: Callable[[Intrinsics], np.ndarray]
+) -> ImageFile:
     plain = photo.name if photo.name.lower().endswith((".jpg", ".jpeg")) else photo.name + ".jpg"
     target = folder / plain
     mask_target, stamp_file = (target.with_name(target.name + suffix) for suffix in (".mask.png", ".json"))
@@ -95,20 +117,20 @@ def _undistort_one(folder: Path, photo: ImageFile, pinhole: Intrinsics) -> Image
         stamp[kind] = status and [str(file), status.st_size, status.st_mtime_ns]
     known = _read_json(stamp_file)
     if not (target.is_file() and isinstance(known, dict) and known.get("made_from") == stamp):
-        keep = _write_straight(photo, pinhole, target, mask_target)
+        keep = _write_straight(photo, map_of(lens), target, mask_target)
         _write(stamp_file, json.dumps({"made_from": stamp, "mask": keep}).encode())
         known = {"mask": keep}
     mask = mask_target if known.get("mask") and mask_target.is_file() else None
     return ImageFile(photo.name, target, mask, pinhole)
 
 
-def _write_straight(photo: ImageFile, pinhole: Intrinsics, target: Path, mask_target: Path) -> bool:
-    """Write the straightened image, and its mask if there is one (from a file or from transparency)."""
+def _write_straight(photo: ImageFile, grid: np.ndarray, target: Path, mask_target: Path) -> bool:
+    """Write the straightened image (`grid` as of `sampling_map`), and its mask if there is one (from a file or from
+    transparency)."""
     pixels, keep = decode_photograph(photo.path)
     if photo.mask is not None:
         masked = decode_mask(photo.mask, pixels.shape[1], pixels.shape[0])
         keep = masked if keep is None else masked & keep
-    grid = sampling_map(photo.intrinsics, pinhole)
     x, y = grid[..., 0], grid[..., 1]
     straight = cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     settings = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111]
