@@ -6,8 +6,7 @@ Where the up axis and the scale come from, in this order:
 2. georef.json: the world already is ENU metres; only the origin may move.
 3. GPS of the photographs: robust similarity from camera centres to ENU.
 4. What the format promises about its world (Mega-NeRF, MatrixCity).
-5. Estimate: the axis of least variance of the camera centres and the sparse points, signed against the mean
-   viewing direction (drones look down; the mean of the cameras' own up axes fails for nadir flights).
+5. Estimate (`up`): drones look down on what is flat, others hold their cameras level.
 
 All arithmetic is float64. Choice: in a frame that is not georeferenced the origin is the median sparse point,
 so z = 0 is the median height of the ground; where metres are unknown the median camera flies at
@@ -27,6 +26,7 @@ from vdgs.captures.formats.source import KnownWorld, SourceCapture
 from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.captures.georeference import match_gps, read_georef, read_gps
 from vdgs.captures.heights import reach
+from vdgs.captures.up import estimate_up
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
 
@@ -36,8 +36,6 @@ CAMERA_HEIGHT = 10.0
 FAR_FROM_ORIGIN_M = 1000.0
 #: Cameras farther than this from the origin of an ENU world are not in it: they have turned by half a degree.
 FARTHEST_ENU_M = 50_000.0
-#: Below this cosine between up and the mean view the sign of up is taken from the heights instead.
-LEVEL_VIEW = 0.1
 #: A told up axis farther than this from the estimated one is worth a warning.
 SUSPICIOUS_DEG = 30.0
 AXES = {
@@ -49,11 +47,11 @@ AXES = {
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """What the frame is found from: camera centres, viewing directions and finite points, source world."""
+    """What the frame is found from: camera centres, camera_from_world rotations and finite points, source world."""
 
     names: list[str]
     centres: np.ndarray
-    forwards: np.ndarray
+    rotations: np.ndarray
     points: np.ndarray
 
 
@@ -88,7 +86,7 @@ def find_ground_frame(source: SourceCapture, root: Path, options: CaptureOptions
         frame = _promised(scene, source.world, warnings)
         _compare_up(scene, frame, warnings)
         return frame, warnings
-    up, how = estimate_up(scene.centres, scene.forwards, scene.points, warnings)
+    up, how = estimate_up(scene.centres, scene.rotations, scene.points, warnings)
     return _unscaled(scene, rotation_to_z(up), how, warnings), warnings
 
 
@@ -96,7 +94,7 @@ def _scene(source: SourceCapture) -> _Scene:
     poses = np.stack([view.camera_from_world for view in source.views])
     centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     points = source.points[np.isfinite(source.points).all(axis=1)]
-    return _Scene([view.name for view in source.views], centres, poses[:, 2, :3], points)
+    return _Scene([view.name for view in source.views], centres, poses[:, :3, :3], points)
 
 
 # ----------------------------------------------------------------------------------------- georeference
@@ -168,7 +166,7 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
 def _compare_up(scene: _Scene, frame: GroundFrame, warnings: list[str]) -> None:
     """Warn where the up axis that was told and the one that the cameras suggest contradict each other."""
     doubts: list[str] = []
-    up, _ = estimate_up(scene.centres, scene.forwards, scene.points, doubts)
+    up, _ = estimate_up(scene.centres, scene.rotations, scene.points, doubts)
     angle = float(np.degrees(np.arccos(np.clip(frame.rotation[2] @ up, -1, 1))))
     if angle > SUSPICIOUS_DEG and not doubts:
         warnings.append(
@@ -177,43 +175,7 @@ def _compare_up(scene: _Scene, frame: GroundFrame, warnings: list[str]) -> None:
         )
 
 
-# ---------------------------------------------------------------------------------------------- estimate
-
-
-def estimate_up(
-    centres: np.ndarray, forwards: np.ndarray, points: np.ndarray, warnings: list[str]
-) -> tuple[np.ndarray, str]:
-    """Unit up vector [3] in the source world, and how it was found.
-
-    The axis of least variance of camera centres and sparse points: both covariances are divided by their
-    trace, so that each counts alike, and added; points beyond the 95 % quantile of distance to the median are
-    left out. All of it turns with the world (no per-axis medians). Signed against the mean viewing
-    direction, or towards the cameras where that is level.
-    """
-    covariance = _shape(centres) + _shape(points)
-    values, vectors = np.linalg.eigh(covariance)
-    up = vectors[:, 0]
-    if values[0] > 0.5 * values[1]:
-        warnings.append(
-            "the up axis is uncertain: cameras and points spread about as far up as sideways. "
-            "Look at the figures of `vdgs inspect`; --up x|y|z|-x|-y|-z says it outright."
-        )
-    looking = float(forwards.mean(axis=0) @ up)
-    if abs(looking) >= LEVEL_VIEW:
-        return (-up if looking > 0 else up), "least variance of cameras and points, against the view"
-    above = float(np.median(centres @ up) - np.median(points @ up))
-    warnings.append("the cameras look level on average; up is taken to be the side of the cameras. --up overrides.")
-    return (-up if above < 0 else up), "least variance of cameras and points, cameras above"
-
-
-def _shape(points: np.ndarray) -> np.ndarray:
-    """Covariance divided by its trace, [3, 3]; zero for a single place."""
-    offset = points - geometric_median(points)
-    distance = np.linalg.norm(offset, axis=1)
-    core = points[distance <= np.quantile(distance, 0.95)]
-    covariance = np.cov(core, rowvar=False, bias=True) if len(core) > 1 else np.zeros((3, 3))
-    trace = np.trace(covariance)
-    return covariance / trace if trace > 0 else np.zeros((3, 3))
+# ------------------------------------------------------------------------------------------------ frames
 
 
 def rotation_to_z(up: np.ndarray) -> np.ndarray:

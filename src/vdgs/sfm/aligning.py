@@ -9,7 +9,8 @@ import numpy as np
 import pycolmap
 
 from vdgs.captures.alignment import Similarity, fit_similarity_robust, is_collinear
-from vdgs.captures.ground import estimate_up, rotation_to_z
+from vdgs.captures.ground import rotation_to_z
+from vdgs.captures.up import estimate_up
 from vdgs.sfm.photograph import Photograph
 from vdgs.sfm.positions import LEAST_POSITIONS, Positions
 
@@ -135,10 +136,10 @@ def _level(
         left, _, right = np.linalg.svd(np.sum(found, axis=0))
         mean = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
         return _along(mean, centres, targets) @ mean, "the recorded attitudes"
-    forwards = np.array([_rotation(image)[2] for image in images.values()])
-    up, _ = estimate_up(centres, forwards, points_of(model), [])
+    rotations = np.array([_rotation(image) for image in images.values()])
+    up, _ = estimate_up(centres, rotations, points_of(model), [])
     level = rotation_to_z(up)
-    return _along(level, centres, targets) @ level, "the views, which look down"
+    return _along(level, centres, targets) @ level, "the views"
 
 
 def _along(rotation: np.ndarray, centres: np.ndarray, targets: np.ndarray) -> np.ndarray:
