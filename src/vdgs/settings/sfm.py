@@ -17,7 +17,8 @@ class SfmOptions:
     """The focal length. hold: that of EXIF and XMP; refine: fitted; auto: fitted where the flight can tell it from the
     height (oblique views, or several heights), or where nothing says what it is; held otherwise."""
     neighbours: Annotated[int, Range(2, 1000)] = 16
-    """Each photograph is matched with so many that were taken near it, where positions are known."""
+    """Each photograph is matched with so many that were taken near it, where positions are known; with more where those
+    show little of the same: facades, oblique views, several cameras at one place."""
     exhaustive: Annotated[int, Range(0, MANY)] = 50
     """Without positions: up to so many photographs, all are matched with all; beyond it those next to each other in
     order, and those that look alike."""

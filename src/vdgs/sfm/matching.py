@@ -21,13 +21,15 @@ AT_ONCE = 12
 _READ = 2000
 
 
-def expected_pairs(count: int, positions: Positions, options: SfmOptions) -> int:
+def expected_pairs(photographs: Sequence[Photograph], positions: Positions, options: SfmOptions) -> int:
     """About how many pairs will be matched."""
+    count = len(photographs)
     if not positions.usable:
         everyone = count * (count - 1) // 2
         return everyone if count <= options.exhaustive else count * (pairs.NEXT + pairs.DOUBLINGS + pairs.ALIKE // 2)
-    each = 0.7 * options.neighbours + pairs.NEXT_WITH_POSITIONS / 2
-    return round(min(count * (count - 1) / 2, len(positions) * each + (count - len(positions)) * pairs.ALIKE))
+    if count <= pairs.NEXT:
+        return count * (count - 1) // 2
+    return len(_by_positions(photographs, positions, options)) + (count - len(positions)) * pairs.ALIKE
 
 
 def choose_pairs(
@@ -35,16 +37,15 @@ def choose_pairs(
 ) -> list[tuple[str, str]]:
     """Names of the pairs to match, sorted."""
     count = len(photographs)
-    order = sorted(range(count), key=lambda i: (photographs[i].taken, photographs[i].name))
+    order = _in_time(photographs)
     if count <= pairs.NEXT or (not positions.usable and count <= options.exhaustive):
         chosen = pairs.everyone(count)
     elif not positions.usable:
         chosen = pairs.in_order(order, pairs.NEXT, pairs.DOUBLINGS)
         chosen |= pairs.alike(_descriptors(work, photographs), range(count))
     else:
-        places = positions.rows(count)
-        chosen = pairs.near(places, options.neighbours) | pairs.in_order(order, pairs.NEXT_WITH_POSITIONS)
-        lost = np.flatnonzero(~np.isfinite(places).all(axis=1))
+        chosen = _by_positions(photographs, positions, options)
+        lost = np.flatnonzero(~np.isfinite(positions.rows(count)).all(axis=1))
         if len(lost):
             chosen |= pairs.alike(_descriptors(work, photographs), lost.tolist())
             place = {i: k for k, i in enumerate(order)}
@@ -56,6 +57,18 @@ def choose_pairs(
             }
     names = [photo.name for photo in photographs]
     return [(names[i], names[j]) for i, j in sorted(chosen)]
+
+
+def _by_positions(photographs: Sequence[Photograph], positions: Positions, options: SfmOptions) -> set[tuple[int, int]]:
+    """Pairs of those near each other, and of those next to each other in time, where a position is wrong."""
+    unknown = np.full(3, np.nan)
+    views = np.array([photo.attitude.camera_from_enu[2] if photo.attitude else unknown for photo in photographs])
+    near = pairs.near(positions.rows(len(photographs)), options.neighbours, views)
+    return near | pairs.in_order(_in_time(photographs), pairs.NEXT_WITH_POSITIONS)
+
+
+def _in_time(photographs: Sequence[Photograph]) -> list[int]:
+    return sorted(range(len(photographs)), key=lambda i: (photographs[i].taken, photographs[i].name))
 
 
 def match(work: Work, chosen: Sequence[tuple[str, str]], threads: int, console: Console) -> None:

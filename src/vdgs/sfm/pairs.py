@@ -9,8 +9,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
     from sklearn.cluster import MiniBatchKMeans
 
+#: Of those nearest in the plane, so many must be farther above or below than beside to be a facade's (choice).
+MOST = 0.75
+#: Cameras that look less than this apart show the same (degrees); SIFT follows no farther.
+SAME_WAY_DEG = 30.0
+#: A place is shared by those nearer than this share of how far the nearest reach, and only by so many (choice).
+SHARED, LEAST_SHARING = 0.1, 4
+#: Where places are shared, so many times more are asked for; what is asked for is sought among so many times more
+#: nearest ones (choice).
+SHARED_TIMES, WIDER = 3, 5
 #: With positions: so many that follow in order of time too, where a position is wrong.
 NEXT_WITH_POSITIONS = 2
 #: Without: so many that follow, and at distances that double, up to so many more.
@@ -21,21 +31,51 @@ ALIKE = 12
 WORDS, SAMPLE = 48, 40_000
 
 
-def near(places: np.ndarray, neighbours: int) -> set[tuple[int, int]]:
-    """Pairs of those nearest to each other in the plane; places [n, 3] metres, NaN where unknown."""
+def near(places: np.ndarray, neighbours: int, views: np.ndarray | None = None) -> set[tuple[int, int]]:
+    """Pairs of those nearest to each other in the plane, and of others where those show little of the same.
+
+    places [n, 3] in metres, NaN where unknown; views [n, 3], unit vectors of where the cameras look, NaN where unknown.
+    More are asked for, the nearest first, where most of those nearest in the plane are farther above or below than
+    beside (a facade: then the nearest in space), where most of them look another way (then those that look the same
+    way), and where several that may look the same way share a place (then `SHARED_TIMES` as many).
+    """
     from scipy.spatial import cKDTree
 
     known = np.flatnonzero(np.isfinite(places).all(axis=1))
     if len(known) < 2:
         return set()
-    count = min(neighbours + 1, len(known))
-    _, found = cKDTree(places[known, :2]).query(places[known, :2], k=count)
-    return {
-        _pair(int(known[i]), int(known[j]))
-        for i, row in enumerate(found.reshape(len(known), -1))
-        for j in row
-        if i != j
-    }
+    spots, plane = places[known], cKDTree(places[known, :2])
+    away, first = _nearest(plane, spots[:, :2], neighbours)
+    chosen = _pairs(np.arange(len(known)), first, np.ones(first.shape, bool))
+    radius = away[:, -1]
+    upright = np.quantile(np.abs(spots[first, 2] - spots[:, None, 2]), 1 - MOST, axis=1) > radius
+    away, wider = _nearest(plane, spots[:, :2], WIDER * neighbours)
+    if upright.any():
+        away[upright], wider[upright] = _nearest(cKDTree(spots), spots[upright], WIDER * neighbours)
+        radius[upright] = away[upright, first.shape[1] - 1]
+    looks = np.full(spots.shape, np.nan) if views is None else views[known]
+    same_way = ~(np.einsum("nki,ni->nk", looks[wider], looks) < np.cos(np.radians(SAME_WAY_DEG)))  # unknown: the same
+    turned = same_way[:, : first.shape[1]].mean(axis=1) < 0.5
+    apart = np.linalg.norm(spots[wider] - spots[:, None], axis=2)
+    sharing = (same_way & (apart <= SHARED * radius[:, None])).sum(axis=1)  # itself too
+    shared = np.median(sharing[first], axis=1) >= LEAST_SHARING
+    more = np.flatnonzero(upright | turned | shared)
+    asked = neighbours * np.where(shared, SHARED_TIMES, 1) + 1
+    taken = same_way & (np.cumsum(same_way, axis=1) <= asked[:, None])
+    chosen |= _pairs(more, wider[more], taken[more])
+    return {_pair(int(known[i]), int(known[j])) for i, j in chosen if i != j}
+
+
+def _nearest(tree: cKDTree, at: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Distances and numbers of so many nearest besides itself, the nearest first, [m, count + 1] or all there are."""
+    away, found = tree.query(at, k=range(1, min(count + 1, tree.n) + 1))
+    return away, found
+
+
+def _pairs(rows: np.ndarray, found: np.ndarray, taken: np.ndarray) -> set[tuple[int, int]]:
+    """Pairs of `rows` [m] with those `found` for each [m, k] that are `taken` [m, k]."""
+    row, column = np.nonzero(taken)
+    return set(zip(rows[row].tolist(), found[row, column].tolist(), strict=True))
 
 
 def in_order(order: Sequence[int], following: int, doublings: int = 0) -> set[tuple[int, int]]:

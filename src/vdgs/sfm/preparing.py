@@ -52,7 +52,7 @@ def prepare(request: SfmRequest) -> Prepared:
     look = look_at(collection, positions)
     look = replace(look, warnings=[*look.warnings, *(control.notes if control else ())])
     threads = request.threads or default_threads()
-    pairs = matching.expected_pairs(len(collection.photographs), positions, request.options)
+    pairs = matching.expected_pairs(collection.photographs, positions, request.options)
     takes = seconds(collection.photographs, pairs, request.options, threads)
     return Prepared(request, collection, positions, look, threads, takes, control)
 
@@ -70,7 +70,7 @@ def _control(options: SfmOptions, collection: Collection, positions: Positions) 
 def tell(prepared: Prepared, console: Console) -> None:
     """Print the look, and what will be done."""
     photographs, options = prepared.collection.photographs, prepared.request.options
-    pairs = matching.expected_pairs(len(photographs), prepared.positions, options)
+    pairs = matching.expected_pairs(photographs, prepared.positions, options)
     held, why = mapping.holds_focal(photographs, options)
     how = "near each other by their positions" if prepared.positions.usable else (
         "all with all" if len(photographs) <= options.exhaustive else "next in order, and alike")  # fmt: skip
