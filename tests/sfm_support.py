@@ -121,8 +121,9 @@ def write_photograph(
     orientation: int = 1,
     xmp: str | None = None,
     model: str = "Drone",
+    error_m: float | None = None,
 ) -> None:
-    """A JPEG with EXIF, its place where `enu` is given, and XMP."""
+    """A JPEG with EXIF, its place (wrong by `error_m`) where `enu` is given, and XMP."""
     exif = Image.Exif()
     exif[0x010F], exif[0x0110], exif[0x0112] = "Maker", model, orientation
     details = exif.get_ifd(0x8769)
@@ -137,6 +138,8 @@ def write_photograph(
         gps[1], gps[2] = ("S" if latitude < 0 else "N"), sexagesimal(latitude)
         gps[3], gps[4] = ("W" if longitude < 0 else "E"), sexagesimal(longitude)
         gps[5], gps[6] = (b"\x01" if altitude < 0 else b"\x00"), abs(altitude)
+        if error_m is not None:
+            gps[0x1F] = error_m
         xmp = xmp or (
             f'drone-dji:RelativeAltitude="+{enu[2]:.2f}" drone-dji:GimbalPitchDegree="-90.0" '
             'drone-dji:GimbalYawDegree="90.0" drone-dji:GimbalRollDegree="0.0"'

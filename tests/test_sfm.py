@@ -34,8 +34,8 @@ from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.presets import PRESETS
 from vdgs.settings.requests import RunRequest
 from vdgs.settings.sfm import SfmOptions, SfmRequest
-from vdgs.sfm import features, mapping, matching
-from vdgs.sfm.aligning import move, place
+from vdgs.sfm import aligning, features, mapping, matching
+from vdgs.sfm.aligning import Placed, Unplaced, move, place
 from vdgs.sfm.collection import collect
 from vdgs.sfm.positions import find_positions
 from vdgs.sfm.reconstruct import reconstruct
@@ -211,12 +211,46 @@ def test_one_line_of_photographs_is_placed_by_attitudes_or_views(made, flight, a
             model.deregister_frame(image.frame_id)
     line = [photo if attitudes else replace(photo, attitude=None) for photo in line]
     placed = place(model, line, find_positions(line, None, (1.0, 2.0)))
-    assert placed is not None
+    assert isinstance(placed, Placed)
     assert "along one line" in placed.how
     assert np.abs(placed.residuals).max() < 0.7
     move(model, placed.similarity)
     for image in (image for image in model.images.values() if image.has_pose):
         assert image.viewing_direction()[2] < -np.cos(np.radians(8))
+
+
+@pytest.mark.parametrize("line", [True, False])
+@pytest.mark.parametrize(("smaller", "believed"), [(1, True), (12, False)])
+def test_positions_that_are_wrong_by_as_much_as_the_flight_is_wide_tell_no_scale(made, flight, smaller, believed, line):
+    """Metres wrong, as a phone is: of the nine photographs 9 m apart, and of as many around an object."""
+    photographs = [photo for photo in collect([flight.folder]).photographs if photo.name in flight.names]
+    model = pycolmap.Reconstruction(made / "work" / "models" / "0")
+    positions = find_positions(photographs, None, (3.0, 3.0) if line else (0.1, 0.1))
+    drift = np.random.default_rng(4).normal(0, 0.9, positions.enu.shape)
+    placed = place(model, photographs, replace(positions, enu=positions.enu / smaller + drift))
+    assert isinstance(placed, Placed) == believed
+    if isinstance(placed, Unplaced):
+        assert "disagree" in placed.why
+        assert "over a flight of" in placed.why
+        assert "--gcp" in placed.remedy
+    else:
+        assert placed.similarity.scale == pytest.approx(1, abs=0.15)
+
+
+def test_positions_that_disagree_leave_the_scale_arbitrary_and_say_why(made, flight, tmp_path, monkeypatch):
+    output, said = tmp_path / "capture", console()
+    shutil.copytree(made, output, symlinks=True)
+    found = Unplaced("the positions disagree by 2 m", "give better ones")
+    monkeypatch.setattr(aligning, "place", lambda *_: found)
+    facts = reconstruct(SfmRequest((flight.folder,), output, threads=1, options=SfmOptions(max_size=200)), said)
+    assert (facts.origin, facts.residual_rms_m) == (None, None)
+    assert "disagree by 2 m" in facts.georeferenced
+    assert (
+        "not georeferenced (the positions disagree by 2 m): the scale of the scene is arbitrary" in said.file.getvalue()
+    )
+    assert "next flight: give better ones" in said.file.getvalue()
+    assert not (output / "georef.json").exists()
+    assert not load_capture(output).ground.metric
 
 
 def test_facts_are_plain_json(made):

@@ -82,6 +82,19 @@ def test_rtk_says_how_accurate_it_is(tmp_path):
     assert positions_of([replace(each, deviations=None) for each in seen]).deviations[0] == pytest.approx([1, 1, 2])
 
 
+def test_exif_says_how_accurate_a_phone_is_where_rtk_does_not(tmp_path):
+    seen = [photograph(tmp_path, k, (9.0 * k, 0, 40), error_m=4.5) for k in range(3)]
+    assert [each.error_m for each in seen] == [4.5] * 3
+    assert positions_of(seen).deviations[0] == pytest.approx([4.5, 4.5, 9])
+    better = [replace(each, deviations=(0.02, 0.02, 0.04)) for each in seen]
+    assert positions_of(better).deviations[0] == pytest.approx([0.02, 0.02, 0.04])
+    table = tmp_path / "gps.csv"
+    table.write_text("name,lat,lon,alt\n" + "".join(f"p{k:02d},10.{k:04d},20,5\n" for k in range(3)))
+    assert find_positions(seen, table, (1.0, 2.0)).deviations[0] == pytest.approx([1, 1, 2])
+    for nothing in (0.0, 99_999.0):
+        assert photograph(tmp_path, 5, (0, 0, 40), error_m=nothing).error_m is None
+
+
 @pytest.mark.parametrize("cut", [0, 10, 200, 3000, -2000])
 def test_what_is_cut_off_is_named_and_nothing_else_is_raised(tmp_path, cut):
     photograph(tmp_path, 1)

@@ -8,6 +8,9 @@ import numpy as np
 
 #: Points whose second principal spread is below this share of the first lie on one line.
 COLLINEAR = 0.02
+#: Matched points disagree where a fit leaves them farther off (RMS) than this share of their spread, or where fewer
+#: than this share of them trust it: what they say of scale and directions is chance (choice).
+MOST_OFF, LEAST_TRUSTED = 0.25, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +73,19 @@ def fit_similarity_robust(source: np.ndarray, target: np.ndarray, rounds: int = 
             return fit_similarity(source, target), np.ones(len(source), bool)
         best = fit_similarity(source[inliers], target[inliers])
     return best, inliers
+
+
+def disagreement(residuals: np.ndarray, targets: np.ndarray, trusted: np.ndarray) -> str:
+    """How far matched points are from agreeing on a similarity, in words; empty where they agree.
+
+    residuals [n, 3] are of all points, `trusted` [n] bool are those that the fit trusts; targets [m, 3] in metres
+    tell the spread.
+    """
+    rms = float(np.sqrt((residuals[trusted] ** 2).sum(axis=1).mean()))
+    spread = float(np.sqrt((targets - targets.mean(axis=0)).var(axis=0).sum()))
+    if trusted.mean() < LEAST_TRUSTED or rms > MOST_OFF * spread:
+        return f"{trusted.sum()} of {len(trusted)} agree, RMS {rms:.3g} m over a flight of {spread:.3g} m"
+    return ""
 
 
 def _residuals(similarity: Similarity, source: np.ndarray, target: np.ndarray) -> np.ndarray:

@@ -20,7 +20,13 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.alignment import Similarity, fit_similarity_robust, geometric_median, is_collinear
+from vdgs.captures.alignment import (
+    Similarity,
+    disagreement,
+    fit_similarity_robust,
+    geometric_median,
+    is_collinear,
+)
 from vdgs.captures.capture import GroundFrame
 from vdgs.captures.formats.source import KnownWorld, SourceCapture
 from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
@@ -144,18 +150,17 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
             "fix no up axis; the frame is estimated from the cameras instead and is not metric."
         )
         return None
-    residuals = similarity.apply(centres)[inliers] - enu[inliers]
-    rms = float(np.sqrt((residuals**2).sum(axis=1).mean()))
-    spread = float(np.sqrt((enu - enu.mean(axis=0)).var(axis=0).sum()))
-    if inliers.mean() < 0.5 or rms > 0.25 * spread:
+    residuals = similarity.apply(centres) - enu
+    how_far = disagreement(residuals, enu, inliers)
+    if how_far:
         warnings.append(
-            f"{file.name}: GPS and camera positions disagree ({inliers.sum()} of {len(indices)} agree, RMS "
-            f"{rms:.3g} m over a flight of {spread:.3g} m); it is ignored and the frame is estimated."
+            f"{file.name}: GPS and camera positions disagree ({how_far}); it is ignored and the frame is estimated."
         )
         return None
     if not inliers.all():
         names = ", ".join(scene.names[i] for i in indices[~inliers][:5])
         warnings.append(f"{file.name}: {(~inliers).sum()} GPS positions left out as outliers ({names}).")
+    rms = float(np.sqrt((residuals[inliers] ** 2).sum(axis=1).mean()))
     how = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m"
     frame = GroundFrame(similarity.scale, similarity.rotation, similarity.translation, True, how, origin)
     frame = _shifted(frame, -_middle(frame.to_ground(scene.points)), how)

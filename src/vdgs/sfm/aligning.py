@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from vdgs.captures.alignment import Similarity, fit_similarity_robust, is_collinear
+from vdgs.captures.alignment import Similarity, disagreement, fit_similarity_robust, is_collinear
 from vdgs.captures.ground import rotation_to_z
 from vdgs.captures.up import estimate_up
 from vdgs.sfm.photograph import Photograph
@@ -20,6 +20,11 @@ LEAST_ATTITUDES = 3
 SEVERAL_WAYS = 0.3
 #: Positions fix a turn about a line if they spread across it this many times their standard deviation.
 WRONG_TIMES = 3.0
+WRITE_GPS = "let the drone write GPS into the photographs: metres, north, maps."
+BETTER_POSITIONS = (
+    "take photographs over many times more than positions are wrong by, or give better positions: a receiver with RTK, "
+    "a table (--gps) or surveyed points (--gcp)."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +42,22 @@ class Placed:
     """Which of them the placing trusts, [m] bool."""
 
 
-def place(model: pycolmap.Reconstruction, photographs: Sequence[Photograph], positions: Positions) -> Placed | None:
-    """The similarity that brings the model to its positions; None where they are too few. Does not change the model."""
+@dataclass(frozen=True)
+class Unplaced:
+    """Why a model was not brought to a place on Earth, and what to do about it."""
+
+    why: str
+    remedy: str
+
+
+def place(model: pycolmap.Reconstruction, photographs: Sequence[Photograph], positions: Positions) -> Placed | Unplaced:
+    """The similarity that brings the model to its positions, or why they do not tell one: they are too few, or wrong by
+    too much of how far they spread. Does not change the model."""
     images = {image.name: image for image in model.images.values() if image.has_pose}
     rows, centres, targets = _matched(images, photographs, positions)
     if not positions.usable or len(rows) < LEAST_POSITIONS:
-        return None
+        few = f"{len(positions)} positions, of placed photographs, are too few"
+        return Unplaced(few if len(positions) else "no positions that can be used", WRITE_GPS)
     if not is_collinear(centres) and not is_line(targets, positions.deviations[rows]):
         similarity, inliers = fit_similarity_robust(centres, targets)
         how = f"positions of {int(inliers.sum())} photographs ({positions.source})"
@@ -50,7 +65,12 @@ def place(model: pycolmap.Reconstruction, photographs: Sequence[Photograph], pos
         rotation, by = _level(model, images, photographs, centres, targets)
         similarity, inliers = _scaled(rotation, centres, targets), np.ones(len(rows), bool)
         how = f"positions of {len(rows)} photographs along one line ({positions.source}), up by {by}"
-    return Placed(similarity, how, rows, similarity.apply(centres) - targets, inliers)
+    residuals = similarity.apply(centres) - targets
+    how_far = disagreement(residuals, targets[inliers], inliers)
+    if how_far:
+        why = f"the positions ({positions.source}) and where the photographs were placed disagree: {how_far}"
+        return Unplaced(why, BETTER_POSITIONS)
+    return Placed(similarity, how, rows, residuals, inliers)
 
 
 def as_it_lies(

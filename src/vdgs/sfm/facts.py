@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from vdgs.captures.reconstruction import CameraFacts, PhotographFacts, ReconstructionFacts, SurveyFacts
-from vdgs.sfm.aligning import Placed, points_of, tilt_against_attitudes
+from vdgs.sfm.aligning import Placed, Unplaced, points_of, tilt_against_attitudes
 from vdgs.sfm.collection import Collection, LeftOut
 from vdgs.sfm.features import Kind
 from vdgs.sfm.look import LEAST_OVERLAP, LEAST_VIEWS, OBLIQUE_DEG, Look
@@ -31,8 +31,8 @@ class Outcome:
 
     #: Kinds of camera, as the features were found with.
     kinds: Sequence[Kind]
-    #: How the model was placed by positions, and where its origin is (latitude, longitude, altitude); None: it was not.
-    placed: Placed | None
+    #: How the model was placed by positions, or why not, and where its origin is (latitude, longitude, altitude).
+    placed: Placed | Unplaced
     origin: tuple[float, float, float] | None
     #: Surveyed points and how far off the model has them.
     survey: tuple[SurveyFacts, ...]
@@ -45,10 +45,14 @@ class Outcome:
     held: tuple[bool, str]
     seconds: float
 
+    @property
+    def on_earth(self) -> Placed | None:
+        return self.placed if isinstance(self.placed, Placed) else None
+
 
 def facts_of(model: pycolmap.Reconstruction, prepared: Prepared, outcome: Outcome) -> ReconstructionFacts:
     """The facts of a model that lies where it belongs."""
-    placed, held = outcome.placed, outcome.held
+    placed, held = outcome.on_earth, outcome.held
     collection, positions, look = prepared.collection, prepared.positions, prepared.look
     images = [image for image in model.images.values() if image.has_pose]
     metric = placed is not None
@@ -57,11 +61,15 @@ def facts_of(model: pycolmap.Reconstruction, prepared: Prepared, outcome: Outcom
     tilt = float(np.median(np.degrees(np.arccos(np.clip(-forwards[:, 2], -1, 1))))) if metric else None
     cameras = _cameras(model, outcome.kinds)
     turned = tilt_against_attitudes(model, collection.photographs) if metric else None
-    georeferenced = placed.how if placed else f"none: {_why_not(positions)}; scale, north and up are not known"
     warnings = [*look.warnings, *_warnings(cameras, held[0], height, look.height_m, turned)]
     warnings += _survey_warnings(outcome.survey)
-    if not metric:
-        warnings.append(f"not georeferenced ({_why_not(positions)}): the scale of the scene is arbitrary.")
+    advice = _advice(look, held[0], len(images), len(collection.photographs))
+    if isinstance(outcome.placed, Unplaced):
+        georeferenced = f"none: {outcome.placed.why}; scale, north and up are not known"
+        warnings.append(f"not georeferenced ({outcome.placed.why}): the scale of the scene is arbitrary.")
+        advice.append(outcome.placed.remedy)
+    else:
+        georeferenced = outcome.placed.how
     return ReconstructionFacts(
         found=len(collection.photographs) + len(collection.left_out), registered=len(images),
         components=tuple(outcome.components), pairs=outcome.pairs, points=model.num_points3D(),
@@ -72,7 +80,7 @@ def facts_of(model: pycolmap.Reconstruction, prepared: Prepared, outcome: Outcom
         focal_held=held[0], focal_reason=held[1], height_m=height, recorded_height_m=look.height_m, tilt_deg=tilt,
         attitude_difference_deg=turned, cameras=cameras,
         photographs=_photographs(collection, positions, placed, outcome.left_out), warnings=tuple(warnings),
-        advice=tuple(_advice(look, held[0], len(images), len(collection.photographs), metric)),
+        advice=tuple(advice),
         seconds=outcome.seconds,
         survey=outcome.survey,
     )  # fmt: skip
@@ -115,12 +123,6 @@ def _altitudes(prepared: Prepared) -> str:
     if control is not None and control.places_the_model:
         return f"heights as in {control.source} ({control.system})"
     return prepared.positions.altitude_reference
-
-
-def _why_not(positions: Positions) -> str:
-    if not len(positions):
-        return "no positions that can be used"
-    return f"{len(positions)} positions, of placed photographs, are too few"
 
 
 def _rms(placed: Placed | None) -> tuple[float, ...] | None:
@@ -191,7 +193,7 @@ def _survey_warnings(survey: Sequence[SurveyFacts]) -> list[str]:
     return found
 
 
-def _advice(look: Look, held: bool, registered: int, found: int, metric: bool) -> list[str]:
+def _advice(look: Look, held: bool, registered: int, found: int) -> list[str]:
     """What to do better next flight."""
     advice = []
     if look.forward_overlap is not None and look.forward_overlap < LEAST_OVERLAP:
@@ -203,8 +205,6 @@ def _advice(look: Look, held: bool, registered: int, found: int, metric: bool) -
             f"add oblique views (camera {OBLIQUE_DEG + 10:.0f}° or more from straight down) or a second height: walls "
             "come out, and the focal length is fixed by the flight itself."
         )
-    if not metric:
-        advice.append("let the drone write GPS into the photographs: metres, north, maps.")
     if registered < 0.9 * found:
         advice.append("see why photographs were left out: overlap, motion blur (faster shutter), water at the edges.")
     return advice

@@ -20,6 +20,8 @@ from vdgs.sfm.xmp import number, read_xmp
 LEAST_SIDE_PX = 100
 #: EXIF orientations that turn a photograph by a quarter: width and height change places.
 QUARTER_TURNS = (5, 6, 7, 8)
+#: A receiver that is off by more has no position.
+LARGEST_ERROR_M = 1000.0
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
 _XMP_HEADER = b"http://ns.adobe.com/xap/1.0/\x00"
 #: The ends of a JPEG that may have been cut off are looked for in so many bytes at its end.
@@ -52,6 +54,8 @@ class Photograph:
     altitude_type: str
     deviations: tuple[float, float, float] | None
     """Standard deviations east, north and up in metres, where the receiver says them (RTK)."""
+    error_m: float | None
+    """How far the place may be off across, in metres, where EXIF says it (GPSHPositioningError)."""
     above_takeoff: float | None
     attitude: Attitude | None
     """Of the picture as the sensor has it; None for pictures that lay on their side."""
@@ -104,7 +108,7 @@ def read_photograph(path: Path, name: str) -> Photograph:
     return Photograph(
         name, path, width, height, orientation, _camera(tags, details, xmp), lens,
         _text(details.get(0x9003)) or _text(tags.get(0x0132)), _place(gps), altitude, altitude_type, _deviations(xmp),
-        number(xmp, "drone-dji:RelativeAltitude", "sensefly:Height"), attitude, size,
+        _error(gps), number(xmp, "drone-dji:RelativeAltitude", "sensefly:Height"), attitude, size,
     )  # fmt: skip
 
 
@@ -195,6 +199,12 @@ def _deviations(xmp: Mapping[str, str]) -> tuple[float, float, float] | None:
     found = [number(xmp, f"drone-dji:RtkStd{which}") for which in ("Lon", "Lat", "Hgt")]
     east, north, up = (value if value is not None and 0 < value < 100 else None for value in found)
     return None if east is None or north is None or up is None else (east, north, up)
+
+
+def _error(gps: Mapping[int, Any]) -> float | None:
+    """EXIF's GPSHPositioningError in metres; 0 and kilometres say nothing."""
+    value = finite(gps.get(0x1F))
+    return value if value is not None and 0 < value < LARGEST_ERROR_M else None
 
 
 def _attitude(xmp: Mapping[str, str]) -> Attitude | None:

@@ -136,10 +136,16 @@ def _origin(geodetic: np.ndarray) -> tuple[float, float, float]:
 
 
 def _deviation(photo: Photograph, table: Path | None, deviation_m: tuple[float, float]) -> tuple[float, float, float]:
-    if photo.deviations is None or table is not None:
-        return deviation_m[0], deviation_m[0], deviation_m[1]
-    east, north, up = (max(value, LEAST_DEVIATION_M) for value in photo.deviations)
-    return east, north, up
+    """A table has `deviation_m` across and upwards; photographs have what a receiver with RTK says, or what EXIF says
+    across and as much worse upwards as `deviation_m` is."""
+    across, up = deviation_m
+    if table is None and photo.deviations is not None:
+        east, north, height = (max(value, LEAST_DEVIATION_M) for value in photo.deviations)
+        return east, north, height
+    if table is None and photo.error_m is not None:
+        error = max(photo.error_m, LEAST_DEVIATION_M)
+        return error, error, error * up / across
+    return across, across, up
 
 
 def _some(names: Sequence[str], which: np.ndarray) -> str:

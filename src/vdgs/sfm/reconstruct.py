@@ -124,7 +124,7 @@ def _steps(prepared: Prepared, work: Work, keys: dict[str, str], console: Consol
     facts = facts_of(models[0], prepared, outcome)
     points = aligning.points_of(models[0])
     marks = dict(zip((each.name for each in surveyed), _places(prepared), strict=False))
-    draw_residuals(points, prepared.positions, placed, marks, output / FIGURE)
+    draw_residuals(points, prepared.positions, outcome.on_earth, marks, output / FIGURE)
     if origin is not None:
         write_json(output / "georef.json", _georef(facts, origin))
     writing.write_model(output, models[0], _lenses(models[0], request.options.max_size))
@@ -181,20 +181,20 @@ def _models(
 
 def _place(
     model: pycolmap.Reconstruction, prepared: Prepared, hold_focal: bool
-) -> tuple[aligning.Placed | None, tuple[float, float, float] | None, tuple[SurveyFacts, ...]]:
+) -> tuple[aligning.Placed | aligning.Unplaced, tuple[float, float, float] | None, tuple[SurveyFacts, ...]]:
     """Bring the model to metres east, north, up, its median point to height 0; the origin that this has on Earth, and
     what it makes of surveyed points."""
     photographs, positions, control = prepared.collection.photographs, prepared.positions, prepared.control
     doubtful = set[str]()
     if control is not None and control.places_the_model:
         how, doubtful = surveying.bring_to_control(model, control, prepared.origin, hold_focal, prepared.threads)
-        placed: aligning.Placed | None = aligning.as_it_lies(model, photographs, positions, how)
+        placed: aligning.Placed | aligning.Unplaced = aligning.as_it_lies(model, photographs, positions, how)
     else:
         placed = aligning.place(model, photographs, positions)
-        if placed is not None:
+        if isinstance(placed, aligning.Placed):
             aligning.move(model, placed.similarity)
-    if placed is None:
-        return None, None, ()
+    if isinstance(placed, aligning.Unplaced):
+        return placed, None, ()
     surveyed = surveying.survey(model, control, prepared.origin, doubtful) if control is not None else ()
     ground = float(np.median(aligning.points_of(model)[:, 2]))
     aligning.move(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))
