@@ -22,7 +22,7 @@ from vdgs.sfm import pairs
 from vdgs.sfm.aligning import tilt_against_attitudes
 from vdgs.sfm.attitude import of_aircraft, of_gimbal
 from vdgs.sfm.collection import collect, only_photographs
-from vdgs.sfm.lens import find_lens
+from vdgs.sfm.lens import CALIBRATED, Lens, find_lens
 from vdgs.sfm.look import look_at
 from vdgs.sfm.mapping import holds_focal
 from vdgs.sfm.photograph import Photograph, Unusable, read_photograph
@@ -313,9 +313,50 @@ def test_the_focal_length_is_held_where_the_flight_cannot_tell_it(tmp_path):
     oblique = [replace(photo, attitude=of_gimbal(0, -50, 0)) for photo in seen]
     heights = [replace(photo, above_takeoff=30.0 + 20 * k) for k, photo in enumerate(seen)]
     unknown = [replace(photo, lens=None) for photo in seen]
-    held = [holds_focal(each, SfmOptions())[0] for each in (seen, oblique, heights, unknown)]
+    where = positions_of(seen)
+    held = [holds_focal(each, where, SfmOptions())[0] for each in (seen, oblique, heights, unknown)]
     assert held == [True, False, False, False]
-    assert holds_focal(oblique, SfmOptions(focal="hold"))[0]
+    assert holds_focal(oblique, where, SfmOptions(focal="hold"))[0]
+
+
+def circle(radius: float) -> np.ndarray:
+    turn = np.linspace(0, 2 * np.pi, 30, endpoint=False)
+    return radius * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+
+
+def strips(count: int, each: int) -> np.ndarray:
+    return np.array([(12.0 * k, 25.0 * strip, 60.0) for strip in range(count) for k in range(each)])
+
+
+@pytest.mark.parametrize(
+    ("places", "wrong_m", "held"),
+    [
+        pytest.param(strips(5, 8), 1.0, True, id="a survey"),
+        pytest.param(strips(2, 20), 0.5, True, id="there and back"),
+        pytest.param(strips(3, 3), 0.5, True, id="nine photographs"),
+        pytest.param(strips(1, 20), 0.5, False, id="a line"),
+        pytest.param(circle(30.0), 0.5, False, id="around a house"),
+        pytest.param(circle(30.0) * [1, 0.3, 1], 0.5, False, id="around a long house"),
+        pytest.param(circle(1.5), 2.0, False, id="around a statue"),
+        pytest.param(strips(5, 8)[:, [0, 2, 1]], 1.0, False, id="a facade"),
+        pytest.param(strips(5, 8) * [1, 1, 0] + np.outer(np.arange(40) % 4, [0, 0, 15]), 1.0, False, id="heights"),
+        pytest.param(None, 0.0, False, id="no positions"),
+    ],
+)
+def test_without_attitudes_the_focal_length_is_held_where_positions_are_those_of_a_survey(
+    tmp_path, places, wrong_m, held
+):
+    """Older drones and cameras on wings record nothing but positions; phones and hands record no more."""
+    silent = replace(photograph(tmp_path, 0), attitude=None, above_takeoff=None)
+    silent = replace(silent, place=None) if places is None else silent
+    photographs = [silent] * (10 if places is None else len(places))
+    where = positions_of(photographs)
+    if places is not None:
+        enu = places + np.random.default_rng(3).normal(0, wrong_m, places.shape)
+        where = replace(where, index=np.arange(len(enu)), enu=enu, deviations=np.tile([1.0, 1, 2], (len(enu), 1)))
+    assert holds_focal(photographs, where, SfmOptions())[0] is held
+    calibrated = [replace(photo, lens=Lens(0.7, CALIBRATED)) for photo in photographs]
+    assert holds_focal(calibrated, where, SfmOptions())[0]
 
 
 # ----------------------------------------------------------------------------------------------------- pairs

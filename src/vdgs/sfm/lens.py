@@ -24,6 +24,10 @@ _INCH, _CENTIMETRE, _MILLIMETRE = 25.4, 10.0, 1.0
 _UNITS = {2: _INCH, 3: _CENTIMETRE, 4: _MILLIMETRE}
 
 
+#: What says a focal length that was measured, lens by lens.
+CALIBRATED = "the maker's calibration in XMP"
+
+
 @dataclass(frozen=True)
 class Lens:
     """Focal length over the longer side of the picture, and where it is from."""
@@ -41,7 +45,7 @@ def find_lens(
     model = _model(tags)
     focal_mm, equivalent_mm = _number(details.get(0x920A)), _number(details.get(0xA405))
     ways = (
-        (_calibrated(xmp, original), "the maker's calibration in XMP"),
+        (_calibrated(xmp, original), CALIBRATED),
         (_by_sensor(focal_mm, _sensor(details, original)), "EXIF's focal length and sensor"),
         (_by_sensor(focal_mm, SENSOR_WIDTH_MM.get(model)), f"EXIF's focal length, the sensor of {model}"),
         (_by_equivalent(equivalent_mm, width, height), "EXIF's 35 mm equivalent"),

@@ -13,7 +13,9 @@ from rich.console import Console
 
 from vdgs.errors import CaptureError
 from vdgs.settings.sfm import SfmOptions
+from vdgs.sfm.aligning import is_line
 from vdgs.sfm.features import Kind
+from vdgs.sfm.lens import CALIBRATED
 from vdgs.sfm.look import OBLIQUE_DEG
 from vdgs.sfm.photograph import Photograph
 from vdgs.sfm.positions import Positions
@@ -21,15 +23,19 @@ from vdgs.sfm.work import Work, call, progress
 
 #: Oblique views, or heights that differ by so much of the flying height, let a flight tell the focal length (choice).
 OBLIQUE_SHARE, HEIGHTS_DIFFER = 0.15, 0.2
+#: Of a way around something no tenth of the positions is nearer to the middle than this share of how far all are (RMS,
+#: both axes alike); of strips over an area it is (choice).
+AROUND = 0.8
 #: Parts of fewer photographs than this are no model.
 SMALLEST_MODEL = 3
 #: What the mapper has is kept so many times on the way, each time by so many photographs more at least.
 SNAPSHOTS, LEAST_BETWEEN = 20, 5
 
 
-def holds_focal(photographs: Sequence[Photograph], options: SfmOptions) -> tuple[bool, str]:
+def holds_focal(photographs: Sequence[Photograph], positions: Positions, options: SfmOptions) -> tuple[bool, str]:
     """Whether the focal length is held at what EXIF says, and why: over level ground from one height, straight down, a
-    longer lens and a lower flight look the same."""
+    longer lens and a lower flight look the same. Where nothing says that the flight was one like this it is fitted: a
+    wrong focal length that is held bends or tears all other scenes."""
     if options.focal != "auto":
         return options.focal == "hold", "asked for"
     if any(photo.lens is None for photo in photographs):
@@ -38,9 +44,31 @@ def holds_focal(photographs: Sequence[Photograph], options: SfmOptions) -> tuple
     if tilts and np.mean(np.array(tilts) > OBLIQUE_DEG) >= OBLIQUE_SHARE:
         return False, f"{np.mean(np.array(tilts) > OBLIQUE_DEG):.0%} oblique views tell it"
     heights = np.array([photo.above_takeoff for photo in photographs if photo.above_takeoff is not None])
-    if len(heights) >= 3 and np.ptp(np.quantile(heights, [0.05, 0.95])) > HEIGHTS_DIFFER * abs(np.median(heights)):
+    if len(heights) >= 3 and _range(heights) > HEIGHTS_DIFFER * abs(np.median(heights)):
         return False, "flown at several heights, which tell it"
-    return True, "one height, straight down as far as known: the flight cannot tell it"
+    if 2 * max(len(tilts), len(heights)) >= len(photographs):
+        return True, "one height, straight down as far as known: the flight cannot tell it"
+    if all(photo.lens is not None and photo.lens.source == CALIBRATED for photo in photographs):
+        return True, "calibrated by the maker"
+    if _surveys(positions):
+        return True, "level strips over an area: the flight cannot tell it, if it looked straight down"
+    return False, "nothing says that it was flown level, looking straight down"
+
+
+def _surveys(positions: Positions) -> bool:
+    """Whether photographs were taken from one height all over an area, as a survey is, and not around something."""
+    if not positions.usable or is_line(positions.enu, positions.deviations):
+        return False
+    plane = positions.enu[:, :2] - positions.enu[:, :2].mean(axis=0)
+    axes, spread, _ = np.linalg.svd(plane, full_matrices=False)
+    spread, alike = spread / np.sqrt(len(plane)), np.linalg.norm(axes, axis=1) * np.sqrt(len(plane))
+    around = np.quantile(alike, 0.1) > AROUND * np.sqrt(2)
+    return not around and _range(positions.enu[:, 2]) <= HEIGHTS_DIFFER * spread[1]
+
+
+def _range(heights: np.ndarray) -> float:
+    """Between the 5 % quantile and the 95 %."""
+    return float(np.ptp(np.quantile(heights, [0.05, 0.95])))
 
 
 def write_priors(work: Work, photographs: Sequence[Photograph], positions: Positions) -> None:

@@ -71,7 +71,7 @@ def tell(prepared: Prepared, console: Console) -> None:
     """Print the look, and what will be done."""
     photographs, options = prepared.collection.photographs, prepared.request.options
     pairs = matching.expected_pairs(photographs, prepared.positions, options)
-    held, why = mapping.holds_focal(photographs, options)
+    held, why = mapping.holds_focal(photographs, prepared.positions, options)
     how = "near each other by their positions" if prepared.positions.usable else (
         "all with all" if len(photographs) <= options.exhaustive else "next in order, and alike")  # fmt: skip
     metres = "metres east, north, up, " if prepared.positions.usable or prepared.control else ""

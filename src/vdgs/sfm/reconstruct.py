@@ -110,7 +110,7 @@ def _steps(prepared: Prepared, work: Work, keys: dict[str, str], console: Consol
     lost = _features(prepared, work, kinds, keys["features"], console)
     usable = [photo for photo in photographs if photo.name not in {each.name for each in lost}]
     pairs = _matches(prepared, work, keys["matches"], console)
-    held = mapping.holds_focal(photographs, request.options)
+    held = mapping.holds_focal(photographs, prepared.positions, request.options)
     models = _models(prepared, work, keys["model"], len(usable), held[0], console)
     left_out = why_left_out(
         models[0], models[1:], [photo.name for photo in photographs], matching.verified_counts(work), lost
