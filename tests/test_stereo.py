@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from vdgs.cameras import Camera
-from vdgs.stereo import Cell, StereoInputs, StereoView, dense_points, depth_of_pair, partners
+from vdgs.stereo import Cell, StereoInputs, StereoView, dense, dense_points, depth_of_pair, partners
 from vdgs.stereo.dense import SIZES, SPACING
 from vdgs.stereo.rectification import Rectified
 
@@ -170,6 +170,21 @@ def test_a_cell_is_hardly_larger_or_smaller_than_its_pixels_ask_for(widths, leas
 def test_the_same_points_for_any_number_of_threads(tmp_path):
     one, many = points_of(flight(), tmp_path), points_of(flight(), tmp_path, threads=4)
     assert all(np.array_equal(a, b) for a, b in zip(one, many, strict=True))
+
+
+def test_a_place_that_many_photographs_show_takes_no_more_memory(monkeypatch):
+    """However often it is shown, as many cells are held as it has, and once more so many; each is the sum of all."""
+    rng, shown = np.random.default_rng(0), 200
+    photographs = [dense._Cells(np.sort(rng.permutation(300)[:100]), rng.normal(size=(100, 8))) for _ in range(shown)]
+    at_once = dense._Cells.together(photographs)
+    held, of = list[int](), dense._Cells.of
+    monkeypatch.setattr(dense, "WAITING", 150)
+    monkeypatch.setattr(dense._Cells, "of", lambda keys, values: held.append(len(keys)) or of(keys, values))
+    found = dense._summed(iter(photographs))
+    assert max(held) <= 300 + 300 + 100
+    assert np.array_equal(found.keys, at_once.keys)
+    assert np.array_equal(found.sums, at_once.sums)
+    assert len(dense._summed(iter([])).keys) == 0
 
 
 def test_two_photographs_are_enough_and_one_is_not(tmp_path):

@@ -7,7 +7,7 @@ ones would hold the noise of depths there, and nobody can bear so many.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -40,6 +40,8 @@ SPACING = 0.7
 LEAST_AGREED = 0.25
 #: Grey photographs that are held at a time.
 HELD = 256
+#: Cells of photographs that are held at a time at least, before they are added up (72 bytes each).
+WAITING = 2**20
 #: Cells have keys within this many cells of the origin on each axis: 20 bits each, and the size on top.
 REACH = 2**19
 
@@ -90,6 +92,11 @@ class _Cells:
         sums = np.stack([np.bincount(place.reshape(-1), column, len(found)) for column in values.T], 1)
         return _Cells(found, sums.astype(np.float64))  # bincount of nothing is of whole numbers
 
+    @staticmethod
+    def together(some: Sequence[_Cells]) -> _Cells:
+        """The cells of all of them, summed in their order."""
+        return _Cells.of(np.concatenate([each.keys for each in some]), np.concatenate([each.sums for each in some]))
+
 
 def dense_points(
     inputs: StereoInputs, cell: Cell, scratch: Path, tell: Callable[[int, int], None], threads: int = 1
@@ -97,9 +104,9 @@ def dense_points(
     """Match every photograph with its partners, and give each cell that enough pixels lie in the mean of them. A pixel
     counts where the depths of partners confirm it.
 
-    `scratch` is a folder for a file of depths, gone afterwards: memory does not grow with the flight. `tell(done, of)`
-    is called in this thread after each photograph, once for matching and once for confirming. Deterministic, whatever
-    `threads`; raises what `read` raises.
+    `scratch` is a folder for a file of depths, gone afterwards: memory grows with the place, not with how many
+    photographs show it. `tell(done, of)` is called in this thread after each photograph, once for matching and once for
+    confirming. Deterministic, whatever `threads`; raises what `read` raises.
     """
     cameras = [_matched_size(camera) for camera in inputs.cameras]
     others = partners(inputs.cameras, inputs.places)
@@ -119,7 +126,7 @@ def dense_points(
 
         for _ in pool.map(match, range(len(cameras))):
             tell(next(steps), of)
-        found = list(_told(pool.map(confirm, range(len(cameras))), steps, of, tell))
+        found = _summed(_told(pool.map(confirm, range(len(cameras))), steps, of, tell))
         del depths
     return _fused(found, cell)
 
@@ -187,13 +194,23 @@ def _told_by(
     return inside.reshape(places.shape[:2]), agrees.reshape(places.shape[:2])
 
 
-def _fused(found: Sequence[_Cells], cell: Cell) -> DensePoints:
+def _summed(photographs: Iterable[_Cells]) -> _Cells:
+    """The cells of all photographs. Those that wait to be added are at most as many as there are, or `WAITING`: the
+    time is that of one sum of all, and so are the bits, for each cell is summed in the order of the photographs."""
+    total, waiting = _Cells(np.zeros(0, np.int64), np.zeros((0, 8))), list[_Cells]()
+    for each in photographs:
+        waiting.append(each)
+        if sum(len(some.keys) for some in waiting) > max(WAITING, len(total.keys)):
+            total, waiting = _Cells.together([total, *waiting]), []
+    return _Cells.together([total, *waiting])
+
+
+def _fused(found: _Cells, cell: Cell) -> DensePoints:
     """One point for each cell that the pixels of all photographs cover well enough; of two that lie too close that of
     the smaller cell, or of the better covered one."""
-    together = _Cells.of(np.concatenate([each.keys for each in found]), np.concatenate([each.sums for each in found]))
     means = np.zeros((0, 6))
     for size, edge in enumerate(cell.least * SIZES):
-        sums = together.sums[(together.keys >> 60 == size) & (together.sums[:, 7] >= LEAST_COVER * edge**2)]
+        sums = found.sums[(found.keys >> 60 == size) & (found.sums[:, 7] >= LEAST_COVER * edge**2)]
         sums = sums[np.argsort(-sums[:, 7], kind="stable")]
         more = sums[:, :6] / sums[:, 6:7]
         if len(means):
