@@ -171,6 +171,27 @@ def test_walls_do_not_smear(house, samples):
     assert roof == pytest.approx((HOUSE[2] - HOUSE[0]) * (HOUSE[3] - HOUSE[1]), rel=0.15)
 
 
+def test_a_map_ends_with_the_scene_and_not_with_what_cameras_see_behind_it(house):
+    """Photographs of a house from all sides; a tenth of the points lies on hills at the horizon."""
+    capture, _ = house
+    turns = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    views = tuple(replace(capture.views[0], camera=looking_in(30.0, turn)) for turn in turns)
+    hills = np.array([(600 * np.cos(turn), 600 * np.sin(turn), 5.0) for turn in np.linspace(0, 6, len(GROUND) // 9)])
+    around, placement = replace(capture, views=views), Placement.of(capture.ground, "local")
+    assert np.mean([view.camera.sees(hills) for view in views]) > 2 / len(views)  # each is in two and more
+    behind = replace(around, points=np.concatenate([capture.points, hills]))
+    assert extent_of(behind, placement) == pytest.approx(extent_of(around, placement), abs=0.5)
+
+
+def looking_in(distance: float, turn: float) -> Camera:
+    """A camera beside the scene, level, that looks over its middle."""
+    out = np.array([np.cos(turn), np.sin(turn), 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = [[-out[1], out[0], 0.0], [0.0, 0.0, -1.0], -out]
+    pose[:3, 3] = -pose[:3, :3] @ (distance * out + [0, 0, 5.0])
+    return Camera(pose, 40.0, 40.0, 32.0, 24.0, 64, 48)
+
+
 def test_tiles_show_what_one_picture_shows(house):
     capture, model = house
     surveyor = surveyor_of(model, capture, Placement.of(capture.ground))

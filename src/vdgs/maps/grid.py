@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
 
 from vdgs.captures.capture import Capture
 from vdgs.errors import VdgsError
@@ -18,8 +19,9 @@ from vdgs.placing.placement import Placement
 #: Side of a tile in pixels: that of the blocks of the files, so that a tile is written as one.
 TILE_PX = 512
 #: A map ends beyond the sparse points that so many training cameras see, but for a share of them on every side, by a
-#: share of its size.
-SEEN_BY = 2
+#: share of its size. What lies so many times farther from every camera than the median point is what they see behind
+#: the scene, with pixels as many times larger (choice).
+SEEN_BY, BEHIND = 2, 4.0
 _OUTSIDE, _BEYOND = 0.002, 0.03
 #: No map has more pixels: a hundred thousand each way.
 MOST_PIXELS = 10_000_000_000
@@ -95,6 +97,7 @@ def extent_of(capture: Capture, placement: Placement) -> tuple[float, float, flo
     """
     seen = visibility_of(torch.from_numpy(capture.points), [view.camera for view in capture.train_views]).numpy()
     shown = capture.points[seen >= min(SEEN_BY, len(capture.train_views))]
+    shown = shown[_not_behind(shown, np.array([view.camera.position for view in capture.train_views]))]
     if len(shown) < 10:
         raise VdgsError(
             f"{capture.root}: has {len(shown)} sparse points in {SEEN_BY} pictures or more, too few to tell what a map "
@@ -104,6 +107,12 @@ def extent_of(capture: Capture, placement: Placement) -> tuple[float, float, flo
     low, high = np.quantile(places, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
     beyond = _BEYOND * (high - low)
     return (*(low - beyond).tolist(), *(high + beyond).tolist())
+
+
+def _not_behind(points: Float[np.ndarray, "n 3"], cameras: Float[np.ndarray, "c 3"]) -> Bool[np.ndarray, " n"]:
+    """Which points are of the scene, and not of what cameras see behind it."""
+    distance = cKDTree(cameras).query(points, workers=1)[0]
+    return np.asarray(distance <= BEHIND * np.median(distance)) if len(points) else np.ones(0, bool)
 
 
 def refuse_elsewhere(grid: Grid, shown: tuple[float, float, float, float], placement: Placement) -> None:
