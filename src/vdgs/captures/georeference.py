@@ -5,11 +5,27 @@ from __future__ import annotations
 import csv
 import json
 import math
-from pathlib import Path, PurePosixPath
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from vdgs.captures.names import Lookup, ambiguity
 from vdgs.errors import CaptureError
+
+_Find = Callable[[str], tuple[tuple[int, int], list[int]]]
+
+
+@dataclass(frozen=True)
+class GpsRow:
+    """A photograph's position in a table."""
+
+    line: int
+    name: str
+    """As it is written there."""
+    position: tuple[float, float, float]
+    """Latitude and longitude in degrees, altitude in metres."""
 
 
 def read_georef(file: Path) -> tuple[float, float, float]:
@@ -37,8 +53,8 @@ def read_georef(file: Path) -> tuple[float, float, float]:
     return origin  # type: ignore[return-value]
 
 
-def read_gps(file: Path) -> dict[str, tuple[float, float, float]]:
-    """Positions (lat deg, lon deg, alt m) by image stem in lower case; rows without a position are left out.
+def read_gps(file: Path) -> list[GpsRow]:
+    """The rows of a table of positions; those without a position are left out.
 
     Raises `CaptureError` for a missing file or column, or a value that is no position.
     """
@@ -56,7 +72,7 @@ def read_gps(file: Path) -> dict[str, tuple[float, float, float]]:
         raise CaptureError(f"{file}: needs a first line that names the columns name,lat,lon,alt (found: {found}).")
     if not rows:
         raise CaptureError(f"{file}: names its columns but holds no rows. Write one for each photograph.")
-    positions: dict[str, tuple[float, float, float]] = {}
+    positions = []
     for number, row in enumerate(rows, 2):
         words = [(row[key] or "").strip() for key in ("lat", "lon", "alt")]
         if not all(words) or not row["name"]:
@@ -66,29 +82,50 @@ def read_gps(file: Path) -> dict[str, tuple[float, float, float]]:
         except ValueError:
             raise CaptureError(f"{file}: line {number}: {words} are not numbers. Mend the row.") from None
         _check_geodetic((latitude, longitude, altitude), file, f"line {number}: ")
-        positions[stem_of(row["name"])] = (latitude, longitude, altitude)
+        positions.append(GpsRow(number, row["name"], (latitude, longitude, altitude)))
     return positions
 
 
-def stem_of(name: str) -> str:
-    """The key by which photographs are matched across folders and extensions: file stem, lower case."""
-    return PurePosixPath(name.replace("\\", "/")).stem.lower()
-
-
-def match_gps(
-    names: list[str], gps: dict[str, tuple[float, float, float]], file: Path
-) -> tuple[np.ndarray, np.ndarray]:
+def match_gps(names: Sequence[str], rows: Sequence[GpsRow], file: Path) -> tuple[np.ndarray, np.ndarray]:
     """Indices [m] of the images with a GPS position, and the positions [m, 3] (lat, lon, alt).
 
-    Raises `CaptureError` if no name matches: then it is another flight's table.
+    Names match by their whole path, else by the end of it, else without extension; only where the table's folders are
+    not those of the images, by what lies in them. Raises `CaptureError` where a name may be of several images, where
+    several rows place one image differently, and if no name matches: then it is another flight's table.
     """
-    indices = [index for index, name in enumerate(names) if stem_of(name) in gps]
-    if not indices:
+    lookup = Lookup((name, index) for index, name in enumerate(names))
+    found = _best_rows(names, rows, lookup.find, file) or _best_rows(names, rows, lookup.find_elsewhere, file)
+    if not found:
         raise CaptureError(
-            f"{file}: none of its {len(gps)} rows names one of the capture's {len(names)} images "
+            f"{file}: none of its {len(rows)} rows names one of the capture's {len(names)} images "
             f"(for example {names[0]!r}). Give the table of this flight, or leave --gps out."
         )
-    return np.array(indices), np.array([gps[stem_of(names[index])] for index in indices])
+    indices = sorted(found)
+    return np.array(indices), np.array([found[index].position for index in indices])
+
+
+def _best_rows(names: Sequence[str], rows: Sequence[GpsRow], find: _Find, file: Path) -> dict[int, GpsRow]:
+    """For each image that rows name, by its index, the row that names it best."""
+    named: dict[int, list[tuple[tuple[int, int], list[int], GpsRow]]] = {}
+    for row in rows:
+        rank, which = find(row.name)
+        for index in which:
+            named.setdefault(index, []).append((rank, which, row))
+    found = {}
+    for index, claims in named.items():
+        best = min(rank for rank, _, _ in claims)
+        (which, row), *others = [(which, row) for rank, which, row in claims if rank == best]
+        if len(which) > 1:
+            raise CaptureError(f"{file}: line {row.line}: {ambiguity(row.name, names[which[0]], names[which[1]])}")
+        other = next((each for _, each in others if each.position != row.position), None)
+        if other is not None:
+            raise CaptureError(
+                f"{file}: lines {row.line} and {other.line} ({row.name!r}, {other.name!r}) give {names[index]} "
+                "different positions. Keep its own row only; photographs of one name need their folders, in the table "
+                "and on disk."
+            )
+        found[index] = row
+    return found
 
 
 def _check_geodetic(position: tuple[float, ...], file: Path, where: str = "") -> None:

@@ -9,7 +9,8 @@ import numpy as np
 
 from vdgs.captures.formats.source import SINGLE_FOCAL, Intrinsics, SourceCapture, SourceView, listing
 from vdgs.captures.masks import check_mask, find_masks
-from vdgs.captures.photographs import Names, find_images, read_header, same_shape
+from vdgs.captures.names import Names
+from vdgs.captures.photographs import find_images, read_header, same_shape
 from vdgs.captures.undistortion import ImageFile
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions

@@ -9,13 +9,14 @@ import warnings as python_warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from PIL import Image
 
+from vdgs.captures.names import on_disk
 from vdgs.errors import CaptureError
 from vdgs.memory.process import is_out_of_memory
 
@@ -97,35 +98,10 @@ def find_images(folder: Path) -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
-def without_suffix(name: str) -> str:
-    """The key by which names match across extensions: no suffix, lower case."""
-    path = PurePosixPath(name)
-    return str(path.with_suffix("")).lower() if path.suffix else name.lower()
-
-
-class Names:
-    """Looks images up by name: exactly, else by the only one that differs in extension or case."""
-
-    def __init__(self, images: dict[str, Path]) -> None:
-        self.images = images
-        self.by_stem: dict[str, list[str]] = {}
-        for name in images:
-            self.by_stem.setdefault(without_suffix(name), []).append(name)
-
-    def find(self, name: str) -> str | None:
-        """The name on disk, or None."""
-        if name in self.images:
-            return name
-        alike = self.by_stem.get(without_suffix(name), [])
-        return alike[0] if len(alike) == 1 else None
-
-
 def find_mask(folder: Path, name: str) -> Path | None:
     """The mask of an image: name.jpg.png (COLMAP) or name.png, or the image's own name."""
-    for candidate in (name + ".png", str(Path(name).with_suffix(".png")), name):
-        if (folder / candidate).is_file():
-            return folder / candidate
-    return None
+    candidates = (name + ".png", str(Path(name).with_suffix(".png")), name)
+    return next((found for found in (on_disk(folder, each) for each in candidates) if found is not None), None)
 
 
 def decode_photograph(path: Path) -> tuple[np.ndarray, np.ndarray | None]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from vdgs.captures.capture import Split, View
 from vdgs.captures.formats.source import listing
-from vdgs.captures.photographs import Names
+from vdgs.captures.names import Names
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
 

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from vdgs.captures.formats.colmap import partial_model
 from vdgs.captures.formats.source import listing
+from vdgs.captures.names import listable, without_suffix
 from vdgs.captures.outputs import is_capture
-from vdgs.captures.photographs import IMAGE_SUFFIXES, without_suffix
+from vdgs.captures.photographs import IMAGE_SUFFIXES
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.errors import CaptureError
 from vdgs.sfm.photograph import Photograph, Unusable, read_photograph
@@ -46,7 +47,8 @@ class Collection:
 def collect(folders: Sequence[Path]) -> Collection:
     """Read the heads of all photographs in the folders and those below them.
 
-    Raises CaptureError for folders that are not there or hold no photographs, captures, and where too few are usable.
+    Raises CaptureError for folders that are not there or hold no photographs, captures, names that are alike but for
+    blanks, and where too few are usable.
     """
     folders = list(dict.fromkeys(folders))
     for folder in folders:
@@ -99,7 +101,8 @@ def _is_photograph(path: Path) -> bool:
 
 
 def _named(folders: Sequence[Path]) -> tuple[dict[str, Path], int]:
-    """Photographs by their names in the capture, sorted, and the number of other files."""
+    """Photographs by their names in the capture, sorted, and the number of other files. Raises CaptureError for two of
+    one name."""
     prefixes = _prefixes(folders)
     found, others = dict[str, Path](), 0
     seen = set[Path]()
@@ -111,7 +114,13 @@ def _named(folders: Sequence[Path]) -> tuple[dict[str, Path], int]:
             real = path.resolve()
             if real not in seen:  # a folder and one inside it may both be named
                 seen.add(real)
-                found[_safe(prefix + path.relative_to(folder).as_posix())] = path
+                name = listable(prefix + path.relative_to(folder).as_posix())
+                if name in found:
+                    raise CaptureError(
+                        f"{path}: would be called {name} in the capture, whose names have _ for blanks, as would "
+                        f"{found[name]}. Rename one of the two, or remove it if it is a copy."
+                    )
+                found[name] = path
     return dict(sorted(found.items())), others
 
 
@@ -119,14 +128,9 @@ def _prefixes(folders: Sequence[Path]) -> list[str]:
     """What tells photographs of several folders apart: the folders' own names, numbered where they are alike."""
     if len(folders) == 1:
         return [""]
-    names = [folder.resolve().name or "photographs" for folder in folders]
+    names = [listable(folder.resolve().name) or "photographs" for folder in folders]
     counts = Counter(names)
     return [f"{name}_{k + 1}/" if counts[name] > 1 else f"{name}/" for k, name in enumerate(names)]
-
-
-def _safe(name: str) -> str:
-    """A name that COLMAP's lists, which part words at blanks, can hold."""
-    return "".join("_" if letter.isspace() else letter for letter in name)
 
 
 def _read(path: Path, name: str) -> Photograph | LeftOut:

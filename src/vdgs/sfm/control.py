@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from vdgs.captures.alignment import is_collinear
 from vdgs.captures.geodesy import enu_from_geodetic
-from vdgs.captures.georeference import stem_of
+from vdgs.captures.names import Lookup, ambiguity
 from vdgs.errors import CaptureError
 from vdgs.sfm.collection import Collection
 from vdgs.sfm.photograph import Photograph
@@ -209,29 +209,22 @@ def _named(header: str) -> str:
     return header
 
 
-def _by_name(collection: Collection) -> dict[str, list[Photograph | str]]:
-    """Photographs, and names of those left out, by whole names, file names and those without endings, lower case."""
-    found: dict[str, list[Photograph | str]] = {}
-    all_of_them: list[Photograph | str] = [*collection.photographs, *(each.name for each in collection.left_out)]
-    for photo in all_of_them:
-        name = photo if isinstance(photo, str) else photo.name
-        for key in {name.lower(), PurePosixPath(name).name.lower(), stem_of(name)}:
-            found.setdefault(key, []).append(photo)
-    return found
+def _by_name(collection: Collection) -> Lookup[Photograph | str]:
+    """Photographs, and names of those left out."""
+    left_out: list[tuple[str, Photograph | str]] = [(each.name, each.name) for each in collection.left_out]
+    return Lookup([*((photo.name, photo) for photo in collection.photographs), *left_out])
 
 
-def _sighting(line: _Line, by_name: dict[str, list[Photograph | str]], file: Path) -> Sighting | None:
+def _sighting(line: _Line, by_name: Lookup[Photograph | str], file: Path) -> Sighting | None:
     """None in a photograph that was left out."""
-    named = "_".join(line.photograph.replace("\\", "/").lower().split())
-    ways = (by_name.get(key, []) for key in (named, PurePosixPath(named).name, stem_of(named)))
-    found = next((each for each in ways if each), [])
+    found = by_name.find(line.photograph)[1] or by_name.find_elsewhere(line.photograph)[1]
     where = f"{file}: line {line.number}:"
     if not found:
         raise CaptureError(f"{where} there is no photograph {line.photograph!r}. Mend the name, or remove the line.")
     photo = found[0]
     if len(found) > 1:
         one, other = (each if isinstance(each, str) else each.name for each in found[:2])
-        raise CaptureError(f"{where} {line.photograph!r} may be {one} or {other}: write the folder too.")
+        raise CaptureError(f"{where} {ambiguity(line.photograph, one, other)}")
     if isinstance(photo, str):
         return None
     width, height = photo.stored_size

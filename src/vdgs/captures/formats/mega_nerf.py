@@ -25,6 +25,7 @@ from vdgs.captures.formats.source import (
     rigid,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
+from vdgs.captures.names import composed
 from vdgs.captures.photographs import find_images
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
@@ -67,15 +68,15 @@ def _read_folder(
     root: Path, folder: str, images: str, split: Split, origin: np.ndarray, scale: float
 ) -> list[SourceView]:
     metadata = sorted((root / folder / "metadata").glob("*.pt"))
-    present = {Path(name).stem: path for name, path in find_images(root / folder / images).items()}
-    missing = [str(file) for file in metadata if file.stem not in present]
+    present = {composed(Path(name).stem): path for name, path in find_images(root / folder / images).items()}
+    missing = [str(file) for file in metadata if composed(file.stem) not in present]
     if missing:
         raise CaptureError(
             f"{root / folder / images}: {len(missing)} images named by metadata are missing. For "
             "UrbanScene3D, copy "
             f"the raw photographs as Mega-NeRF's README says.{listing(missing)}"
         )
-    return [_read_view(file, present[file.stem], folder, split, origin, scale) for file in metadata]
+    return [_read_view(file, present[composed(file.stem)], folder, split, origin, scale) for file in metadata]
 
 
 def _read_view(file: Path, image: Path, folder: str, split: Split, origin: np.ndarray, scale: float) -> SourceView:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
 from vdgs.captures.alignment import fit_similarity_robust, is_collinear
 from vdgs.captures.formats.colmap import count_images, find_models, read_colmap
 from vdgs.captures.formats.ply import read_point_cloud
+from vdgs.captures.names import stem_of
 from vdgs.errors import CaptureError
 
 #: Names under which a point cloud in the capture's own world is looked for.
@@ -76,7 +77,7 @@ def _match(theirs: list[str], ours: list[str], aliases: Mapping[str, str]) -> li
         return pairs
     stems: dict[str, list[str]] = {}
     for name in ours:
-        stems.setdefault(PurePosixPath(name).stem.lower(), []).append(name)
+        stems.setdefault(stem_of(name), []).append(name)
     unique = {stem: names[0] for stem, names in stems.items() if len(names) == 1}
-    by_stem = [(name, PurePosixPath(aliases.get(name, name)).stem.lower()) for name in theirs]
+    by_stem = [(name, stem_of(aliases.get(name, name))) for name in theirs]
     return [(name, unique[stem]) for name, stem in by_stem if stem in unique]

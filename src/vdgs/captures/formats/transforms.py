@@ -25,7 +25,7 @@ from vdgs.captures.formats.json_poses import (
 from vdgs.captures.formats.ply import read_point_cloud
 from vdgs.captures.formats.source import SourceCapture, SourceView, duplicates, listing, rigid, safe_name
 from vdgs.captures.formats.sparse_points import find_sparse_points
-from vdgs.captures.photographs import Names
+from vdgs.captures.names import Names, on_disk
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
 
@@ -66,14 +66,15 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     views, poses = list[SourceView](), dict[str, np.ndarray]()
     for frame, name in zip(frames, names, strict=True):
         short = name.removeprefix(folder + "/") if folder else name
-        image = _image(root / chosen / short)
+        image = _image(root, f"{chosen}/{short}" if chosen else short)
         world_from_camera = matrix_of(frame.get("transform_matrix"), file, f"frame {name!r}") @ OPENGL_FROM_OPENCV
         in_file = rigid(world_from_camera, file, f"frame {name!r}")
         pose, poses[short] = np.linalg.inv(undo(in_file)), np.linalg.inv(in_file)
         intrinsics = intrinsics_of(frame, content, image, file)
         mask = frame.get("mask_path")
-        mask_path = root / safe_name(str(mask), file, "mask_path", root) if mask else None
-        views.append(SourceView(short, pose, intrinsics, splits.get(name), image, mask_path))
+        mask_path = safe_name(str(mask), file, "mask_path", root) if mask else None
+        mask_file = (on_disk(root, mask_path) or root / mask_path) if mask_path else None
+        views.append(SourceView(short, pose, intrinsics, splits.get(name), image, mask_file))
     twice = duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{file}: the same image occurs more than once.{listing(twice)}")
@@ -100,15 +101,19 @@ def _common_folder(names: list[str]) -> str:
     return first.pop() if len(first) == 1 and not flat else ""
 
 
-def _image(path: Path) -> Path:
+def _image(root: Path, name: str) -> Path:
     """The image itself; file_path may come without its extension, and shrunk folders may hold another."""
-    if path.is_file():
-        return path
-    for suffix in (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG"):
-        for candidate in (path.with_name(path.name + suffix), path.with_suffix(suffix)):
-            if candidate.is_file():
-                return candidate
-    raise CaptureError(f"{path}: no such image, though transforms.json names it. Copy it there, or see --images.")
+    suffixes = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
+    path = PurePosixPath(name)
+    others = (
+        str(other) for suffix in suffixes for other in (path.with_name(path.name + suffix), path.with_suffix(suffix))
+    )
+    found = next((found for found in (on_disk(root, each) for each in (name, *others)) if found is not None), None)
+    if found is None:
+        raise CaptureError(
+            f"{root / name}: no such image, though transforms.json names it. Copy it there, or see --images."
+        )
+    return found
 
 
 def _splits(

@@ -1,0 +1,117 @@
+"""Names of photographs as cards, programs and people write them: which of them mean the same one.
+
+Unicode writes an accented letter in one piece (NFC) or in two (NFD, which macOS leaves on cards); a name is the same in
+both.
+"""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+from typing import Generic, TypeVar
+
+Thing = TypeVar("Thing")
+
+
+def composed(name: str) -> str:
+    """The name with accented letters in one piece."""
+    return unicodedata.normalize("NFC", name)
+
+
+def listable(name: str) -> str:
+    """The name as COLMAP's lists, which part words at blanks, can hold it: `_` for each blank, letters composed."""
+    return "".join("_" if letter.isspace() else letter for letter in composed(name))
+
+
+def without_suffix(name: str) -> str:
+    """The key by which names match across extensions: no suffix, lower case."""
+    path = PurePosixPath(name)
+    return composed((str(path.with_suffix("")) if path.suffix else name).lower())
+
+
+def stem_of(name: str) -> str:
+    """The key by which photographs are matched across folders and extensions: file stem, lower case."""
+    return composed(PurePosixPath(name.replace("\\", "/")).stem.lower())
+
+
+def on_disk(folder: Path, name: str) -> Path | None:
+    """The file of this name below a folder, whichever way its letters are written there; None where there is none."""
+    ways = dict.fromkeys((name, composed(name), unicodedata.normalize("NFD", name)))
+    return next((folder / way for way in ways if (folder / way).is_file()), None)
+
+
+class Names:
+    """Looks images up by name: exactly, else by the only one that differs in how its letters are written, else by the
+    only one that differs in extension or case."""
+
+    def __init__(self, images: dict[str, Path]) -> None:
+        self.images = images
+        self._alike: tuple[dict[str, list[str]], ...] = ({}, {})
+        for name in images:
+            for alike, key in zip(self._alike, (composed(name), without_suffix(name)), strict=True):
+                alike.setdefault(key, []).append(name)
+
+    def find(self, name: str) -> str | None:
+        """The name on disk, or None."""
+        if name in self.images:
+            return name
+        for alike, key in zip(self._alike, (composed(name), without_suffix(name)), strict=True):
+            if len(alike.get(key, [])) == 1:
+                return alike[key][0]
+        return None
+
+
+class Lookup(Generic[Thing]):
+    """Finds things by what people write of their names: the whole path, the end of it, or what it is the end of; in
+    other letters (case, `_` for blanks), with another extension."""
+
+    def __init__(self, named: Iterable[tuple[str, Thing]]) -> None:
+        self._exact: dict[str, list[Thing]] = {}
+        self._whole: dict[str, list[Thing]] = {}
+        self._ending: dict[str, list[Thing]] = {}
+        for name, thing in named:
+            self._exact.setdefault(_posix(name), []).append(thing)
+            for spelled in dict.fromkeys(_spellings(name)):
+                self._whole.setdefault(spelled, []).append(thing)
+                for ending in _endings(spelled):
+                    self._ending.setdefault(ending, []).append(thing)
+
+    def find(self, name: str) -> tuple[tuple[int, int], list[Thing]]:
+        """What a name means, and how well it says so (less is better). Several things where it says too little; none
+        where nothing has this name, or only in another folder."""
+        exact = self._exact.get(_posix(name))
+        if exact:
+            return (0, 0), exact
+        for level, spelled in enumerate(_spellings(name), 1):
+            ends = (self._whole.get(ending) for ending in _endings(spelled)[1:])
+            for way, found in enumerate((self._whole.get(spelled), self._ending.get(spelled), *ends)):
+                if found:
+                    return (level, way), found
+        return (3, 0), []
+
+    def find_elsewhere(self, name: str) -> tuple[tuple[int, int], list[Thing]]:
+        """What has the name's file name, in whichever folder."""
+        return self.find(PurePosixPath(_posix(name)).name)
+
+
+def ambiguity(written: str, one: str, other: str) -> str:
+    """What to tell people who wrote a name that may be either of two."""
+    apart = PurePosixPath(one).parent != PurePosixPath(other).parent
+    return f"{written!r} may be {one} or {other}: write {'the folder too' if apart else 'it as it stands here'}."
+
+
+def _posix(name: str) -> str:
+    return str(PurePosixPath(composed(name).replace("\\", "/")))
+
+
+def _spellings(name: str) -> tuple[str, str]:
+    """A name in ever less exact ways: in lower case with `_` for blanks, then without its extension."""
+    folded = listable(_posix(name).lower())
+    return folded, without_suffix(folded)
+
+
+def _endings(path: str) -> list[str]:
+    """A path, and what is left of it as its folders go, one after the other."""
+    parts = PurePosixPath(path).parts
+    return ["/".join(parts[k:]) for k in range(len(parts))]
