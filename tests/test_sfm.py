@@ -22,6 +22,7 @@ import pycolmap
 from sfm_support import FOCAL, ORIGIN, Flight, write_photograph
 from vdgs.captures.alignment import Similarity
 from vdgs.captures.geodesy import enu_from_geodetic
+from vdgs.captures.images import load_picture
 from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import facts_rows, read_reconstruction
 from vdgs.errors import CaptureError, RunError, VdgsError
@@ -159,8 +160,12 @@ def test_what_was_interrupted_goes_on(flight, tmp_path, monkeypatch):
 
 
 def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
+    """One photograph lies on its side, and its mask with it."""
     card = tmp_path / "card"
-    card.mkdir()
+    (card / "masks").mkdir(parents=True)
+    keep = np.ones((300, 400), bool)
+    keep[:50] = False
+    Image.fromarray(np.rot90(keep)).save(card / "masks" / f"{flight.names[2]}.png")
     for k, name in enumerate(flight.names[:6]):
         with Image.open(flight.folder / name) as image:
             pixels = np.array(image)
@@ -172,7 +177,12 @@ def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
     assert (facts.registered, facts.origin, facts.residual_rms_m) == (6, None, None)
     assert "scale of the scene is arbitrary" in said.file.getvalue()
     assert not (tmp_path / "capture/georef.json").exists()
-    assert not load_capture(tmp_path / "capture").ground.metric
+    capture = load_capture(tmp_path / "capture")
+    assert not capture.ground.metric
+    masks = [load_picture(view).mask for view in capture.views]
+    assert [mask is not None for mask in masks] == [k == 2 for k in range(6)]
+    assert not masks[2][:45].any()
+    assert masks[2][55:].all()
     sizes = {size(tmp_path / "capture/images" / name) for name in flight.names[:6]}
     assert len(sizes) == 1  # all stand upright
     assert files(card) == before

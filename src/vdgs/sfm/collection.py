@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from vdgs.captures.outputs import is_capture
 from vdgs.captures.photographs import IMAGE_SUFFIXES
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.errors import CaptureError
+from vdgs.sfm.masks import check_mask, find_masks
 from vdgs.sfm.photograph import Photograph, Unusable, read_photograph
 
 #: Fewer photographs are no scene.
@@ -42,13 +43,15 @@ class Collection:
     photographs: tuple[Photograph, ...]
     left_out: tuple[LeftOut, ...]
     other_files: int
+    notes: tuple[str, ...] = ()
+    """What people should know of their masks."""
 
 
 def collect(folders: Sequence[Path]) -> Collection:
     """Read the heads of all photographs in the folders and those below them.
 
     Raises CaptureError for folders that are not there or hold no photographs, captures, names that are alike but for
-    blanks, and where too few are usable.
+    blanks, masks that belong to nothing, and where too few are usable.
     """
     folders = list(dict.fromkeys(folders))
     for folder in folders:
@@ -67,8 +70,10 @@ def collect(folders: Sequence[Path]) -> Collection:
             + (f", but {others} other files" if others else "")
             + ". Raw files (.dng) must be developed first."
         )
+    masks, notes = find_masks(folders, named.values())
+    named = {name: path for name, path in named.items() if path in masks}
     with ThreadPoolExecutor(4) as pool:
-        read = list(pool.map(_read, named.values(), named.keys()))
+        read = list(pool.map(_read, named.values(), named.keys(), masks.values()))
     photographs = [each for each in read if isinstance(each, Photograph)]
     left_out = [each for each in read if isinstance(each, LeftOut)]
     photographs, doubled = _without_doubles(photographs)
@@ -80,7 +85,7 @@ def collect(folders: Sequence[Path]) -> Collection:
             f"can be used; a scene needs {LEAST_PHOTOGRAPHS} at the very least, and each place two or three that show "
             f"it from different positions.{reasons}"
         )
-    return Collection(tuple(folders), tuple(photographs), tuple(left_out), others)
+    return Collection(tuple(folders), tuple(photographs), tuple(left_out), others, tuple(notes))
 
 
 def only_photographs(folder: Path) -> bool:
@@ -133,11 +138,13 @@ def _prefixes(folders: Sequence[Path]) -> list[str]:
     return [f"{name}_{k + 1}/" if counts[name] > 1 else f"{name}/" for k, name in enumerate(names)]
 
 
-def _read(path: Path, name: str) -> Photograph | LeftOut:
+def _read(path: Path, name: str, mask: Path | None) -> Photograph | LeftOut:
     try:
-        return read_photograph(path, name)
+        photo = replace(read_photograph(path, name), mask=mask)
     except Unusable as why:
         return LeftOut(name, str(why))
+    check_mask(photo)
+    return photo
 
 
 def _without_doubles(photographs: list[Photograph]) -> tuple[list[Photograph], list[LeftOut]]:

@@ -120,19 +120,21 @@ def find_features(
 ) -> dict[str, int]:
     """Features of all photographs into the database; those that are there already are kept. Returns their numbers."""
     names = [photo.name for kind in kinds for photo in kind.photographs if (work.photographs / photo.name).exists()]
-    done = 0
-    with progress(console, "features, photographs", len(names)) as tell:
+    count, done = len(names), 0
+    with progress(console, "features, photographs", count) as tell:
         for number, kind in enumerate(kinds, 1):
             missing = [photo.name for photo in kind.photographs if (work.photographs / photo.name).exists()]
             there = feature_counts(work)
             done += sum(name in there for name in missing)
             missing = [name for name in missing if name not in there]
-            octave = -1 if is_searched_finely(max(kind.width, kind.height), feature_size, len(names)) else 0
-            for start in range(0, len(missing), AT_ONCE * threads):
-                chunk = missing[start : start + AT_ONCE * threads]
-                _extract(work, chunk, number, octave, feature_size, most, threads)
-                done += len(chunk)
-                tell(done)
+            octave = -1 if is_searched_finely(max(kind.width, kind.height), feature_size, count) else 0
+            for masked in (False, True):  # COLMAP takes masks for all photographs of a call, or for none
+                names = [name for name in missing if work.mask(name).exists() == masked]
+                for start in range(0, len(names), AT_ONCE * threads):
+                    chunk = names[start : start + AT_ONCE * threads]
+                    _extract(work, chunk, masked, number, octave, feature_size, most, threads)
+                    done += len(chunk)
+                    tell(done)
     return feature_counts(work)
 
 
@@ -142,10 +144,19 @@ def is_searched_finely(longer_side: int, feature_size: int, count: int) -> bool:
 
 
 def _extract(
-    work: Work, names: list[str], camera: int, first_octave: int, feature_size: int, most: int, threads: int
+    work: Work,
+    names: list[str],
+    masked: bool,
+    camera: int,
+    first_octave: int,
+    feature_size: int,
+    most: int,
+    threads: int,
 ) -> None:
     reader, options = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
     reader.existing_camera_id = camera
+    if masked:
+        reader.mask_path = work.masks
     options.num_threads, options.max_image_size, options.use_gpu = threads, feature_size, False
     options.sift.first_octave, options.sift.max_num_features = first_octave, most
     call(
@@ -168,14 +179,15 @@ def feature_counts(work: Work) -> dict[str, int]:
 
 
 def without_features(photographs: Sequence[Photograph], counts: dict[str, int]) -> list[LeftOut]:
-    """Photographs that COLMAP could not decode, or found nearly nothing in."""
+    """Photographs that COLMAP could not decode, or found nearly nothing in (outside their masks)."""
     found = []
     for photo in photographs:
         count = counts.get(photo.name)
         if count is None:
             found.append(LeftOut(photo.name, "cannot be decoded: copy it again"))
         elif count < FEW_FEATURES:
-            found.append(LeftOut(photo.name, f"shows only {count} features: blurred, dark, sky or water?"))
+            where = " where its mask is white" if photo.may_be_masked else ""
+            found.append(LeftOut(photo.name, f"shows only {count} features{where}: blurred, dark, sky or water?"))
     if len(photographs) - len(found) < 3:
         raise CaptureError(
             f"{len(photographs) - len(found)} of {len(photographs)} photographs show enough to be matched; a scene "

@@ -38,6 +38,10 @@ class Look:
     """What the heads of the photographs tell."""
 
     photographs: int
+    masks: int
+    """How many have a mask beside them."""
+    transparent: int
+    """How many have an alpha channel, which is a mask too."""
     cameras: list[tuple[str, int]]
     sizes: list[tuple[int, int, int]]
     """Width, height, how many."""
@@ -71,6 +75,8 @@ def look_at(collection: Collection, positions: Positions) -> Look:
     focal = _median(photo.lens.focal * max(photo.width, photo.height) for photo in photographs if photo.lens)
     return Look(
         photographs=len(photographs),
+        masks=sum(photo.mask is not None for photo in photographs),
+        transparent=sum(photo.may_be_transparent for photo in photographs),
         cameras=Counter(photo.camera for photo in photographs).most_common(),
         sizes=[(*size, n) for size, n in Counter((p.width, p.height) for p in photographs).most_common()],
         positions=len(positions),
@@ -82,7 +88,7 @@ def look_at(collection: Collection, positions: Positions) -> Look:
         forward_overlap=overlap, views_per_place=views,
         oblique=sum(tilt > OBLIQUE_DEG for tilt in tilts) if tilts else None,
         days=days,
-        warnings=[*positions.notes, *_warnings(collection, overlap, views, days)],
+        warnings=[*positions.notes, *collection.notes, *_warnings(collection, overlap, views, days)],
     )  # fmt: skip
 
 

@@ -60,6 +60,20 @@ class Photograph:
     attitude: Attitude | None
     """Of the picture as the sensor has it; None for pictures that lay on their side."""
     bytes: int
+    may_be_transparent: bool = False
+    """Its file has an alpha channel, whatever that says."""
+    mask: Path | None = None
+    """White where it counts."""
+
+    @property
+    def may_be_masked(self) -> bool:
+        """Whether something may be left out of it."""
+        return self.mask is not None or self.may_be_transparent
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height once it is upright."""
+        return self.width, self.height
 
     @property
     def stored_size(self) -> tuple[int, int]:
@@ -89,6 +103,7 @@ def read_photograph(path: Path, name: str) -> Photograph:
             exif = image.getexif()
             tags, details, gps = dict(exif), dict(exif.get_ifd(_EXIF_IFD)), dict(exif.get_ifd(_GPS_IFD))
             xmp = read_xmp(_packet(image))
+            transparent = "A" in image.getbands() or "transparency" in image.info
             if image.format == "JPEG" and not _has_end(path, size):
                 image.load()
     except Unusable:
@@ -109,6 +124,7 @@ def read_photograph(path: Path, name: str) -> Photograph:
         name, path, width, height, orientation, _camera(tags, details, xmp), lens,
         _text(details.get(0x9003)) or _text(tags.get(0x0132)), _place(gps), altitude, altitude_type, _deviations(xmp),
         _error(gps), number(xmp, "drone-dji:RelativeAltitude", "sensefly:Height"), attitude, size,
+        transparent,
     )  # fmt: skip
 
 

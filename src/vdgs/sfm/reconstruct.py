@@ -27,7 +27,7 @@ from vdgs.errors import VdgsError
 from vdgs.runs.locks import hold
 from vdgs.settings.plain import to_dict
 from vdgs.settings.sfm import SfmRequest
-from vdgs.sfm import aligning, features, mapping, matching, surveying, writing
+from vdgs.sfm import aligning, features, mapping, masking, matching, surveying, writing
 from vdgs.sfm.collection import LeftOut
 from vdgs.sfm.facts import Outcome, facts_of, why_left_out
 from vdgs.sfm.figures import draw_positions, draw_residuals
@@ -76,13 +76,23 @@ def _keys(prepared: Prepared) -> dict[str, str]:
         for photo in prepared.collection.photographs
     ]
     lenses = [photo.lens and photo.lens.focal for photo in prepared.collection.photographs]
-    found = key_of(__version__, files, lenses, options.feature_size, options.features)
+    found = key_of(__version__, files, lenses, options.feature_size, options.features, *_masked(prepared))
     placed = [positions.index.tolist(), positions.enu.tolist(), positions.deviations.tolist()]
     matched = key_of(found, placed, options.neighbours, options.exhaustive)
     mapped = key_of(matched, options.focal)
     points = prepared.control.points if prepared.control else ()
     capture = key_of(mapped, options.max_size, [plain(point) for point in points])
     return {"features": found, "matches": matched, "model": mapped, "capture": capture}
+
+
+def _masked(prepared: Prepared) -> list[tuple[Any, ...]]:
+    """Photographs of which something may be left out, and what says so."""
+    masked = [photo for photo in prepared.collection.photographs if photo.may_be_masked]
+    files = [photo.mask.stat() if photo.mask is not None else None for photo in masked]
+    return [
+        (photo.name, photo.may_be_transparent, file and (file.st_size, file.st_mtime_ns))
+        for photo, file in zip(masked, files, strict=True)
+    ]
 
 
 def _is_finished(output: Path, key: str) -> bool:
@@ -144,6 +154,7 @@ def _features(
     failed = features.stand_upright(work, photographs)
     counts = features.feature_counts(work)
     if not work.is_done("features", key):
+        masking.write_upright_masks(work, photographs, prepared.threads)
         counts = features.find_features(work, kinds, options.feature_size, options.features, prepared.threads, console)
         work.finish("features", key)
     named = {each.name for each in failed}
@@ -217,7 +228,7 @@ def _write(
 ) -> None:
     output = prepared.request.output
     if not Work(output).is_begun("capture", key):
-        for name in (*(folder for folder, _ in writing.SIZES), "sparse"):
+        for name in (*(folder for folder, _ in writing.SIZES), writing.MASKS, "sparse"):
             shutil.rmtree(output / name, ignore_errors=True)
         for name in (FILE, "georef.json", FIGURE):
             (output / name).unlink(missing_ok=True)

@@ -21,6 +21,8 @@ def tell_look(look: Look, collection: Collection, plan: list[str], console: Cons
         ("Cameras", _several([f"{name} ({n})" for name, n in look.cameras])),
     ]
     rows.append(("Sizes", _several([f"{width} x {height} ({n})" for width, height, n in look.sizes])))
+    if look.masks or look.transparent:
+        rows.append(("Masks", _masks(look)))
     if look.days:
         rows.append(("Taken", look.days[0] if len(look.days) == 1 else f"{look.days[0]} to {look.days[-1]}"))
     rows.append(("Positions", _positions(look)))
@@ -70,6 +72,12 @@ def _photographs(look: Look, collection: Collection) -> str:
     left_out = f", {len(collection.left_out)} left out" if collection.left_out else ""
     others = f", {collection.other_files} other files beside them" if collection.other_files else ""
     return f"{look.photographs}{left_out}{others}"
+
+
+def _masks(look: Look) -> str:
+    alpha = f"{look.transparent} have an alpha channel, which counts as one" if look.transparent else ""
+    files = f"{look.masks} of {look.photographs} photographs have one" if look.masks else ""
+    return "; ".join(each for each in (files, alpha) if each)
 
 
 def _positions(look: Look) -> str:

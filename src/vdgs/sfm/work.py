@@ -41,6 +41,15 @@ class Work:
         return self.path / "photographs"
 
     @property
+    def masks(self) -> Path:
+        """Masks of upright photographs, as COLMAP names them."""
+        return self.path / "masks"
+
+    def mask(self, name: str) -> Path:
+        """Where the mask of a photograph is, if it has one."""
+        return self.masks / f"{name}.png"
+
+    @property
     def database(self) -> Path:
         return self.path / "database.db"
 

@@ -18,6 +18,8 @@ from vdgs.captures.formats.source import Intrinsics
 from vdgs.captures.photographs import decode_photograph
 from vdgs.captures.undistortion import pinhole_for, sampling_map
 from vdgs.errors import CaptureError
+from vdgs.settings.capture import CaptureOptions
+from vdgs.sfm.masking import png_of, straight_mask
 from vdgs.sfm.work import Work, progress
 from vdgs.storage.files import write_bytes
 from vdgs.watching.interrupts import stop_if_asked
@@ -27,6 +29,8 @@ MULTIPLE = 4
 #: The folders of the sizes, and by how much they are shrunk.
 SIZES = (("images", 1), ("images_2", 2), ("images_4", 4))
 JPEG_QUALITY = 95
+#: The folder of masks, of the largest size.
+MASKS = CaptureOptions.masks
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +66,8 @@ def write_images(
     threads: int,
     console: Console,
 ) -> None:
-    """Write images, images_2 and images_4: `names` of the photographs of each camera. What is there is kept.
+    """Write images, images_2, images_4, and masks of those that have one: `names` of the photographs of each camera.
+    What is there is kept.
 
     Raises CaptureError for photographs that cannot be decoded, VdgsError where the disk is full.
     """
@@ -82,6 +87,8 @@ def image_name(name: str) -> str:
 
 def _write_one(output: Path, work: Work, lens: Straightened, name: str) -> None:
     stop_if_asked()
+    if work.mask(name).is_file():
+        _write_mask(output, work.mask(name), lens, name)
     targets = [output / folder / image_name(name) for folder, _ in SIZES]
     if all(target.is_file() for target in targets):
         return
@@ -95,6 +102,13 @@ def _write_one(output: Path, work: Work, lens: Straightened, name: str) -> None:
         size = lens.intrinsics.width // factor, lens.intrinsics.height // factor
         small = straight if factor == 1 else cv2.resize(straight, size, interpolation=cv2.INTER_AREA)
         write_bytes(target, cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), settings)[1].tobytes())
+
+
+def _write_mask(output: Path, mask: Path, lens: Straightened, name: str) -> None:
+    target = output / MASKS / f"{image_name(name)}.png"
+    if not target.is_file():
+        keep = straight_mask(mask, lens.grid, lens.shrunk)[: lens.intrinsics.height, : lens.intrinsics.width]
+        write_bytes(target, png_of(keep))
 
 
 def write_model(output: Path, model: pycolmap.Reconstruction, lenses: Mapping[int, Straightened]) -> None:

@@ -19,11 +19,13 @@ class SfmArguments:
     without lens distortion in three sizes. The same command goes on where it was stopped. Photographs are only read."""
 
     photographs: Positional[tuple[Path, ...]]
-    """Folders of photographs, those below them included."""
+    """Folders of photographs, those below them included. A folder masks/ beside photographs has their masks (white =
+    keep), named like them: name.png or name.jpg.png."""
     output: Path
     """Folder of the capture; new, or the one to go on with."""
     gps: Path | None = None
-    """CSV with the header name,lat,lon,alt: positions to use instead of those in the photographs."""
+    """CSV with the header name,lat,lon,alt: positions to use instead of those in the photographs. Names
+    need no folder and no extension where they are told apart without."""
     dry_run: bool = False
     """Only look: what the photographs say, what would be done and how long it takes. Writes nothing."""
     threads: Annotated[int, WORKERS] = 0
