@@ -18,7 +18,7 @@ from vdgs.executors.errand import Wish
 from vdgs.maps.mapping import can_map, is_mapped, map_run
 from vdgs.report import write_report
 from vdgs.report.terminal import next_step, whole_standing
-from vdgs.runs.beginning import begin_run
+from vdgs.runs.beginning import driven_run
 from vdgs.runs.folder import RunFolder
 from vdgs.settings.checks import validate
 from vdgs.settings.ranges import refuse
@@ -46,10 +46,10 @@ def run_all(asked: RunRequest, console: Console, command: str | None = None) -> 
     refuse(asked)
     refuse_missing(asked.lpips_weights)
     asked = with_capture(asked, console)
-    run, capture = begin_run(
-        asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo, command=command
-    )
-    with run.driven():
+    with driven_run(asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo, command=command) as (
+        run,
+        capture,
+    ):
         _stages(run, capture, asked, console)
     console.print(escape(f"next: {next_step(whole_standing(run))}"), highlight=False)
 
@@ -57,7 +57,8 @@ def run_all(asked: RunRequest, console: Console, command: str | None = None) -> 
 def with_capture(asked: RunRequest, console: Console) -> RunRequest:
     """The request about a capture: where it is about photographs alone, they become one in RUN/capture first.
 
-    Raises what `reconstruct` raises, and VdgsError for settings that do not work, before the long work.
+    Raises what `reconstruct` raises, RunError where another process drives the run whose capture it would be, and
+    VdgsError for settings that do not work, before the long work.
     """
     if not of_photographs(asked):
         return asked
@@ -65,7 +66,7 @@ def with_capture(asked: RunRequest, console: Console) -> RunRequest:
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
     _title(console, "photographs")
     request = sfm_request(asked)
-    reconstruct(request, console)
+    reconstruct(request, console, RunFolder(asked.output).driven())
     return replace(asked, capture=request.output, photographs=(), options=replace(asked.options, gps=None))
 
 

@@ -9,7 +9,8 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -154,28 +155,34 @@ def work(job: Job) -> None:
     from vdgs.kernels import set_threads
 
     set_threads(job.threads)
-    working = _Working(job, *_opened(job), Console(soft_wrap=True))
-    record = _record(job)
-    write_json(job.output / RECORD, record)  # what an interrupted run leaves is not what it was before
-    for name in job.stages:
-        began = time.monotonic()
-        STAGES[name](working)
-        record["seconds"][name] = record["seconds"].get(name, 0.0) + time.monotonic() - began
-        write_json(job.output / RECORD, record)
-    write_json(job.output / RECORD, record | {"state": "done", "origin": origin(job.threads)})
+    with _opened(job) as (run, capture):
+        working = _Working(job, run, capture, Console(soft_wrap=True))
+        record = _record(job)
+        write_json(job.output / RECORD, record)  # what an interrupted run leaves is not what it was before
+        for name in job.stages:
+            began = time.monotonic()
+            STAGES[name](working)
+            record["seconds"][name] = record["seconds"].get(name, 0.0) + time.monotonic() - began
+            write_json(job.output / RECORD, record)
+        write_json(job.output / RECORD, record | {"state": "done", "origin": origin(job.threads)})
 
 
-def _opened(job: Job) -> tuple[Any, Any]:
-    """The run folder and the capture. Where renders are measured the folder is no run: nothing is trained there."""
+@contextmanager
+def _opened(job: Job) -> Iterator[tuple[Any, Any]]:
+    """The run folder, driven, and the capture. Where renders are measured the folder is no run: nothing is trained
+    there."""
     from vdgs.captures.loading import load_capture
-    from vdgs.runs.beginning import begin_run
+    from vdgs.runs.beginning import driven_run
     from vdgs.runs.folder import RunFolder
     from vdgs.runs.opening import options_from
 
     options = options_from(job.options, job.output)
     if job.renders is not None:
-        return RunFolder(job.output), load_capture(job.capture, options)
-    return begin_run(job.capture, job.output, options, from_dict(MethodConfig, job.method), redo=job.redo)
+        yield RunFolder(job.output), load_capture(job.capture, options)
+        return
+    method = from_dict(MethodConfig, job.method)
+    with driven_run(job.capture, job.output, options, method, redo=job.redo) as begun:
+        yield begun
 
 
 def _record(job: Job) -> dict[str, Any]:

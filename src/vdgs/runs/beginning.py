@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,9 +38,25 @@ def begin_run(
 
     `redo` None compares the settings of the coarse stage only and refuses others; True or False is about changing
     them (`RunFolder.change_settings`). `command` is the one that asks, kept in the run. Raises CaptureError for a
-    capture that cannot be used, RunError for other settings than the run's, VdgsError for settings that do not work and
-    for an output among inputs.
+    capture that cannot be used, RunError for other settings than the run's and for a run that another process drives,
+    VdgsError for settings that do not work and for an output among inputs.
     """
+    with driven_run(capture_path, output, capture_options, method, redo=redo, command=command) as begun:
+        return begun
+
+
+@contextmanager
+def driven_run(
+    capture_path: Path,
+    output: Path,
+    capture_options: CaptureOptions,
+    method: MethodConfig,
+    *,
+    redo: bool | None = None,
+    command: str | None = None,
+) -> Iterator[tuple[RunFolder, Capture]]:
+    """As `begin_run`, for who takes the run from stage to stage: it is driven (`RunFolder.driven`) from before anything
+    of it is written or removed to the end of the `with`."""
     problems = validate(method)
     if problems:
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
@@ -49,7 +67,17 @@ def begin_run(
     run = RunFolder(output)
     if not run.config_file.exists():  # what cannot become a scene leaves no folder that other settings stumble over
         refuse_unsound(capture)
-    settings = run_settings(capture_path, capture_options, method)
+    run.refuse_strangers()
+    with run.driven():
+        _take_up(run, capture, capture_path, run_settings(capture_path, capture_options, method), redo, command)
+        yield run, capture
+
+
+def _take_up(
+    run: RunFolder, capture: Capture, capture_path: Path, settings: dict[str, Any], redo: bool | None,
+    command: str | None,
+) -> None:  # fmt: skip
+    """Write down the settings of a run that this process drives, new ones or others; what they make useless goes."""
     with run.locked(shared=_goes_on(run, settings)):
         read_anew = run.config_file.exists() and reads_otherwise(run, settings)
         if run.capture_file.exists() and not read_anew:
@@ -62,7 +90,6 @@ def begin_run(
             if read_anew:  # nothing is left that was made of it; what the coarse stage writes takes its place
                 run.capture_file.unlink(missing_ok=True)
         _keep_reconstruction(capture.root, run.path)
-    return run, capture
 
 
 def _goes_on(run: RunFolder, settings: dict[str, Any]) -> bool:

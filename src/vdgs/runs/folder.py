@@ -115,7 +115,7 @@ class RunFolder:
         """Raise RunError where a new run would be begun among other files."""
         if self.config_file.exists():
             return
-        known = {".lock", *([self.own_capture.name] if is_reconstruction(self.own_capture) else [])}
+        known = {".lock", self._driver.name, *([self.own_capture.name] if is_reconstruction(self.own_capture) else [])}
         if self.path.exists() and not self.path.is_dir():
             raise RunError(f"{self.path}: is a file. Choose a folder for --output.")
         strangers = (
@@ -199,7 +199,8 @@ class RunFolder:
     def driven(self) -> Iterator[None]:
         """Take this run from stage to stage, so that others can see it between two stages too (`is_driven`).
 
-        RunError if another process does.
+        Whoever changes its settings holds it meanwhile: between two stages, and while a model is measured or drawn, a
+        driver holds nothing else. RunError if another process drives the run.
         """
         with hold(self._driver):
             yield

@@ -152,9 +152,10 @@ def open_capture(folder: RunFolder, at: Path | None = None) -> Capture:
 
 
 def remember_capture(folder: RunFolder, at: Path) -> None:
-    """Let a run find its capture where it lies now. Raises RunError for another capture than the run's."""
+    """Let a run find its capture where it lies now. Raises RunError for another capture than the run's, and where
+    another process works on the run or drives it."""
     capture = open_capture(folder, at)
-    with folder.locked():
+    with folder.driven(), folder.locked():
         if folder.capture_file.exists():
             refuse_another_capture(folder.capture_file, read_json(folder.capture_file), capture)
         folder.move_capture(at)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +42,14 @@ from vdgs.storage.records import plain
 MAP = "photographs.png"
 
 
-def reconstruct(request: SfmRequest, console: Console) -> ReconstructionFacts:
+def reconstruct(
+    request: SfmRequest, console: Console, alone: AbstractContextManager[None] | None = None
+) -> ReconstructionFacts:
     """Make a capture of photographs in `request.output`, or go on with one that was begun.
 
-    Raises CaptureError for photographs that cannot become one, VdgsError for an output that is something else and a
-    disk that is full. What was done is kept.
+    `alone` is held while anything is written; not where all is done already. Raises what it raises, CaptureError for
+    photographs that cannot become one, VdgsError for an output that is something else and a disk that is full. What was
+    done is kept.
     """
     quiet_colmap()
     prepared = prepare(request)
@@ -58,7 +62,7 @@ def reconstruct(request: SfmRequest, console: Console) -> ReconstructionFacts:
     _refuse_other_things(output)
     tell(prepared, console)
     check_disk(prepared)
-    with hold(output):
+    with alone or nullcontext(), hold(output):
         work.path.mkdir(exist_ok=True)
         draw_positions(prepared.positions, in_time(prepared), "Where the photographs were taken", output / MAP)
         facts = _steps(prepared, work, keys, console)

@@ -70,7 +70,7 @@ def refuse_idle_blocks(arguments: list[str], partition: PartitionConfig) -> None
 
 
 def change_settings(run: RunFolder, method: MethodConfig, redo: bool, quiet: bool = False) -> None:
-    """Give the run other settings for later stages, if they are other."""
+    """Give the run other settings for later stages, if they are other. RunError where another process drives it."""
     from vdgs.errors import VdgsError
     from vdgs.settings.checks import validate
     from vdgs.settings.plain import to_dict
@@ -80,7 +80,7 @@ def change_settings(run: RunFolder, method: MethodConfig, redo: bool, quiet: boo
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
     wanted = run.settings() | to_dict(method)
     if wanted != run.settings():
-        with run.locked():
+        with run.driven(), run.locked():
             for line in run.change_settings(wanted, redo):
                 open_console(quiet).print(f"[yellow]changed[/] {line}", highlight=False)
 
