@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import shlex
 import shutil
@@ -18,8 +20,8 @@ from vdgs.errors import RunError
 from vdgs.report import write_report
 from vdgs.report.terminal import NOT_WHOLE, next_step, whole_standing
 from vdgs.runs.folder import RunFolder
-from vdgs.runs.locks import is_locked
-from vdgs.runs.opening import open_run
+from vdgs.runs.locks import hold, is_locked
+from vdgs.runs.opening import open_model, open_run
 from vdgs.runs.standing import OTHER_BLOCKS, OTHER_CUT, OTHER_MODEL, OTHER_SETTINGS, standing_of
 from vdgs.runs.status import Status
 from vdgs.runs.vouching import load_vouched
@@ -184,6 +186,30 @@ def test_looking_changes_nothing_and_survives_damage(run):
     standing = standing_of(run)
     assert {standing.of(name).state for name in ("coarse", "partition", "block 0", "merge")} == {"unknown"}
     assert {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])
+def test_a_run_is_read_where_no_file_can_be_locked(run, monkeypatch, capsys, number):
+    """Lustre without `-o flock`, some of FUSE: finished runs are looked at there, and nothing works on one."""
+    run.block(1).set_status(Status("running", iteration=9, iterations=40))
+    for folder in (run.block(1).path, run.path / ".run"):
+        with hold(folder):
+            pass
+
+    def refuse(*_: object) -> None:
+        raise OSError(number, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    assert standing_of(run).of("block 1").state == "stopped"
+    assert not run.is_driven()
+    assert command_line("status", run.path) == NOT_WHOLE
+    assert command_line("report", run.path) == 0
+    assert open_model(run, "coarse").name == "coarse"
+    with pytest.raises(OSError, match="not implemented"):
+        is_locked(run.path / ".run")
+    for held in (run.driven(), run.locked()):
+        with pytest.raises(RunError, match=r"file system locks no files \(Function not implemented\)\. Mount"), held:
+            pass
 
 
 def test_a_folder_without_a_run_is_an_error(tmp_path, capsys):

@@ -14,7 +14,7 @@ from vdgs.errors import RunError, VdgsError
 from vdgs.partition.records import PartitionRecord
 from vdgs.runs.config_file import SECTIONS, ConfigFile, changed_options
 from vdgs.runs.keys import StageKeys, stage_keys
-from vdgs.runs.locks import hold, is_locked
+from vdgs.runs.locks import hold, seems_locked
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import from_dict
@@ -206,7 +206,7 @@ class RunFolder:
             yield
 
     def is_driven(self) -> bool:
-        return is_locked(self._driver)
+        return seems_locked(self._driver)
 
     @property
     def _driver(self) -> Path:

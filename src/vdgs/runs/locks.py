@@ -17,7 +17,10 @@ LOCK_ATTEMPTS, LOCK_SECONDS = 3, 0.02
 
 
 def is_locked(folder: Path) -> bool:
-    """Whether a process works on what is in a folder alone. Only looks: nothing is created."""
+    """Whether a process works on what is in a folder alone. Only looks: nothing is created.
+
+    OSError where the file system of the folder locks no files: for those who must know.
+    """
     try:
         handle = (folder / ".lock").open("rb")
     except OSError:
@@ -28,6 +31,14 @@ def is_locked(folder: Path) -> bool:
         except BlockingIOError:
             return True
     return False
+
+
+def seems_locked(folder: Path) -> bool:
+    """As `is_locked`, for those who only show or read what is there: where no file can be locked, none is."""
+    try:
+        return is_locked(folder)
+    except OSError:  # Lustre without -o flock, some of FUSE: a finished run can be looked at there all the same
+        return False
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from vdgs.errors import VdgsError
 from vdgs.partition.records import PartitionRecord
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.keys import StageKeys, stage_keys
-from vdgs.runs.locks import is_locked
+from vdgs.runs.locks import seems_locked
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.runs.vouching import foreign, to_delete
@@ -232,7 +232,7 @@ class _Survey:
             return "stale", other
         if status.state == "done":
             return ("done", status.why or "") if folder.model.exists() else ("missing", f"{folder.model.name} is gone")
-        if status.state == "running" and not is_locked(locked):
+        if status.state == "running" and not seems_locked(locked):
             return "stopped", "its process ended without a word; it continues from its last checkpoint"
         if status.state in ("running", "queued", "stopped", "failed"):
             return status.state, _first_line(status.why or "")  # type: ignore[return-value]
