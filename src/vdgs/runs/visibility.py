@@ -34,12 +34,12 @@ def visibility_of_run(opened: OpenedModel, cameras: Sequence[Camera]) -> Int32[T
 
 
 def keep_visibility(opened: TrainedRun) -> Int32[Tensor, " n"]:
-    """As `visibility_of_run` of a run opened with its coarse model, and kept from now on."""
+    """As `visibility_of_run` of a run opened with its coarse model, in main memory, and kept from now on."""
     cameras = [view.camera for view in opened.capture.train_views]
     kept = _read(opened.folder)
     if kept is not None and len(kept) == len(opened.model.anchors):
         return kept
-    tensors = {"visibility": visibility_of(opened.model.anchors.positions, cameras)}
+    tensors = {"visibility": visibility_of(opened.model.anchors.positions, cameras).cpu()}
     facts = {"key": opened.folder.keys().visibility, "crc32": checksum(tensors)}
     header = {FORMAT: json.dumps(facts)}
     write_atomically(opened.folder.visibility / FILE, lambda temporary: write_tensors(temporary, tensors, header))
