@@ -77,6 +77,18 @@ def open_model(folder: RunFolder, which: ModelName = "best", device: torch.devic
     return OpenedModel(folder, model, found.stage.model, found.name, found.stage.status(), found.key, found.caution)
 
 
+def refuse_empty(folder: RunFolder, anchors: int | None) -> None:
+    """Raise RunError where the coarse model of a run holds no anchors (None: not known): nothing can be built on it."""
+    if anchors == 0:
+        growth = folder.method().training.growth
+        raise RunError(
+            f"{folder.coarse.path}: the coarse model holds no anchors: in training all of them were taken for "
+            f"transparent and removed. Give a smaller --growth.prune-opacity (it is {growth.prune_opacity:g}) or a "
+            "larger --growth.start, to `vdgs run` with --redo or in a new --output, and look at the photographs with "
+            "`vdgs inspect`: do they show the place, through the right cameras?"
+        )
+
+
 @dataclass(frozen=True)
 class FoundModel:
     """One of the models of a run, not read yet; as `OpenedModel`."""

@@ -24,13 +24,16 @@ from vdgs.model.sizes import largest_log_scales
 from vdgs.model.start import initial_anchors
 from vdgs.runs.flight import keep_flight
 from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import refuse_empty
 from vdgs.runs.seldom import seldom_terms
+from vdgs.runs.status import Status
 from vdgs.runs.stereo import find_points
 from vdgs.settings.method import TrainConfig
 from vdgs.settings.watching import WatchOptions
 from vdgs.stereo import DensePoints
+from vdgs.storage.checkpoints import save_state
 from vdgs.storage.files import write_json
-from vdgs.training import Stage, TrainingState, mean_colour, start_state
+from vdgs.training import Stage, TrainingState, mean_colour, start_state, to_saved
 from vdgs.training.sampling import shares_for
 from vdgs.watching.anchors import continue_or_start, finish, note_without_growth, train_watched
 from vdgs.watching.images import image_budget
@@ -43,11 +46,12 @@ def train_coarse(
     """Train, or continue, the coarse model of a run on a device; nothing if it is finished.
 
     Raises CaptureError for a capture that cannot become a scene or damaged photographs, Stopped after Ctrl-C or SIGTERM
-    (state saved), TrainingDiverged (last good state kept).
+    (state saved), TrainingDiverged (last good state kept), RunError where training leaves no anchors.
     """
     options.check()
     folder, key = run.coarse, run.keys().coarse
     if folder.is_done(key):  # its blocks may be at work
+        refuse_empty(run, folder.status().anchors)
         console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
         return
     with run.locked():
@@ -79,11 +83,21 @@ def _train(
         state = continue_or_start(folder, stage, begun, console)
         _announce(capture, state, config, console)
         train_watched(folder, state, stage, options, console)
+    _refuse_empty(run, state)
     facts = {
         "capture": capture_facts(capture), "version": __version__, "iterations": state.iteration,
         "key": run.keys().coarse,
     }  # fmt: skip
     finish(folder, state, AnchorModel(*state.result(), stage.voxel, stage.background, facts), console)
+
+
+def _refuse_empty(run: RunFolder, state: TrainingState) -> None:
+    """Raise RunError for a state without anchors, before its stage counts as done. It is kept: to come this far again
+    would not help."""
+    if not len(state.anchors):
+        save_state(run.coarse.checkpoints, to_saved(state))
+        run.coarse.set_status(Status("failed", iteration=state.iteration, why="training has removed all anchors"))
+    refuse_empty(run, len(state.anchors))
 
 
 def _dense_points(
