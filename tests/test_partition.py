@@ -212,6 +212,30 @@ def test_a_handful_of_anchors_or_a_line_of_them_is_cut(count: int) -> None:
         assert len(blocks) == len(set(owners(blocks, positions).tolist())) == count
 
 
+def notes(positions: np.ndarray, views: np.ndarray, count: int, **settings: object) -> str:
+    """What people are told of a cut."""
+    return " ".join(cut_scene(positions, views, PartitionConfig(blocks=count, **settings), seed=0)[1])
+
+
+def test_fewer_blocks_than_asked_for_are_said_with_the_reason() -> None:
+    generator = np.random.default_rng(8)
+    site, views = generator.uniform(0, 200, (2000, 3)), generator.integers(5, 20, 4000)
+    far_apart = np.concatenate([site, site + np.array([50_000.0, 0, 0])])
+    for lambda_vis in (0.0, 0.2):
+        said = notes(far_apart, views, 8, lambda_vis=lambda_vis)
+        assert "instead of 8: blocks are told apart on cells of 1/512 of the scene's extent" in said
+        assert "each is better a run of its own" in said
+        assert "lambda" not in said
+        assert notes(far_apart, views, 2, lambda_vis=lambda_vis) == ""  # as it advises
+        assert notes(site, views[:2000], 4, lambda_vis=lambda_vis) == ""
+    place = generator.uniform(0, 100, (4000, 3))
+    assert "scattered among those of their neighbours. A smaller --lambda-vis" in notes(place, views, 4, lambda_vis=9.0)
+    stray = np.concatenate([place, generator.uniform(0, 5000, (120, 3))])
+    said = notes(stray, np.append(views, views[:120]), 8, lambda_vis=0.0)
+    assert "the other clusters hold hardly any anchors" in said
+    assert "lambda" not in said
+
+
 def test_the_number_of_blocks() -> None:
     auto = PartitionConfig(blocks="auto")
     assert choose_block_count(10**6, 500, 10**6, PartitionConfig(blocks=3)) == 3

@@ -86,8 +86,7 @@ def cell_size(places: Float[np.ndarray, "n 2"], count: int) -> float:
     """Edge of the cells on which components are found (choice): twice the distance within which 95 % of the anchors
     have eight neighbours, so that cells of sparse outskirts are seldom empty; within bounds set by the scene's size.
     """
-    low, high = np.quantile(places, WINDOW, axis=0)
-    extent = float((high - low).max()) or float(np.ptp(places, axis=0).max())
+    extent = extent_of(places)
     rank = min(CELL_NEIGHBOUR, len(places) - 1)
     sample = places[:: -(-len(places) // CELL_SAMPLE)]
     # Not balanced: built several times faster, and exact all the same.
@@ -95,6 +94,12 @@ def cell_size(places: Float[np.ndarray, "n 2"], count: int) -> float:
     distances = tree.query(sample, k=[rank + 1])[0]
     wanted = CELL_FACTOR * float(np.quantile(distances, CELL_QUANTILE))
     return float(np.clip(wanted, extent / MOST_CELLS, extent / (LEAST_CELLS * np.sqrt(count))))
+
+
+def extent_of(places: Float[np.ndarray, "n 2"]) -> float:
+    """How far places reach along the longer axis, outliers aside."""
+    low, high = np.quantile(places, WINDOW, axis=0)
+    return float((high - low).max()) or float(np.ptp(places, axis=0).max())
 
 
 def _components(places: np.ndarray, labels: np.ndarray, count: int, cell: float) -> dict[int, Float[np.ndarray, "m 2"]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Float, Int
 from vdgs.errors import VdgsError
 from vdgs.memory.estimate import Need, estimate
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.boundary import cores_of, widen
+from vdgs.partition.boundary import LEAST_CELLS, cell_size, cores_of, extent_of, widen
 from vdgs.partition.cluster import cluster, features_of, refuse_too_many
 from vdgs.partition.nearest import Cores
 from vdgs.partition.plane import principal_plane
@@ -51,18 +52,39 @@ def cut_scene(
     places, visibility = _sorted(plane.places(ground), visibility)
     features = features_of(places, visibility, config.lambda_vis)
     labels = cluster(features, count, seed, config.balanced)
-    cores = [core for core in cores_of(places, labels, count) if core is not None]
-    cores = _worth_training(sorted(cores, key=lambda core: (core.centroid.x, core.centroid.y)), places, count)
+    found = cores_of(places, labels, count)
+    there = [core for core in found if core is not None]
+    cores = _worth_training(sorted(there, key=lambda core: (core.centroid.x, core.centroid.y)), places, count)
     warnings = []
     if len(cores) < count:
-        warnings.append(
-            f"the scene is cut into {len(cores)} blocks instead of {count}: the anchors of the other clusters are "
-            "scattered among those of their neighbours. A smaller --lambda-vis or fewer blocks avoid this."
-        )
+        lost = [label for label, core in enumerate(found) if not any(core is kept for kept in cores)]
+        why = _why_fewer(places, labels, lost, count, config.lambda_vis)
+        warnings.append(f"the scene is cut into {len(cores)} blocks instead of {count}: {why}")
     if len(cores) == 1:
         return _whole(ground, config.expansion), warnings
     grounded = [plane.to_ground(core) for core in cores]
     return Blocks(tuple(Block(core, widen(core, config.expansion)) for core in grounded)), warnings
+
+
+def _why_fewer(
+    places: Float[np.ndarray, "n 2"], labels: Int[np.ndarray, " n"], lost: Sequence[int], count: int, lambda_vis: float
+) -> str:
+    """Why the `lost` of `count` clusters became no blocks, and what to do about it."""
+    cell, members = cell_size(places, count), [places[labels == label] for label in lost]
+    if any(len(each) >= LEAST_SHARE * len(places) / count and extent_of(each) < LEAST_CELLS * cell for each in members):
+        return (
+            f"blocks are told apart on cells of 1/{extent_of(places) / cell:.0f} of the scene's extent, and the other "
+            f"clusters are less than {LEAST_CELLS} such cells across. Fewer blocks avoid this; of places that lie "
+            "far apart, each is better a run of its own."
+        )
+    if lambda_vis > 0:
+        return (
+            "the anchors of the other clusters are scattered among those of their neighbours. A smaller --lambda-vis "
+            "or fewer blocks avoid this."
+        )
+    return (
+        "the other clusters hold hardly any anchors, or lie scattered among their neighbours. Fewer blocks avoid this."
+    )
 
 
 def choose_block_count(
