@@ -133,6 +133,46 @@ def test_older_tiles_go_when_new_ones_are_there(tmp_path, town):
     assert len(tiles_of(path)[0][2]) == 50
 
 
+def listed(folder: Path) -> list[str]:
+    """All that lies in a folder, at any depth."""
+    return sorted(each.relative_to(folder).as_posix() for each in folder.rglob("*"))
+
+
+def test_only_tiles_of_ours_ever_go(tmp_path, town):
+    path, some = tmp_path / "tileset.json", Scene.of(town.select(torch.arange(50)))
+    for mine in ("tiles-photos/a.jpg", "tiles-1/a.jpg", "tiles-2/0.glb", "tiles-/0.glb"):
+        (tmp_path / mine).parent.mkdir()
+        (tmp_path / mine).write_text("mine")
+    before = listed(tmp_path)
+    registry.write(path, some)
+    assert listed(tmp_path) == sorted([*before, "tiles-3", "tiles-3/0.glb", "tileset.json"])
+    (tmp_path / "tiles-3" / "notes.txt").write_text("mine")
+    registry.write(path, some)
+    assert listed(tmp_path) == sorted(
+        [*before, "tiles-3", "tiles-3/notes.txt", "tiles-4", "tiles-4/0.glb", "tileset.json"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("generator", "uri"),
+    [
+        ("another", "tiles-2/0.glb"), ("vdgs 1", "../tiles-2/0.glb"), ("vdgs 1", "tiles-2/../mine/0.glb"),
+        ("vdgs 1", "mine/0.glb"), ("vdgs 1", "/tiles-2/0.glb"), ("vdgs 1", "tiles-2"), ("vdgs 1", 5), (None, None),
+    ],
+)  # fmt: skip
+def test_what_a_strange_tileset_names_stays(tmp_path, town, generator, uri):
+    folder = tmp_path / "at"
+    for mine in ("tiles-2/0.glb", "at/tiles-2/0.glb", "at/mine/0.glb"):
+        (tmp_path / mine).parent.mkdir(parents=True)
+        (tmp_path / mine).write_text("mine")
+    root = {"content": {"uri": str(tmp_path) + uri if str(uri).startswith("/") else uri}}
+    strange = {"asset": {"version": "1.1", "generator": generator}, "root": root}
+    (folder / "tileset.json").write_text(json.dumps(strange) if generator else "{")
+    registry.write(folder / "tileset.json", Scene.of(town.select(torch.arange(50))))
+    for mine in ("tiles-2/0.glb", "at/tiles-2/0.glb", "at/mine/0.glb"):
+        assert (tmp_path / mine).read_text() == "mine"
+
+
 def test_a_crowd_on_one_spot_ends_in_one_tile(tmp_path):
     crowd = random_gaussians(300, 0)
     crowd = replace(crowd, means=torch.zeros(300, 3))

@@ -88,6 +88,15 @@ def test_all_files_of_one_baking_hold_the_same_scene(export, tmp_path: Path):
     assert not list(tmp_path.glob(".baking-*"))
 
 
+def test_the_size_of_tiles_is_theirs_alone(export, tmp_path: Path):
+    (tmp_path / "other.bin").write_bytes(bytes(10_000_000))
+    (tmp_path / "tiles-9").mkdir()
+    (tmp_path / "tiles-9" / "0.glb").write_bytes(bytes(10_000_000))
+    (file,) = export("tileset.json")["files"]
+    (tile,) = (tmp_path / "tiles-10").iterdir()
+    assert file["bytes"] == tile.stat().st_size + (tmp_path / "tileset.json").stat().st_size
+
+
 def test_files_about_a_place_on_earth_keep_its_origin_apart(export, tmp_path: Path):
     pytest.importorskip("pyproj")
     export("utm.ply", "enu.ply", origin=PLACE, crs="EPSG:32632")

@@ -24,6 +24,7 @@ from vdgs.export.elsewhere import BakedElsewhere, baked_elsewhere, forget_pieces
 from vdgs.export.formats import registry
 from vdgs.export.formats.scene import ROWS, Page, Scene
 from vdgs.export.formats.spool import Spooled
+from vdgs.export.formats.tiles import NAME, tiles_of
 from vdgs.export.frame import Frame
 from vdgs.export.here import BakedHere, bar_on
 from vdgs.export.loss import loss_of, measured_views
@@ -174,10 +175,9 @@ def _write(path: Path, scene: Scene, console: Console) -> dict[str, Any]:
 
 
 def _size(path: Path) -> int:
-    """Bytes of a file, or of all the tiles about it."""
-    if registry.format_of(path).ending == registry.NAME:
-        return sum(file.stat().st_size for file in path.parent.rglob("*") if file.is_file())
-    return path.stat().st_size
+    """Bytes of a file, with the tiles that it names."""
+    tiles = tiles_of(path) if registry.format_of(path).ending == NAME else []
+    return sum(file.stat().st_size for file in (path, *tiles))
 
 
 def _losses(

@@ -8,8 +8,11 @@ middle; the root's transform takes them to Earth-centred coordinates where the s
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +33,9 @@ from vdgs.model.similarity import covariances, transformed
 from vdgs.storage.files import write_bytes, write_json
 
 NAME = "tileset.json"
+#: How tiles are named beside their tileset: the folder's number is one that nothing there has yet, the file says where
+#: in the quadtree it stands.
+_TILE = re.compile(r"tiles-[0-9]+/[0-3]+\.glb")
 #: Gaussians of a tile: about a megabyte with spherical harmonics of degree 3.
 MOST = 50_000
 #: The extension of glTF asks for version 2.
@@ -59,16 +65,16 @@ def refuse_other_names(path: Path, scene: Scene) -> None:
 
 
 def write_tiles(path: Path, scene: Scene, most: int = MOST) -> tuple[str, ...]:
-    """Write tiles beside `path` and then, atomically, the tileset that names them; older tiles are removed last.
+    """Write tiles beside `path` and then, atomically, the tileset that names them; the tiles of the one that was there
+    before are removed last, and nothing else.
 
     The numbers of the scene wait in a file beside it; of them memory holds a place and an index each. Returns what was
     lost. Raises VdgsError.
     """
     refuse_other_names(path, scene)
-    older = [each for each in path.parent.glob("tiles-*") if each.is_dir()]
-    folder = (
-        path.parent / f"tiles-{1 + max((int(each.name[6:]) for each in older if each.name[6:].isdecimal()), default=0)}"
-    )
+    older = tiles_of(path)
+    taken = [int(each.name[6:]) for each in path.parent.glob("tiles-*") if each.name[6:].isdecimal()]
+    folder = path.parent / f"tiles-{1 + max(taken, default=0)}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{NAME}.") as spool:
@@ -82,12 +88,40 @@ def write_tiles(path: Path, scene: Scene, most: int = MOST) -> tuple[str, ...]:
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
-    for each in older:
-        shutil.rmtree(each, ignore_errors=True)
+    _remove(older)
     notes = ["positions are rounded to 0.24 mm, colours and shapes to bytes"]
     if scene.facts.geodetic is None:
         notes.append("the scene is not georeferenced: globes show it at the centre of the Earth")
     return tuple(notes)
+
+
+def tiles_of(path: Path) -> list[Path]:
+    """The files that the tileset at `path` names, where it is one that `write_tiles` wrote; else none.
+
+    Any other tileset, a damaged one, and what is named otherwise than our own tiles is not for us to touch.
+    """
+    try:
+        tileset = json.loads(path.read_bytes())
+        if not str(tileset["asset"]["generator"]).startswith("vdgs "):
+            return []
+        found, waiting = [], [tileset["root"]]
+        while waiting:
+            entry = waiting.pop()
+            found.append(str(entry["content"]["uri"]))
+            waiting += entry.get("children", [])
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return []
+    return [path.parent / uri for uri in sorted(set(found)) if _TILE.fullmatch(uri)]
+
+
+def _remove(tiles: list[Path]) -> None:
+    """Remove tiles and the folders that are empty then. What people have put beside them stays."""
+    for each in tiles:
+        with suppress(OSError):
+            each.unlink()
+    for folder in sorted({each.parent for each in tiles}):
+        with suppress(OSError):
+            folder.rmdir()
 
 
 class _Tree:
