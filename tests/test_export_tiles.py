@@ -14,7 +14,7 @@ from formats_support import overhead, picture, psnr, random_gaussians
 from vdgs.captures.geodesy import geodetic_from_ecef
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry, spz
-from vdgs.export.formats.levels import thinned
+from vdgs.export.formats.levels import cell_of, thinned
 from vdgs.export.formats.scene import Y_UP, Facts, Scene
 from vdgs.export.formats.tiles import write_tiles
 from vdgs.model.gaussians import Gaussians, draw_gaussians
@@ -233,6 +233,43 @@ def test_nothing_changes_where_nothing_must_be_merged():
     same, edge = thinned(some, 100)
     assert same is some
     assert edge == 0
+
+
+@pytest.mark.parametrize("share", [0.9, 0.2, 0.02])
+@pytest.mark.parametrize("far", [(), (3e3,), (1e6, -1e6), (1e9,)])
+def test_no_far_thing_decides_how_much_of_a_scene_is_left(far, share):
+    """As much is left of a flat scene and of a filled room as was asked for, whatever lies beyond the horizon."""
+    some = random_gaussians(5000, 0, reach=100.0)
+    most = int(share * len(some))
+    for flat in (0.02, 1.0):
+        scene = replace(some, means=some.means * torch.tensor([1.0, 1.0, flat]))
+        if far:
+            away = some.select(torch.arange(len(far)))
+            scene = scene.extended(replace(away, means=torch.tensor([[x, 0.0, 0.0] for x in far])))
+        coarse, edge = thinned(scene, most)
+        assert 0.8 * most <= len(coarse) <= most
+        again, same = thinned(scene, most)
+        assert same == edge
+        assert torch.equal(again.means, coarse.means)
+        for x in far:
+            assert (coarse.means == torch.tensor([x, 0.0, 0.0])).all(1).sum() == 1
+
+
+def test_cells_of_a_grid_too_large_to_number_hold_what_lies_together():
+    means = torch.tensor([[0.0, 0.0, 0.0], [1e9, 1e9, 1e9], [0.5, 0.5, 0.5], [0.5, 1.5, 0.5], [1e9, 1e9, -1e9]])
+    near, far = torch.tensor([[3.0, 3.0, 3.0]]).double(), means.double()
+    expected = [1, 4, 1, 2, 3, 0]
+    assert cell_of(torch.cat([far, far[4:] - 1e9]), 1.0).tolist() == expected
+    # The same order as where all of the grid is numbered.
+    small = torch.cat([torch.rand(200, 3, generator=torch.Generator().manual_seed(0)).double() * 4, near])
+    beyond = torch.cat([small, torch.tensor([[1e8, 1e8, 1e8]]).double()])
+    assert torch.equal(cell_of(beyond, 0.5)[:-1], cell_of(small, 0.5))
+
+
+def test_what_has_one_place_becomes_one():
+    crowd = random_gaussians(300, 0)
+    coarse, _ = thinned(replace(crowd, means=torch.zeros(300, 3)), 100)
+    assert len(coarse) == 1
 
 
 def test_what_is_alone_in_its_cell_stays_as_it_is():

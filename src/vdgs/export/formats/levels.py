@@ -25,29 +25,69 @@ WIDER = 4.0
 MOST_OPAQUE = 0.999
 #: By how much a cell grows while there are still too many of them.
 GROWTH = 1.2
+#: So much of what may be left is left, at least (choice).
+FULL = 0.8
+#: Cells are made smaller so often at most, which is far more than a scene needs: where many Gaussians have one place,
+#: no cells part them.
+TRIES = 16
 
 
 def thinned(gaussians: Gaussians, most: int) -> tuple[Gaussians, float]:
     """At most `most` Gaussians that look like these from afar, and the edge of the cells that they were merged in.
 
-    The edge is 0 where nothing had to be merged.
+    At least `FULL` of `most` are left, unless so many have one place that no cells come near. The edge is 0 where
+    nothing had to be merged.
     """
     if len(gaussians) <= most:
         return gaussians, 0.0
     means = gaussians.means.double()
     size = (means.amax(0) - means.amin(0)).clamp_min(1e-9)
     # The first guess: the cells that a surface as large as the two longest sides would fill.
-    edge = math.sqrt(float(size.topk(2).values.prod()) / most)
-    while True:
+    edge, too_small = math.sqrt(float(size.topk(2).values.prod()) / most), 0.0
+    cells = cell_of(means, edge)
+    while _number(cells) > most:
+        edge, too_small = edge * GROWTH, edge
         cells = cell_of(means, edge)
-        if int(cells.max()) < most:
-            return merged(gaussians, cells), edge
-        edge *= GROWTH
+    # A few things far from all others make the sides long, and the cells too large for everything else.
+    edge, cells = _smaller(means, most, edge, cells, too_small)
+    return merged(gaussians, cells), edge
+
+
+def _smaller(
+    means: Float[Tensor, "n 3"], most: int, edge: float, cells: Int64[Tensor, " n"], too_small: float
+) -> tuple[float, Int64[Tensor, " n"]]:
+    """The edge and the cells, made smaller until `FULL` of `most` are in use. `too_small`: an edge that makes more
+    than `most`; 0 where none is known."""
+    for _ in range(TRIES):
+        if (count := _number(cells)) >= FULL * most:
+            break
+        # Half the edge, four times the cells: so it is on a surface. What falls beyond the bounds is halved between
+        # them.
+        tried = edge * math.sqrt(count / (most * (1 + FULL) / 2))
+        if tried <= too_small:
+            tried = math.sqrt(edge * too_small)
+        found = cell_of(means, tried)
+        if _number(found) > most:
+            too_small = tried
+        else:
+            edge, cells = tried, found
+    return edge, cells
+
+
+def _number(cells: Int64[Tensor, " n"]) -> int:
+    """How many cells are in use."""
+    return int(cells.max()) + 1
 
 
 def cell_of(means: Float[Tensor, "n 3"], edge: float) -> Int64[Tensor, " n"]:
     """The number of the cell of a cubic grid that each centre lies in, 0 .. the number of cells in use - 1."""
-    places = ((means - means.amin(0)) / edge).floor().long()
+    places = ((means - means.amin(0)) / edge).floor()
+    if float((places.amax(0) + 1).prod()) >= 2.0**62:
+        # Small cells about something very far: 64 bits number the layers in use, but not all of the grid.
+        x, y, z = (torch.unique(column, return_inverse=True)[1] for column in places.unbind(1))
+        x = torch.unique(x * _number(y) + y, return_inverse=True)[1]
+        return torch.unique(x * _number(z) + z, return_inverse=True)[1]
+    places = places.long()
     counts = places.amax(0) + 1
     keys = (places[:, 0] * counts[1] + places[:, 1]) * counts[2] + places[:, 2]
     return torch.unique(keys, return_inverse=True)[1]
@@ -55,7 +95,7 @@ def cell_of(means: Float[Tensor, "n 3"], edge: float) -> Int64[Tensor, " n"]:
 
 def merged(gaussians: Gaussians, cells: Int64[Tensor, " n"]) -> Gaussians:
     """One Gaussian for each cell, in the order of their numbers."""
-    count = int(cells.max()) + 1
+    count = _number(cells)
     areas = _areas(gaussians.log_scales)
     depth = -torch.log1p(-gaussians.logits.sigmoid().double().clamp_max(MOST_OPAQUE))
     cover = depth * areas
