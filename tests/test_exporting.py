@@ -16,6 +16,7 @@ from formats_support import random_gaussians
 from merging_support import camera_above, model_at
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.captures.geodesy import ecef_from_geodetic, enu_axes
 from vdgs.errors import VdgsError
 from vdgs.export import exporting, here
 from vdgs.export.baking import survey
@@ -117,6 +118,52 @@ def test_files_about_a_place_on_earth_keep_its_origin_apart(export, tmp_path: Pa
     assert torch.allclose(plain.means, here.means, atol=1e-4)
 
 
+def on_earth(local: torch.Tensor, geodetic: tuple[float, float, float]) -> np.ndarray:
+    """Earth-centred metres [n, 3] of what lies so far east, north and up of a place."""
+    return local.double().numpy() @ enu_axes(*geodetic[:2]) + ecef_from_geodetic(np.array([geodetic]))
+
+
+@pytest.mark.parametrize("crs", [None, "enu", "EPSG:32632", "source", "local"])
+def test_tiles_stand_on_the_globe_whatever_other_files_are_written_in(export, tmp_path: Path, crs):
+    pytest.importorskip("pyproj")
+    record = export("a.ply", "tileset.json", origin=PLACE, crs=crs)
+    assert not any("centre of the Earth" in note for file in record["files"] for note in file["notes"])
+    matrix = np.array(read_json(tmp_path / "tileset.json")["root"]["transform"]).reshape(4, 4).T
+    np.testing.assert_allclose(matrix[:3, 3], ecef_from_geodetic(np.array([PLACE]))[0], atol=1e-6)
+    np.testing.assert_allclose(matrix[:3, :3], enu_axes(*PLACE[:2]).T, atol=1e-12)
+
+
+def test_tiles_of_nowhere_in_a_map_are_refused(export, tmp_path: Path):
+    with pytest.raises(VdgsError, match="not georeferenced"):
+        export("tileset.json", crs="EPSG:32632")
+    assert not (tmp_path / "tileset.json").exists()
+    (file,) = export("tileset.json")["files"]
+    assert any("centre of the Earth" in note for note in file["notes"])
+
+
+def test_a_scene_far_from_its_origin_stays_where_it_is_on_earth(export, tmp_path, monkeypatch):
+    looking_down_at(monkeypatch, 3000.0)
+    model = moved(scattered(), torch.full((200,), 3000.0))
+    export("a.spz", "a.ply", model=model, origin=PLACE)
+    near, whole = registry.read(tmp_path / "a.spz"), registry.read(tmp_path / "a.ply")
+    facts = read_json(tmp_path / "a.spz.json")
+    assert facts["origin"] == [0, 0, 0]
+    assert facts["geodetic"] != list(PLACE)
+    assert float(near.means.abs().max()) < 100
+    apart = on_earth(near.means, facts["geodetic"]) - on_earth(whole.means, PLACE)
+    assert np.abs(apart).max() < 1e-3
+    # Tiles that are farther away than single precision reaches say so in their transform.
+    looking_down_at(monkeypatch, 30_000.0)
+    model = moved(scattered(), torch.full((200,), 30_000.0))
+    export("tileset.json", model=model, origin=PLACE)
+    root = read_json(tmp_path / "tileset.json")["root"]
+    matrix = np.array(root["transform"]).reshape(4, 4).T
+    middle = (matrix @ [*root["boundingVolume"]["box"][:3], 1.0])[:3]
+    expected = on_earth(torch.tensor([[30_000.0, 0.0, 0.0]]), PLACE)[0]
+    assert np.linalg.norm(middle - expected) < 10
+    assert np.abs(root["boundingVolume"]["box"][:3]).max() < 200
+
+
 def test_a_frame_and_back_is_where_it_was():
     pytest.importorskip("pyproj")
     model = scattered()
@@ -127,6 +174,9 @@ def test_a_frame_and_back_is_where_it_was():
         back = frame.to_ground(frame.place(gaussians))
         for name in ("means", "log_scales", "rest"):
             assert torch.allclose(getattr(back, name), getattr(gaussians, name), atol=1e-3), (crs, name)
+    frame = frame_of(ground(PLACE), "enu", np.array([5000.0, -3000.0, 20.0]), far=1000.0)
+    back = frame.to_ground(frame.place(gaussians))
+    assert torch.allclose(back.means, gaussians.means, atol=1e-3)
 
 
 def test_boxes_blocks_and_numbers_choose(export, tmp_path: Path):
@@ -174,7 +224,7 @@ def looking_down_at(monkeypatch: pytest.MonkeyPatch, *x: float) -> None:
     capture = capture_at(None)
     cameras = [Camera(look_down(np.array([at, 0, 8.0]), 0.0, 90.0), 60.0, 60.0, 32.0, 24.0, 64, 48) for at in x]
     views = tuple(replace(capture.views[0], camera=camera) for camera in cameras)
-    monkeypatch.setattr(f"{__name__}.capture_at", lambda _: replace(capture, views=views))
+    monkeypatch.setattr(f"{__name__}.capture_at", lambda origin: replace(capture, views=views, ground=ground(origin)))
 
 
 def moved(model: AnchorModel, x: torch.Tensor) -> AnchorModel:

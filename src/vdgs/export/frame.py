@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.captures.capture import GroundFrame
+from vdgs.captures.geodesy import enu_axes, geodetic_from_enu
 from vdgs.export.formats.scene import Facts
 from vdgs.model.gaussians import Gaussians
 from vdgs.model.similarity import transformed
@@ -56,19 +57,32 @@ def frame_of(ground: GroundFrame, crs: str | None, centre: Float[np.ndarray, "3"
 
     Gaussians take the similarity that is right about the centre: over a kilometre a projection departs from it by
     centimetres, mostly in height (the Earth is round). A middle that is more than `far` from the origin of the system
-    gets an origin of its own. Raises VdgsError for a system that cannot be had.
+    gets an origin of its own; in `enu` that is a place on Earth, about which x is east, y north and z up again, so that
+    what says of the file where it stands is one thing, its latitude, longitude and height. Raises VdgsError for a
+    system that cannot be had.
     """
     placement = Placement.of(ground, crs)
     similarity = placement.similarity_at(centre)
     middle = similarity.apply(centre[None])[0]
     origin = np.round(middle / ROUND) * ROUND if np.abs(middle).max() > far else np.zeros(3)
-    facts = Facts(
-        origin=(float(origin[0]), float(origin[1]), float(origin[2])),
-        crs=placement.wkt,
-        unit="metre" if placement.unit == "m" else placement.unit,
-        geodetic=ground.origin_geo if placement.crs == "enu" and not origin.any() else None,
-    )
+    unit = "metre" if placement.unit == "m" else placement.unit
+    if placement.crs == "enu" and ground.origin_geo is not None:
+        geodetic, turn = _place_at(origin, ground.origin_geo)
+        rotation, translation = turn @ similarity.rotation, turn @ (similarity.origin - origin)
+        return Frame(similarity.scale, rotation, translation, Facts(unit=unit, geodetic=geodetic))
+    facts = Facts((float(origin[0]), float(origin[1]), float(origin[2])), placement.wkt, unit)
     return Frame(similarity.scale, similarity.rotation, similarity.origin - origin, facts)
+
+
+def _place_at(
+    origin: Float[np.ndarray, "3"], about: tuple[float, float, float]
+) -> tuple[tuple[float, float, float], Float[np.ndarray, "3 3"]]:
+    """Latitude, longitude (deg) and ellipsoidal height (m) of what lies `origin` east, north and up of `about`, and
+    the rotation from the axes there to those at that place."""
+    if not origin.any():
+        return about, np.eye(3)
+    latitude, longitude, height = (float(each) for each in geodetic_from_enu(origin[None], about)[0])
+    return (latitude, longitude, height), enu_axes(latitude, longitude) @ enu_axes(*about[:2]).T
 
 
 def usual_crs(ground: GroundFrame, path: Path) -> str | None:

@@ -63,9 +63,14 @@ def _of_block(run: TrainedRun, block: int) -> np.ndarray:
 
 
 def frame_for(path: Path, run: TrainedRun, asked: ExportRequest, centre: np.ndarray) -> Frame:
-    """The coordinates of a file: those that do not reach far have their origin nearby."""
-    far = min(FAR, registry.format_of(path).reach / 2)
-    return frame_of(run.capture.ground, asked.crs or usual_crs(run.capture.ground, path), centre, far)
+    """The coordinates of a file: those that do not reach far have their origin nearby.
+
+    3D Tiles stand on the globe wherever it is known how, whatever --crs says of other files: no map lies between.
+    """
+    ground, kind = run.capture.ground, registry.format_of(path)
+    far = min(FAR, kind.reach / 2)
+    frame = frame_of(ground, asked.crs or usual_crs(ground, path), centre, far)  # which refuses what is no system
+    return frame_of(ground, "enu", centre, far) if kind.on_globe and ground.origin_geo is not None else frame
 
 
 def rows_for(

@@ -176,7 +176,7 @@ class ExportRequest:
     crs: str | None = None
     """Coordinates of the files: EPSG:n (EPSG:25832), `enu` (metres east and north of the scene's origin), `source`
     (those of the capture) or `local` (the ground frame). By default `enu` where the capture is georeferenced, and UTM
-    for .laz and .las; else `local`."""
+    for .laz and .las; else `local`. 3D Tiles of a georeferenced capture always stand on the globe (`enu`)."""
     measure: bool = True
     """Read a file back, draw the test views and say what was lost against the model itself."""
     threads: Annotated[int, WORKERS] = 0

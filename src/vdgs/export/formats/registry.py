@@ -39,6 +39,8 @@ class Format:
     reach: float = math.inf
     #: Whether its colours do not change with the direction: best baked so, where all files are of that kind.
     fixed: bool = False
+    #: Whether it stands on the globe, in no map's coordinates.
+    on_globe: bool = False
 
 
 #: The longer endings first: `.points.ply` is a `.ply` too.
@@ -49,7 +51,7 @@ FORMATS: tuple[Format, ...] = (
     Format(".splat", "32 bytes a Gaussian, fixed colours", write_splat, splat_pieces, facts_beside=True),
     Format(".sog", "PlayCanvas' SOG, a twelfth of the PLY or less", write_sog, facts_beside=True),
     Format(".glb", "glTF with KHR_gaussian_splatting, nothing lost", write_glb, check=refuse_too_large),
-    Format(NAME, "3D Tiles for CesiumJS, in levels", write_tiles, check=refuse_other_names),
+    Format(NAME, "3D Tiles for CesiumJS, in levels", write_tiles, check=refuse_other_names, on_globe=True),
     Format(".html", "page that shows the scene offline", write_html, html_pieces, refuse_without_viser, fixed=True),
     Format(".laz", "point cloud, map coordinates, compressed", write_laz, check=refuse_without_laspy),
     Format(".las", "point cloud, map coordinates", write_laz, check=refuse_without_laspy),
