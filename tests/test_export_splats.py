@@ -330,6 +330,16 @@ def test_a_glb_beyond_4_gib_is_refused_before_work(tmp_path):
         registry.check(tmp_path / "a.glb", Scene([], 20_000_000, 3))
 
 
+def test_more_than_every_reader_of_spz_opens_is_said(tmp_path, monkeypatch):
+    some = random_gaussians(50, 0)
+    monkeypatch.setattr(spz, "MOST_EVERYWHERE", 50)
+    assert registry.write(tmp_path / "a.spz", Scene.of(some)) == ()
+    monkeypatch.setattr(spz, "MOST_EVERYWHERE", 49)
+    (note,) = registry.write(tmp_path / "a.spz", Scene.of(some))
+    assert "--max-gaussians 49" in note
+    assert "tileset.json" in note
+
+
 def test_pictures_would_tell_a_wrong_turn(tmp_path):
     """So the tests above can fail."""
     some = random_gaussians(300, 3)

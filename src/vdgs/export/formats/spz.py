@@ -31,6 +31,8 @@ HEADER = struct.Struct("<IIIBBBB")
 FRACTION_BITS = 12
 #: Positions lie below this many units from the origin.
 REACH = 2**23 / 2**FRACTION_BITS
+#: For long Niantic's reader opened no more Gaussians than this; programs that have it from then still refuse them.
+MOST_EVERYWHERE = 10_000_000
 COLOUR_SCALE = 0.15
 #: Columns in the order of the file.
 COLUMNS = ("positions", "alphas", "colours", "scales", "rotations", "harmonics")
@@ -78,7 +80,13 @@ def write_spz(path: Path, scene: Scene, version: int = 3) -> tuple[str, ...]:
 
     write_atomically(path, write)
     write_beside(path, scene.facts, {"axes": "x east, y up, z south"})
-    return tuple(f"{cut[name]} of {scene.count} {what}" for name, what in CUT.items() if cut[name])
+    notes = [f"{cut[name]} of {scene.count} {what}" for name, what in CUT.items() if cut[name]]
+    if scene.count > MOST_EVERYWHERE:
+        notes.append(
+            f"holds {scene.count:,} Gaussians, and many programs open no SPZ of more than {MOST_EVERYWHERE:,}. For "
+            f"those, write fewer (--max-gaussians {MOST_EVERYWHERE}) or tileset.json"
+        )
+    return tuple(notes)
 
 
 def header(count: int, degree: int, version: int, fraction: int = FRACTION_BITS) -> bytes:
