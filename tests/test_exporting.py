@@ -203,6 +203,8 @@ def test_boxes_blocks_and_numbers_choose(export, tmp_path: Path):
         ((), {}, "--to FILE"),
         (("scene.obj",), {}, "no format is known"),
         (("a.ply", "a.ply"), {}, "given twice"),
+        (("run/report.html",), {}, "is the report of the run"),
+        (("a.ply", "run/../run/report.html"), {}, "is the report of the run"),
         (("a.ply",), {"bbox": (50.0, 50.0, 60.0, 60.0)}, "lies within"),
         (("a.ply",), {"bbox": (1.0, 0.0, 1.0, 5.0)}, "is empty"),
         (("a.ply",), {"bbox": (float("nan"), 0.0, 1.0, 5.0)}, "is empty"),

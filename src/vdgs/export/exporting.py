@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -33,6 +34,7 @@ from vdgs.export.refit import Baked
 from vdgs.export.selection import bounds_of, chosen, frame_for, rows_for
 from vdgs.export.steps import as_files_hold
 from vdgs.model.gaussians import Gaussians
+from vdgs.runs.folder import REPORT
 from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.settings.requests import ExportRequest
 from vdgs.storage.files import jsonable, write_json
@@ -89,10 +91,11 @@ def export_run(asked: ExportRequest, console: Console, wish: Wish | None = None)
     """Write what was asked for, on a device that is chosen already; returns what RUN/export.json holds.
 
     The scene is baked in this process, or in pieces where a `wish` sends them: the files are the same. Raises
-    VdgsError, before any Gaussian is baked, for file names of no format, outputs among a capture's inputs, an empty
-    choice, and coordinates that a format or the capture does not have; and what `Errand.run` raises.
+    VdgsError, before any Gaussian is baked, for file names of no format, outputs that are the run's report or among a
+    capture's inputs, an empty choice, and coordinates that a format or the capture does not have; and what `Errand.run`
+    raises.
     """
-    _check_names(asked.to)
+    _check_names(asked.run, asked.to)
     asked = as_files_hold(asked)
     run = open_run(asked.run, asked.model, asked.device)
     if run.caution:
@@ -152,12 +155,17 @@ def _refined(baked: Baked, training: Sequence[Camera], seconds: float, console: 
         refine(baked, endless(training), seconds, after_step)
 
 
-def _check_names(paths: tuple[Path, ...]) -> None:
+def _check_names(run: Path, paths: tuple[Path, ...]) -> None:
     if not paths:
         raise VdgsError("Nothing to write: give --to FILE, such as --to scene.ply.")
     for path in paths:
         registry.format_of(path)
         refuse_in_a_capture(path)
+        if path.name.lower() == REPORT and os.path.realpath(path.parent) == os.path.realpath(run):
+            raise VdgsError(
+                f"--to {path}: is the report of the run, which would be overwritten, and written again over the page. "
+                "Choose another name, such as scene.html."
+            )
     twice = sorted({str(path) for path in paths if paths.count(path) > 1})
     if twice:
         raise VdgsError(f"--to {twice[0]}: is given twice.")

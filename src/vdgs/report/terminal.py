@@ -10,8 +10,8 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from vdgs.report.write import FILE, report_standing
-from vdgs.runs.folder import RunFolder
+from vdgs.report.write import report_standing
+from vdgs.runs.folder import REPORT, RunFolder
 from vdgs.runs.standing import RunStanding, Standing, standing_of
 from vdgs.runs.status import Status
 
@@ -60,7 +60,7 @@ def next_step(standing: RunStanding) -> str:
     if standing.at_work:
         return "nothing to type: it is at work"
     run = shlex.quote(str(standing.path))
-    return f"open {standing.path / FILE}, or film it: vdgs render {run} --views flyover --output flyover.mp4"
+    return f"open {standing.path / REPORT}, or film it: vdgs render {run} --views flyover --output flyover.mp4"
 
 
 def progress_of(status: Status | None) -> str:

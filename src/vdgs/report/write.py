@@ -16,7 +16,7 @@ from vdgs.report.reading import Record, Shown, Source
 from vdgs.report.results import by_visibility_section, metrics_of, result_table, seams_section, verdict, views_section
 from vdgs.report.scene import assignment_section, blocks_section, maps_section, page_link, visibility_section
 from vdgs.report.training import training_section
-from vdgs.runs.folder import RunFolder
+from vdgs.runs.folder import REPORT, RunFolder
 from vdgs.runs.standing import RunStanding, Standing, standing_of
 from vdgs.storage.files import write_text
 
@@ -26,8 +26,6 @@ CONTENTS = (
     ("views", "test views"), ("maps", "maps"), ("by-visibility", "quality by visibility"), ("seams", "per block"),
     ("costs", "time and memory"), ("settings", "settings"),
 )  # fmt: skip
-
-FILE = "report.html"
 #: Name of the line of the page that says which standing of the run it shows, and where it is to be found at the latest.
 STANDING, HEAD_CHARACTERS = "vdgs-standing", 2000
 
@@ -57,22 +55,22 @@ def write_report(run: RunFolder) -> Path:
     ]
     links = [*([("photographs", "photographs")] if photographs else []), *CONTENTS]
     header, title = _header(shown)
-    path = run.path / FILE
+    path = run.path / REPORT
     write_text(path, document(title, [header, contents(links), *sections], {STANDING: shown.standing.digest}))
     return path
 
 
 def report_standing(run: RunFolder, standing: RunStanding) -> Standing:
     """Whether the report is there and shows the run as it stands."""
-    path = run.path / FILE
+    path = run.path / REPORT
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
             head = file.read(HEAD_CHARACTERS)
     except OSError:
-        return Standing("report", "missing", FILE)
+        return Standing("report", "missing", REPORT)
     if f'<meta name="{STANDING}" content="{standing.digest}">' in head:
-        return Standing("report", "done", FILE)
-    return Standing("report", "stale", FILE, "the run went on since it was written")
+        return Standing("report", "done", REPORT)
+    return Standing("report", "stale", REPORT, "the run went on since it was written")
 
 
 def _header(shown: Shown) -> tuple[Html, str]:

@@ -21,6 +21,9 @@ from vdgs.settings.plain import from_dict
 from vdgs.storage.files import read_json
 from vdgs.storage.records import record_of
 
+#: The page about a run, in its folder (`vdgs report`).
+REPORT = "report.html"
+
 
 @dataclass(frozen=True)
 class RunFolder:

@@ -50,8 +50,8 @@ def export(arguments: list[str]) -> None:
 
     asked.where.check()
     export_run(replace(asked, device=device), console, Wish(asked.where, asked.jobs, device=device))
-    from vdgs.report.write import FILE, write_report
-    from vdgs.runs.folder import RunFolder
+    from vdgs.report.write import write_report
+    from vdgs.runs.folder import REPORT, RunFolder
 
-    if any(path.suffix.lower() == ".html" for path in asked.to) and (asked.run / FILE).exists():
+    if any(path.suffix.lower() == ".html" for path in asked.to) and (asked.run / REPORT).exists():
         write_report(RunFolder(asked.run))  # it leads to the page
