@@ -22,7 +22,7 @@ from vdgs.evaluation.pictures import Thumbnail
 from vdgs.evaluation.records import load_view, save_view
 from vdgs.evaluation.seams import BlockFigures
 from vdgs.evaluation.view import ViewFigures
-from vdgs.executors.work import PieceWork, alone, at_work, spans_of
+from vdgs.executors.work import PieceWork, alone, at_work, clear, remove, spans_of
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.stages.evaluate import is_measured
@@ -154,6 +154,39 @@ def test_pieces_of_other_work_go_unless_they_are_at_work(tmp_path):
         pass
     with pytest.raises(RunError, match="--piece 1: there are 1 pieces"):
         wanted.span(1)
+
+
+def test_what_a_person_keeps_in_a_folder_of_that_name_stays(tmp_path):
+    """A folder for maps may be any: `pieces` in it may hold a chess set, folders named by digests, links to others."""
+    theirs = [tmp_path / "pieces" / name for name in ("rook.png", "white/king.png", "0123456789ab/queen.png")]
+    for file in theirs:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(b"ours")
+    elsewhere = PieceWork.of(tmp_path / "elsewhere", "that", [range(2)])
+    elsewhere.mark_queued()
+    (tmp_path / "pieces" / "ba9876543210").symlink_to(elsewhere.folder)
+    wanted, other = (PieceWork.of(tmp_path, name, [range(2)]) for name in ("this", "that"))
+    for work in (wanted, other):
+        work.mark_queued()
+    clear(tmp_path, wanted.key)
+    assert wanted.folder.exists()
+    assert not other.folder.exists()
+    remove(wanted)
+    clear(tmp_path)
+    assert not wanted.folder.exists()
+    assert all(file.read_bytes() == b"ours" for file in theirs)
+    assert elsewhere.piece(0).status().state == "queued"
+
+
+def test_the_folder_of_all_pieces_goes_with_the_last_work(tmp_path):
+    """Also where a driver ended before any piece was queued, and where another works for the same folder."""
+    begun, other = (PieceWork.of(tmp_path, name, [range(2)]) for name in ("begun", "other"))
+    begun.folder.mkdir(parents=True)
+    other.mark_queued()
+    remove(other)
+    assert begun.folder.exists()
+    clear(tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture(scope="module")

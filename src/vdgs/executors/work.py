@@ -5,13 +5,15 @@
     OUTPUT/pieces/KEY/slurm/   as in a run folder, where jobs of SLURM do the work
 
 KEY tells what the work depends on: what was begun for another model or with other settings is never joined, nor found
-by a driver that wants something else. All of it is removed once the pieces are joined.
+by a driver that wants something else. All of it is removed once the pieces are joined. OUTPUT may be any folder of a
+person's, with a `pieces` of its own in it: only what is known to be work of ours is ever removed.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -30,6 +32,8 @@ from vdgs.runs.status import Status
 
 #: The name of the folder of all pieces in the folder that the work is for.
 PIECES = "pieces"
+#: What the names of the folders of works look like (`PieceWork.of`).
+_KEY = re.compile(r"[0-9a-f]{12}")
 #: Seconds between two notes of how far a piece is.
 STATUS_SECONDS = 1.0
 
@@ -113,14 +117,30 @@ def alone(output: Path, key: str | None = None) -> Iterator[None]:
 def clear(output: Path, key: str | None = None) -> None:
     """Remove what pieces of other work than that with this `key` have left. Raises RunError where they are at work."""
     for work in (output / PIECES).glob("*"):
-        if work.name != key:
+        if work.name != key and _is_work(work):
             _refuse_at_work(work)
-            shutil.rmtree(work)
+            _remove(work)
 
 
 def remove(work: PieceWork) -> None:
     """Remove what pieces have left, once they are joined."""
-    shutil.rmtree(work.output / PIECES)
+    _remove(work.folder)
+
+
+def _remove(work: Path) -> None:
+    """Remove the folder of a work, and that of all pieces once nothing is in it."""
+    shutil.rmtree(work)
+    with suppress(OSError):
+        work.parent.rmdir()
+
+
+def _is_work(folder: Path) -> bool:
+    """Whether a folder holds pieces, whoever put what else beside it: it is named by a key, and it or a piece in it was
+    locked once. One with nothing in it was made by a driver that ended at once, or is no loss."""
+    if folder.is_symlink() or not folder.is_dir() or not _KEY.fullmatch(folder.name):
+        return False
+    locked = (folder / ".lock").exists() or any(folder.glob("*/.lock"))
+    return locked or not any(folder.iterdir())
 
 
 def _refuse_at_work(work: Path) -> None:

@@ -39,6 +39,7 @@ from vdgs.partition.figures import maps as figures
 from vdgs.partition.records import AssignedBlock, PartitionRecord
 from vdgs.partition.strategies import STRATEGIES
 from vdgs.runs.folder import RunFolder
+from vdgs.runs.locks import hold
 from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.runs.visibility import keep_visibility
 from vdgs.settings.method import AssignmentConfig, MethodConfig, PartitionConfig
@@ -213,7 +214,8 @@ def _score_in_pieces(
 ) -> Scores:
     """Let pieces of the cameras be scored elsewhere, and join their rows."""
     blocks, warnings = cut
-    save_blocks(work.folder / CUT, blocks, [{} for _ in blocks.items], {"warnings": warnings})
+    with hold(work.folder):  # from here on `executors.work` knows it as a work, whenever this process ends
+        save_blocks(work.folder / CUT, blocks, [{} for _ in blocks.items], {"warnings": warnings})
     if left := work.left:
         views = scene.opened.capture.train_views
         pixels = max(camera.width * camera.height for camera in scene.cameras)
