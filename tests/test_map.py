@@ -20,7 +20,7 @@ from merging_support import model_at, opaque_plane
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
 from vdgs.errors import VdgsError
-from vdgs.maps import mapping, tiles
+from vdgs.maps import folder, mapping, tiles
 from vdgs.maps.geotiff import CACHE_BYTES, bounded_cache
 from vdgs.maps.grid import TILE_PX, Grid, extent_of, grid_over, ground_sampling
 from vdgs.maps.overhead import Overhead
@@ -91,6 +91,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         request = MapRequest(tmp_path / "run", device="cpu", **asked)
         return mapping.map_run(request, Console(file=sys.stderr, soft_wrap=True))
 
+    run.path = tmp_path / "run"
     return run
 
 
@@ -289,7 +290,53 @@ def test_a_folder_pieces_beside_the_maps_is_not_ours(house, make, tmp_path):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"theirs")
     make(*house, gsd=0.5, output=tmp_path)
-    assert (tmp_path / "pieces/king.png").read_bytes() == (tmp_path / "pieces/white/queen.png").read_bytes() == b"theirs"
+    assert (
+        (tmp_path / "pieces/king.png").read_bytes() == (tmp_path / "pieces/white/queen.png").read_bytes() == b"theirs"
+    )
+
+
+def test_photographs_of_any_folder_are_no_place_for_maps(house, make, tmp_path):
+    capture, model = house
+    views = [replace(view, image_path=tmp_path / "card" / view.name) for view in capture.views]
+    (tmp_path / "card").mkdir()
+    with pytest.raises(VdgsError, match=r"is for inputs of the capture.*Nothing was written"):
+        make(replace(capture, views=tuple(views)), model, gsd=0.5, output=tmp_path / "card" / "maps")
+    assert not list((tmp_path / "card").iterdir())
+
+
+@pytest.mark.parametrize("facts", [None, "{}", '{"software": "GIS 3", "layers": 2}'])
+def test_maps_of_others_are_not_written_over(house, make, tmp_path, monkeypatch, facts):
+    monkeypatch.setattr(mapping, "open_run", lambda *_: pytest.fail("opened"))
+    (tmp_path / "dsm.tif").write_bytes(b"a month in the field")
+    if facts is not None:
+        (tmp_path / "map.json").write_text(facts)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    with pytest.raises(VdgsError, match=r"holds dsm\.tif.*Nothing was drawn"):
+        mapping.map_run(MapRequest(tmp_path / "run", output=tmp_path), Console(quiet=True))
+    with pytest.raises(VdgsError, match="is a file"):
+        mapping.map_run(MapRequest(tmp_path / "run", output=tmp_path / "dsm.tif"), Console(quiet=True))
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_a_map_killed_while_its_files_take_their_places_is_known_as_ours_and_as_unfinished(house, make, monkeypatch):
+    class Killed(BaseException):
+        pass
+
+    def kill(source: Path, target: Path) -> None:
+        if target.name == "orthophoto.tif":
+            raise Killed
+        shutil.move(source, target)
+
+    capture, model = house
+    with monkeypatch.context() as patch:
+        patch.setattr(folder.os, "replace", kill)
+        with pytest.raises(Killed):
+            make(capture, model, gsd=0.5)
+    run = SimpleNamespace(path=make.path, merged=SimpleNamespace(status=lambda: SimpleNamespace(model="1-2")))
+    assert (make.path / "maps" / "dsm.tif").exists()
+    assert not mapping.is_mapped(run)
+    make(capture, model, gsd=0.4)
+    assert mapping.is_mapped(run)
 
 
 def test_a_disk_without_room_is_named_before_anything_is_drawn(house, make, monkeypatch):

@@ -17,9 +17,11 @@ from vdgs.captures.loading import load_capture
 from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
 from vdgs.errors import VdgsError
 from vdgs.inspection.inspect import inspect_capture
+from vdgs.maps.mapping import map_run
 from vdgs.runs.beginning import begin_run
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.presets import PRESETS
+from vdgs.settings.requests import MapRequest
 from vdgs.synth import SynthOptions, generate
 
 
@@ -113,7 +115,12 @@ def bench(_: Path, output: Path) -> None:
     run_bench(BenchSettings("toy", output, Choices()), Console(quiet=True))
 
 
-@pytest.mark.parametrize("verb", [begin, inspect, synth, bench])
+def map_scene(root: Path, output: Path) -> None:
+    pytest.importorskip("rasterio")
+    map_run(MapRequest(root.parent / "run", output=output), Console(quiet=True))
+
+
+@pytest.mark.parametrize("verb", [begin, inspect, synth, bench, map_scene])
 @pytest.mark.parametrize("inside", ["images_4", "images_4/new"])
 def test_no_verb_writes_among_inputs(root: Path, verb, inside: str) -> None:
     before = contents(root)

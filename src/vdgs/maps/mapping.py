@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable
+from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,21 @@ from rich.progress import track
 from vdgs.errors import VdgsError
 from vdgs.executors.errand import Wish
 from vdgs.executors.work import clear
+from vdgs.maps.folder import (
+    DSM,
+    FACTS,
+    HILLSHADE,
+    ORTHOPHOTO,
+    PREVIEW,
+    VISIBILITY,
+    refuse_foreign,
+    software,
+    staged,
+)
 from vdgs.maps.geotiff import Layer, bounded_cache, cloud_optimised, require_rasterio, write_tile, writing
 from vdgs.maps.pictures import Sheet, hillshade_png, preview_png
 from vdgs.maps.pieces import drawn_elsewhere
-from vdgs.maps.plan import Plan
+from vdgs.maps.plan import Plan, folder_of
 from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Tile
 from vdgs.placing.placement import Placement
 from vdgs.runs.folder import RunFolder
@@ -30,8 +41,6 @@ from vdgs.settings.requests import MapRequest
 from vdgs.storage.files import jsonable, read_record, write_json
 from vdgs.watching.interrupts import stop_if_asked
 
-ORTHOPHOTO, DSM, VISIBILITY = "orthophoto.tif", "dsm.tif", "visibility.tif"
-HILLSHADE, PREVIEW, FACTS = "hillshade.png", "preview.png", "map.json"
 #: What a map takes on the disk while it is written, in parts of its uncompressed size: tiles, overviews, the result.
 _DISK_SHARE = 2.4
 
@@ -40,10 +49,12 @@ def map_run(asked: MapRequest, console: Console, wish: Wish | None = None) -> Pa
     """Write the maps of a run, on a device that is chosen already; returns their folder.
 
     Tiles are drawn in this process, or in pieces where a `wish` sends them: the files are the same. Raises VdgsError,
-    before anything is drawn, for a system, pixel size or extent that makes no map, a disk without room, and where
-    rasterio or pyproj is missing; and what `Errand.run` raises.
+    before anything is drawn, for a system, pixel size or extent that makes no map, a folder among a capture's inputs or
+    with such files of others, a disk without room, and where rasterio or pyproj is missing; and what `Errand.run`
+    raises.
     """
     require_rasterio()
+    refuse_foreign(folder_of(asked, asked.run))
     began = time.monotonic()
     if wish is not None and wish.sends:
         facts, folder = _map_in_pieces(asked, wish, console)
@@ -81,7 +92,7 @@ def _write(plan: Plan, tiles: Iterable[Tile], console: Console) -> dict[str, Any
     """Make maps of all tiles, which come in their order: files that come to stand in the folder together. Returns
     what map.json says."""
     layers = layers_of(plan.placement)
-    with _staged(plan.folder) as staging, bounded_cache():
+    with staged(plan.folder) as staging, bounded_cache():
         facts = _facts(plan)
         facts |= _draw(plan, tiles, layers, staging, facts, console)
         if not facts["mapped_share"]:
@@ -187,11 +198,9 @@ def _bands(tile: Tile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _facts(plan: Plan) -> dict[str, Any]:
-    from vdgs import __version__
-
     grid, placement, capture = plan.grid, plan.placement, plan.above.capture
     return {
-        "software": f"vdgs {__version__}", "model": plan.model, "model_identity": plan.model_identity,
+        "software": software(), "model": plan.model, "model_identity": plan.model_identity,
         "crs": placement.crs, "crs_name": placement.name,
         "unit": placement.unit, "heights": placement.heights, "georeference": capture.ground.how,
         "gsd": grid.gsd, "width": grid.width, "height": grid.height, "bounds": list(grid.bounds),
@@ -199,29 +208,6 @@ def _facts(plan: Plan) -> dict[str, Any]:
         "training_cameras": len(capture.train_views),
         "notes": list(placement.notes),
     }  # fmt: skip
-
-
-@contextmanager
-def _staged(folder: Path) -> Iterator[Path]:
-    """A folder inside `folder` whose files come to stand in it when all are there; nothing is left if not.
-
-    Raises VdgsError, with the remedy, where the disk refuses.
-    """
-    staging = folder / f".maps-{os.getpid()}"
-    try:
-        staging.mkdir(parents=True, exist_ok=True)
-        yield staging
-        for file in sorted(staging.iterdir()):
-            os.replace(file, folder / file.name)
-    except OSError as error:  # rasterio's errors are such too
-        raise VdgsError(
-            f"{folder}: the maps cannot be written ({error.strerror or error}). Free some space or give another "
-            "--output; maps that were there are kept."
-        ) from error
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-        if folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
 
 
 def _size(count: int) -> str:

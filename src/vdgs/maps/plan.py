@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.captures.capture import Capture
+from vdgs.captures.outputs import refuse_among_inputs
 from vdgs.maps.grid import Grid, extent_of, grid_over, ground_sampling, middle_of, refuse_elsewhere
 from vdgs.maps.overhead import Overhead
 from vdgs.maps.sharpening import Sharpener
@@ -15,6 +16,11 @@ from vdgs.maps.tiles import Surveyor, samples_for
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.placing.placement import Placement
 from vdgs.settings.requests import MapRequest
+
+
+def folder_of(asked: MapRequest, run: Path) -> Path:
+    """Where the files of a map go."""
+    return asked.output or run / "maps"
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +43,9 @@ class Plan:
     @staticmethod
     def of(asked: MapRequest, run: Path, model: str, model_identity: str | None, capture: Capture) -> Plan:
         """The map that is asked for of a run folder. Raises VdgsError for a system, pixel size or extent that makes
-        none."""
+        none, and for an output among inputs of the capture."""
+        folder = folder_of(asked, run)
+        refuse_among_inputs(folder, capture)
         placement = Placement.of(capture.ground, asked.crs)
         finest = ground_sampling(capture, placement.similarity_at(middle_of(capture)).scale)
         shown = extent_of(capture, placement)
@@ -45,7 +53,6 @@ class Plan:
         refuse_elsewhere(grid, shown, placement)
         above = Overhead.of(capture, placement)
         above.camera(grid.part(0, 0, 1, 1))  # a system that makes no map is refused here
-        folder = asked.output or run / "maps"
         return Plan(folder, run.name, model, model_identity, above, grid, samples_for(grid.gsd, finest), asked.sharp)
 
     @property

@@ -125,7 +125,7 @@ class MapRequest:
     run: Path
     """Run folder."""
     output: Path | None = None
-    """Folder for the maps; by default RUN/maps."""
+    """Folder for the maps, not among photographs nor with such files of others; by default RUN/maps."""
     gsd: Annotated[float | None, Range(0, LARGE, above=True)] = None
     """Side of a pixel in units of the map (metres, mostly); by default the median that a pixel of the training
     photographs shows of the ground, at the size at which they were used."""
