@@ -132,6 +132,38 @@ def test_systems_that_make_no_map_are_named(crs, message):
         Placement.of(frame(), crs)
 
 
+@pytest.mark.parametrize(
+    ("crs", "origin", "message"),
+    [
+        ("EPSG:5513", (50.1, 14.4, 300.0), r"south and west; .*its twin to the east and north, EPSG:5514"),
+        ("EPSG:2065", (50.1, 14.4, 300.0), r"its twin to the east and north, EPSG:5221"),
+        ("EPSG:5513+5705", (50.1, 14.4, 300.0), r"EPSG:5513\+5705.*EPSG:5514"),
+        ("EPSG:2048", (-33.9, 18.4, 20.0), r"west and south; .*such as EPSG:32734"),
+        ("EPSG:3145", (62.0, -6.8, 20.0), r"north and west; .*such as EPSG:32629"),
+    ],
+)
+def test_systems_that_count_to_the_west_are_named_with_one_that_does_not(crs, origin, message):
+    with pytest.raises(VdgsError, match=message):
+        Placement.of(frame(origin), crs)
+
+
+@pytest.mark.parametrize(
+    ("crs", "origin"),
+    [
+        ("EPSG:5514", (50.1, 14.4, 300.0)),
+        ("EPSG:31467", (48.1, 9.4, 300.0)),  # northing first in the catalogue
+        (None, (86.0, 19.0, 10.0)),  # UPS, whose axes both lead south
+        (None, (-86.0, 19.0, 10.0)),
+        ("EPSG:3031", (-77.8, 166.7, 10.0)),
+    ],
+)
+def test_systems_to_the_east_and_north_are_no_mirror(crs, origin):
+    placement = Placement.of(frame(origin), crs)
+    corner = placement.places(np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]]))
+    assert np.linalg.det(corner[1:] - corner[0]) > 0
+    assert np.linalg.det(placement.similarity_at(np.zeros(3)).rotation) > 0
+
+
 @pytest.mark.parametrize("metric", [True, False])
 def test_without_a_georeference_there_is_the_ground_frame_and_the_source(metric):
     ground = frame(None, metric=metric)

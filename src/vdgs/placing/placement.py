@@ -66,8 +66,8 @@ class Placement:
         """The placement of a ground frame in the system that `crs` names (`CHOICES`).
 
         None: the UTM zone of the origin where the frame is georeferenced, else "local", the ground frame itself.
-        Raises VdgsError for a system that is unknown, in degrees, or needs a georeference that is not there, and where
-        pyproj is not installed.
+        Raises VdgsError for a system that is unknown, in degrees, not to the east and north, or needs a georeference
+        that is not there, and where pyproj is not installed.
         """
         asked = (crs or ("local" if ground.origin_geo is None else utm_zone(*ground.origin_geo[:2]))).strip()
         if asked.lower() == "local":

@@ -62,8 +62,8 @@ def utm_zone(latitude_deg: float, longitude_deg: float) -> str:
 def open_projection(code: str, origin: tuple[float, float, float]) -> Projection:
     """The system `EPSG:n` (or `EPSG:n+m` with heights) for a scene about `origin` (lat deg, lon deg, height m).
 
-    Raises VdgsError for a code that is unknown, in degrees, of mixed units or with heights that cannot be had, and
-    where pyproj is not installed.
+    Raises VdgsError for a code that is unknown, in degrees, of axes that are not east and north, of mixed units or with
+    heights that cannot be had, and where pyproj is not installed.
     """
     try:
         import pyproj
@@ -81,6 +81,7 @@ def open_projection(code: str, origin: tuple[float, float, float]) -> Projection
             f"--crs {code}: {crs.name} is not in metres across (degrees, or heights alone). Give a projected system, "
             f"such as {utm_zone(*origin[:2])}, or leave --crs out."
         )
+    _refuse_westward(crs, code, origin)
     axes = crs.axis_info
     metres = float(axes[0].unit_conversion_factor)
     if any(abs(axis.unit_conversion_factor - metres) > 1e-12 for axis in axes):
@@ -97,6 +98,33 @@ def open_projection(code: str, origin: tuple[float, float, float]) -> Projection
 
 def _horizontal(crs: Any) -> Any:
     return crs.sub_crs_list[0] if crs.is_compound else crs
+
+
+def _refuse_westward(crs: Any, code: str, origin: tuple[float, float, float]) -> None:
+    """Raise VdgsError for coordinates that grow to the west: maps and scenes would be turned about, or as in a mirror.
+
+    Both axes of a polar system lead south, or both north: they lie to each other as east and north do.
+    """
+    towards = [axis.direction for axis in _horizontal(crs).axis_info[:2]]
+    if "west" not in towards:
+        return
+    twin = _of_name(f"{_horizontal(crs).name} East North")
+    instead = (
+        f"Give its twin to the east and north, {twin}" if twin else f"Give another, such as {utm_zone(*origin[:2])}"
+    )
+    raise VdgsError(
+        f"--crs {code}: {crs.name} counts to the {towards[0]} and {towards[1]}; maps and scenes need east and north. "
+        f"{instead}, or leave --crs out."
+    )
+
+
+def _of_name(name: str) -> str | None:
+    """The code of the projected system of this name, if the catalogue has one."""
+    from pyproj.database import query_crs_info
+    from pyproj.enums import PJType
+
+    known = query_crs_info(auth_name="EPSG", pj_types=[PJType.PROJECTED_CRS])
+    return next((f"EPSG:{each.code}" for each in known if each.name == name), None)
 
 
 def _operation(crs: Any, code: str, origin: tuple[float, float, float]) -> tuple[Any, tuple[str, ...]]:
