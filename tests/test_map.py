@@ -20,7 +20,7 @@ from merging_support import model_at, opaque_plane
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
 from vdgs.errors import VdgsError
-from vdgs.maps import folder, mapping, tiles
+from vdgs.maps import folder, mapping, sharpening, tiles
 from vdgs.maps.geotiff import CACHE_BYTES, bounded_cache
 from vdgs.maps.grid import TILE_PX, Grid, extent_of, grid_over, ground_sampling
 from vdgs.maps.overhead import Overhead
@@ -28,6 +28,7 @@ from vdgs.maps.pictures import hillshade, round_length
 from vdgs.maps.sharpening import Sharpener
 from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Surveyor, samples_for
 from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.decoder import Decoder
 from vdgs.model.render import render
 from vdgs.placing.placement import Placement
 from vdgs.settings.requests import MapRequest
@@ -428,6 +429,47 @@ def test_detail_comes_from_the_photographs_where_they_see_the_place(house, tmp_p
     detail = pattern(np.stack(np.meshgrid(x, y), axis=-1))
     assert np.corrcoef(gained[ground], detail[ground])[0, 1] > 0.7
     assert np.abs(gained[~ground]).mean() < 0.35 * np.abs(gained[ground]).mean()
+
+
+def grey(places: np.ndarray) -> AnchorModel:
+    """The same splats, all of one grey."""
+    model = model_of(places)
+    tensors = {name: tensor.clone() for name, tensor in model.decoder.tensors().items()}
+    tensors["colour_w2"].zero_()
+    tensors["colour_b2"].zero_()
+    return replace(model, decoder=Decoder.from_tensors(tensors))
+
+
+def misted(capture: Capture, folder: Path) -> Capture:
+    """Photographs, whose own brightness waves smoothly with the place and is another in each."""
+    views = []
+    for number, view in enumerate(capture.views):
+        sharp = view.camera.resized(320, 240)
+        x, y, _ = np.moveaxis(sharp.unproject(np.full((240, 320), sharp.position[2])), -1, 0)
+        light = 0.5 + 0.1 * np.sin(2 * np.pi * (x + 0.3 * number) / 4.1) * np.cos(2 * np.pi * y / 5.3)
+        Image.fromarray((light[..., None].repeat(3, axis=2) * 255 + 0.5).astype(np.uint8)).save(folder / view.name)
+        views.append(replace(view, camera=sharp, image_path=folder / view.name))
+    return replace(capture, views=tuple(views))
+
+
+@pytest.mark.parametrize("most", [12, 2])
+def test_detail_knows_no_borders_of_tiles(house, tmp_path, monkeypatch, most):
+    """Also where only some of the photographs are looked up."""
+    monkeypatch.setattr(sharpening, "_MOST_VIEWS", most)
+    capture, _ = house
+    capture, model = misted(capture, tmp_path), grey(GROUND)
+    sharpener = Sharpener(model, capture)
+    surveyor = surveyor_of(model, capture, Placement.of(capture.ground, "local"), sharpener=sharpener)
+    grid = Grid(-8.0, 4.0, 0.08, 200, 100)
+    whole = surveyor.tile(grid).colours
+    joined = np.zeros_like(whole)
+    for column, row, part in grid.tiles(50):
+        joined[row : row + part.height, column : column + part.width] = surveyor.tile(part).colours
+    sharpener.close()
+    assert np.ptp(whole[..., 0].astype(int)) > 10
+    off = np.abs(joined.astype(int) - whole)
+    assert off.max() <= 1
+    assert (off > 0).mean() < 0.01
 
 
 def test_gdal_may_keep_megabytes_of_a_map_and_not_bytes():

@@ -25,7 +25,7 @@ from vdgs.executors.placement import Share
 from vdgs.executors.work import PieceWork, at_work, clear, remove, spans_of
 from vdgs.maps.grid import TILE_PX
 from vdgs.maps.plan import Plan
-from vdgs.maps.sharpening import held_bytes
+from vdgs.maps.sharpening import HALO_PX, held_bytes
 from vdgs.maps.tiles import Tile
 from vdgs.memory.estimate import drawing_bytes
 from vdgs.runs.folder import RunFolder
@@ -52,7 +52,8 @@ def drawn_elsewhere(
     clear(plan.folder, work.key)
     with hold(work.folder):
         if left := work.left:
-            images, side = held_bytes(plan.sharp, plan.above.capture), TILE_PX * plan.samples
+            images = held_bytes(plan.sharp, plan.above.capture)
+            side = (TILE_PX + (2 * HALO_PX if plan.sharp else 0)) * plan.samples
             errand = Errand(
                 TILES, work.folder, len(work.spans), left, work.piece,
                 lambda index, share, device: _command(plan, asked, run, found, index, share, device),

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8, UInt16
+from jaxtyping import Bool, Float, Int, UInt8, UInt16
 
 from vdgs.cameras import Camera
 from vdgs.maps.grid import Grid
 from vdgs.maps.overhead import Overhead
-from vdgs.maps.sharpening import Sharpener
+from vdgs.maps.sharpening import HALO_PX, Sharpener
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import render
 from vdgs.model.visibility import visibility_of
@@ -34,6 +35,15 @@ class Tile:
     visibility: UInt16[np.ndarray, "h w"]
 
 
+class _Seen(NamedTuple):
+    """What pixels show, of which some are `shown`: for those, places in the ground frame and how many cameras look."""
+
+    colours: Float[np.ndarray, "h w 3"]
+    shown: Bool[np.ndarray, "h w"]
+    points: Float[np.ndarray, "n 3"]
+    counts: Int[np.ndarray, " n"]
+
+
 @dataclass(frozen=True, eq=False)
 class Surveyor:
     """Draws tiles of a map of one model."""
@@ -48,9 +58,30 @@ class Surveyor:
     def tile(self, grid: Grid) -> Tile:
         """Draw the pixels of a grid, each from `samples`² of its own."""
         fine = Grid(grid.left, grid.top, grid.gsd / self.samples, grid.width * self.samples, grid.height * self.samples)
-        camera = self.above.camera(fine)
+        through = self.above.camera(fine)
+        camera = self.above.camera(grid) if self.samples > 1 else through
+        seen = self._seen(through, camera)
+        shown, colours = seen.shown, seen.colours
+        if self.sharpener is not None and shown.any():
+            # Drawn once more, with what lies about it; not cut from that, so that heights and V are those without.
+            around = self._seen(_widened(through, HALO_PX * self.samples), _widened(camera, HALO_PX))
+            detail = self.sharpener.detail(around.points, around.colours, around.shown)
+            colours = colours + detail[HALO_PX:-HALO_PX, HALO_PX:-HALO_PX]
+        tile = Tile(
+            np.zeros((*shown.shape, 3), np.uint8), np.zeros(shown.shape, np.uint8),
+            np.full(shown.shape, NO_HEIGHT, np.float32), np.full(shown.shape, NO_COUNT, np.uint16),
+        )  # fmt: skip
+        tile.colours[shown] = (colours[shown].clip(0, 1) * 255 + 0.5).astype(np.uint8)
+        tile.alpha[shown] = 255
+        if shown.any():
+            tile.heights[shown] = self.above.placement.places(seen.points)[:, 2]
+        tile.visibility[shown] = seen.counts.clip(max=NO_COUNT - 1)
+        return tile
+
+    def _seen(self, through: Camera, camera: Camera) -> _Seen:
+        """What the pixels of a camera show, each from `samples`² of those of the camera `through` which it is drawn."""
         with torch.inference_mode():
-            raster = render(self.model, camera, background=(0.0, 0.0, 0.0), depth=True)
+            raster = render(self.model, through, background=(0.0, 0.0, 0.0), depth=True)
         assert raster.median_depth is not None
         opacity = _blocks(raster.alpha.cpu().numpy(), self.samples).mean(axis=-1)
         image = raster.image.cpu().numpy()
@@ -59,32 +90,21 @@ class Surveyor:
         depth[raster.alpha.cpu().numpy() < DRAWN_ALPHA] = np.nan
         # One of the samples, not their mean: at a wall the mean is a height that nothing has.
         depth = _lower_median(_blocks(depth, self.samples))
-        return self._tile(self.above.camera(grid) if self.samples > 1 else camera, light, opacity, depth)
-
-    def _tile(
-        self, camera: Camera, light: Float[np.ndarray, "h w 3"], opacity: Float[np.ndarray, "h w"],
-        depth: Float[np.ndarray, "h w"],
-    ) -> Tile:  # fmt: skip
         shown = (opacity >= DRAWN_ALPHA) & np.isfinite(depth)
         points = camera.unproject(np.where(shown, depth, 0.0))[shown]
         counts = visibility_of(
             torch.from_numpy(points), [view.camera for view in self.above.capture.train_views]
         ).numpy()
-        heights = self.above.placement.places(points)[:, 2] if len(points) else np.zeros(0)
-        seen = counts > 0  # what no photograph shows, the model invents
-        shown[shown] = seen
-        tile = Tile(
-            np.zeros((*shown.shape, 3), np.uint8), np.zeros(shown.shape, np.uint8),
-            np.full(shown.shape, NO_HEIGHT, np.float32), np.full(shown.shape, NO_COUNT, np.uint16),
-        )  # fmt: skip
-        colours = light / np.maximum(opacity, DRAWN_ALPHA)[..., None]
-        if self.sharpener is not None and shown.any():
-            colours = self.sharpener.sharpened(points[seen], colours, shown)
-        tile.colours[shown] = (colours[shown].clip(0, 1) * 255 + 0.5).astype(np.uint8)
-        tile.alpha[shown] = 255
-        tile.heights[shown] = heights[seen]
-        tile.visibility[shown] = counts[seen].clip(max=NO_COUNT - 1)
-        return tile
+        looked_at = counts > 0  # what no photograph shows, the model invents
+        shown[shown] = looked_at
+        return _Seen(light / np.maximum(opacity, DRAWN_ALPHA)[..., None], shown, points[looked_at], counts[looked_at])
+
+
+def _widened(camera: Camera, by: int) -> Camera:
+    """The same camera with so many pixels more on every side."""
+    return replace(
+        camera, cx=camera.cx + by, cy=camera.cy + by, width=camera.width + 2 * by, height=camera.height + 2 * by
+    )
 
 
 def samples_for(gsd: float, finest: float) -> int:
