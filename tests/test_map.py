@@ -159,6 +159,19 @@ def test_files_are_cloud_optimised_and_say_what_they_are(house, make):
         assert "ellipsoidal" in file.descriptions[0]
 
 
+def test_overviews_have_no_height_between_roof_and_street_either(house, make):
+    folder = make(*house, gsd=0.03)
+    for name, nothing in (("dsm", NO_HEIGHT), ("visibility", NO_COUNT)):
+        with rasterio.open(folder / f"{name}.tif") as file:
+            whole, factors = file.read(1), file.overviews(1)
+        assert factors
+        for level in range(len(factors)):
+            with rasterio.open(folder / f"{name}.tif", overview_level=level) as file:
+                values = file.read(1)
+            assert set(np.unique(values)) <= set(np.unique(whole))
+            assert (values != nothing).mean() == pytest.approx((whole != nothing).mean(), abs=0.02)
+
+
 @pytest.mark.parametrize("samples", [1, 3])
 def test_walls_do_not_smear(house, samples):
     """No pixel has a height between ground and roof: not at an edge, not where samples are put together."""

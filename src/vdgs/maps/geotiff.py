@@ -27,7 +27,8 @@ class Layer:
     bands: tuple[str, ...]
     dtype: str
     nodata: float | None
-    #: How overviews are made: "average" for pictures and heights, "nearest" for counts.
+    #: How overviews are made: "average" for pictures, "nearest" for heights and counts: the mean of a roof and a street
+    #: is a height that nothing has.
     overviews: str
     unit: str = ""
 

@@ -128,7 +128,7 @@ def layers_of(placement: Placement) -> tuple[Layer, Layer, Layer]:
         Layer(ORTHOPHOTO, "orthophoto: colours seen from straight above", ("red", "green", "blue", "alpha"), "uint8",
               None, "average"),
         Layer(DSM, f"surface model: {placement.heights}", (f"height, {placement.heights}",), "float32", NO_HEIGHT,
-              "average", placement.unit),
+              "nearest", placement.unit),
         Layer(VISIBILITY, "V: training cameras whose picture holds the place", ("training cameras",), "uint16",
               NO_COUNT, "nearest", "cameras"),
     )  # fmt: skip
