@@ -19,6 +19,7 @@ from types import ModuleType
 from typing import Any
 
 from vdgs.doctor.check import Check
+from vdgs.memory.groups import group_limits
 
 #: What each extra adds, for people; an extra that is not listed is reported without a sentence.
 EXTRAS = {
@@ -116,22 +117,13 @@ def _threads() -> list[Check]:
 def _memory() -> list[Check]:
     import psutil
 
-    memory = psutil.virtual_memory()
-    total, free = memory.total, memory.available
-    limit = _container_limit()
-    if limit is not None and limit < total:
-        total, free = limit, min(free, limit)
-        return [Check("memory", "ok", f"{_gb(free)} free, limited to {_gb(total)} by the container")]
+    groups, memory = group_limits(), psutil.virtual_memory()
+    total = min([memory.total, *(group.limit for group in groups)])
+    free = min([memory.available, *(group.free for group in groups)])
+    if total < memory.total:
+        by = "by a control group (container, SLURM job, systemd unit)"
+        return [Check("memory", "ok", f"{_gb(free)} free, limited to {_gb(total)} {by}")]
     return [Check("memory", "ok", f"{_gb(free)} free of {_gb(total)}")]
-
-
-def _container_limit() -> int | None:
-    """The memory that a Linux control group allows, in bytes; None where it sets no limit."""
-    for file in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
-        text = _attempt(lambda file=file: Path(file).read_text().strip())  # type: ignore[misc]
-        if text and text.isdecimal():
-            return int(text)
-    return None
 
 
 def _torch() -> list[Check]:

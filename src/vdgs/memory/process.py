@@ -13,6 +13,7 @@ from pathlib import Path
 import psutil
 
 from vdgs.kernels import release_idle_memory
+from vdgs.memory.groups import group_limits, slurm_limit
 
 #: How the libraries word it: torch on the CPU (Linux, Windows), C++, OpenCV.
 OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "Insufficient memory", "CUDA out of memory")
@@ -26,21 +27,27 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def available_bytes() -> int:
-    """What this process may still take: of the machine's free memory, of its container's, of its own limit."""
-    free = [psutil.virtual_memory().available]
-    with suppress(OSError, ValueError):  # a Linux control group that sets a limit
-        group = Path("/sys/fs/cgroup")
-        free.append(int((group / "memory.max").read_text()) - _taken_by(group))
+    """What this process may still take: of the machine's free memory, of its control groups' (a container's, a SLURM
+    job's, a systemd unit's), of its own limit. Where no group limits a SLURM job, of what the job asked for."""
+    memory, groups = psutil.virtual_memory(), group_limits()
+    free = [memory.available, *(group.free for group in groups)]
+    job = slurm_limit()
+    if job is not None and all(group.limit >= memory.total for group in groups):
+        free.append(job - _taken_with_children())
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY:
         free.append(limit - psutil.Process().memory_info().vms)
     return max(0, min(free))
 
 
-def _taken_by(group: Path) -> int:
-    """Memory of a control group that is not a mere copy of files."""
-    facts = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-    return int((group / "memory.current").read_text()) - int(facts["inactive_file"])
+def _taken_with_children() -> int:
+    """Resident bytes of this process and of those that it started; what they share counts for each."""
+    process = psutil.Process()
+    taken = process.memory_info().rss
+    for child in process.children(recursive=True):
+        with suppress(psutil.Error):  # it has just ended
+            taken += child.memory_info().rss
+    return int(taken)
 
 
 def peak_memory_bytes() -> int:

@@ -1,0 +1,104 @@
+"""What Linux control groups let this process take: those of containers, of SLURM's jobs, of systemd's units.
+
+Only the standard library is imported: `vdgs doctor` looks here where other things are broken.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+#: What the kernel says of this process.
+PROCESS = Path("/proc/self")
+
+
+@dataclass(frozen=True)
+class GroupLimit:
+    """What the processes of one control group may take together, and take now, in bytes."""
+
+    limit: int
+    used: int
+
+    @property
+    def free(self) -> int:
+        return max(0, self.limit - self.used)
+
+
+def group_limits(process: Path = PROCESS) -> list[GroupLimit]:
+    """The limits on this process: of its own control group and of all above it, for each binds; [] where none is set.
+
+    Version 2 and version 1, whose limit is close to 2^63 where there is none. What Linux does not let us see (groups
+    above a container's root, a folder that is not mounted) is left out.
+    """
+    with suppress(OSError, ValueError):  # no Linux
+        groups = _groups(_own_groups((process / "cgroup").read_text()), (process / "mountinfo").read_text())
+        return [limit for folder, version in groups if (limit := _limit(folder, version)) is not None]
+    return []
+
+
+def slurm_limit(environment: Mapping[str, str] = os.environ) -> int | None:
+    """Bytes that the SLURM job asked for on this node; None outside of jobs, and where it asked for nothing.
+
+    For clusters where SLURM sets no control group a limit: it may then count what the job takes and end it.
+    """
+    if "SLURM_JOB_ID" not in environment:
+        return None
+
+    def number(name: str) -> int:
+        text = environment.get(name, "")
+        return int(text) if text.isdecimal() else 0
+
+    # Both are in MiB; 0 is all of the node.
+    mib = number("SLURM_MEM_PER_NODE") or number("SLURM_MEM_PER_CPU") * number("SLURM_CPUS_ON_NODE")
+    return mib << 20 or None
+
+
+def _own_groups(text: str) -> dict[int, str]:
+    """This process's group in the hierarchy that may limit memory, by version, as /proc/self/cgroup names it."""
+    own = dict[int, str]()
+    for line in text.splitlines():
+        number, controllers, path = line.split(":", 2)
+        if "memory" in controllers.split(","):
+            own[1] = path
+        elif number == "0" and not controllers:
+            own[2] = path
+    return own
+
+
+def _groups(own: Mapping[int, str], mounts: str) -> Iterator[tuple[Path, int]]:
+    """The folders of this process's groups, from its own up to where the hierarchy is mounted, and their version."""
+    for line in mounts.splitlines():
+        before, _, after = line.partition(" - ")
+        kind, _, options = after.split(" ", 2)
+        version = 2 if kind == "cgroup2" else 1 if kind == "cgroup" and "memory" in options.split(",") else 0
+        if version not in own:
+            continue
+        root, mounted = (_unescaped(field) for field in before.split(" ")[3:5])
+        path = PurePosixPath(own[version])
+        # Below another root (a container that shows the host's names, or only its own part): that root alone.
+        below = path.relative_to(root) if path.is_relative_to(root) and ".." not in path.parts else PurePosixPath()
+        for group in (below, *below.parents):
+            yield Path(mounted) / group, version
+
+
+def _unescaped(field: str) -> str:
+    """A path of mountinfo, which writes spaces and backslashes in octal."""
+    return re.sub(r"\\([0-7]{3})", lambda found: chr(int(found[1], 8)), field)
+
+
+def _limit(folder: Path, version: int) -> GroupLimit | None:
+    """The limit of one group; None where it has none. Copies of files that can be dropped at once do not count."""
+    names = ("memory.max", "memory.current") if version == 2 else ("memory.limit_in_bytes", "memory.usage_in_bytes")
+    # `total_`: with the groups below, as usage counts them; version 2 counts all so.
+    droppable = "inactive_file" if version == 2 else "total_inactive_file"
+    with suppress(OSError, ValueError):  # no such file (a root has no limit); "max"
+        limit, used = (int((folder / name).read_text()) for name in names)
+        with suppress(OSError, ValueError, KeyError):
+            stat = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+            used -= int(stat[droppable])
+        return GroupLimit(limit, max(0, used))
+    return None
