@@ -3,22 +3,27 @@
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from captures_support import tiny_scene, write_colmap
+from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
 from vdgs.executors import fitness
+from vdgs.executors.choosing import Machine, choose
 from vdgs.executors.crew import Policy, run_crew
 from vdgs.executors.engine import Begun, End
 from vdgs.executors.executor import Listener, Needs, Task
 from vdgs.executors.fitness import Question, examine
 from vdgs.executors.lines import Lines
-from vdgs.executors.placement import Work, by_queue, on_cluster, on_this_machine
+from vdgs.executors.placement import Work, by_queue, exceeds, on_cluster, on_this_machine
+from vdgs.memory.estimate import decoded_bytes, estimate, need_of_block
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.executors import ExecutorOptions, SlurmOptions
+from vdgs.settings.presets import PRESETS
 from vdgs.verbs import starting
 
 GB = 10**9
@@ -149,6 +154,59 @@ def test_blocks_find_room_on_a_cluster(places, blocks, jobs, each):
     room = sum(place.processors // needs.processors for place in places)
     assert needs.processors == 1 or room >= share.at_once
     assert min(each, most) <= needs.memory_bytes <= most
+
+
+works = st.builds(
+    Work, st.integers(1, 60), st.integers(10**8, 10**11), st.just(0), st.sampled_from([0.0, 0.5, 20.0]),
+    photographs_bytes=st.integers(0, 10**12),
+)  # fmt: skip
+
+
+@given(works, st.integers(1, 128), st.integers(0, 10**12))
+def test_blocks_at_once_and_their_photographs_fit_into_one_machine(work, cores, free):
+    share = on_this_machine(work, cores, free)
+    photographs = min(work.photographs_bytes, 1e9 * share.image_gb)
+    assert share.at_once == 1 or share.at_once * (work.piece_bytes + photographs) <= free + 1
+    assert share.at_once == 1 or not exceeds(work, share.at_once, free)
+    assert exceeds(replace(work, image_gb=0), 1, free) or on_this_machine(replace(work, image_gb=0), 1, free).image_gb
+
+
+def test_large_photographs_leave_room_for_fewer_blocks():
+    """Photographs of 20 MP: 3 GB for the picture of a block and 16 GB for those that are kept."""
+    large = Work(32, 3_800_000_000, photographs_bytes=10**11)
+    share = on_this_machine(large, 32, 64 * GB)
+    assert (share.at_once, share.image_gb) == (12, 16 / 12)
+    assert on_this_machine(replace(large, image_gb=40), 32, 64 * GB).at_once == 6
+    # Small ones need no quarter of the memory.
+    small = Work(32, 2 * GB, photographs_bytes=10**7)
+    assert on_this_machine(small, 32, 64 * GB).at_once == 31
+
+
+def test_two_small_blocks_fit_into_a_laptop_with_4_gb_free():
+    """`make demo`: 56 photographs of 400 x 300 pixels, four blocks; with more anchors than it has."""
+    cameras = [Camera(np.eye(4), 1, 1, 0, 0, 400, 300)] * 56
+    largest = need_of_block(PRESETS["laptop"], 100_000, 200_000, 400 * 300)
+    work = Work(4, estimate(largest).total, photographs_bytes=decoded_bytes(cameras))
+    assert on_this_machine(work, 2, 4 * GB).at_once == 2
+    assert not exceeds(work, 2, 4 * GB)
+
+
+def test_photographs_give_way_to_blocks_that_a_person_asked_for():
+    work = Work(4, 3 * GB, jobs=2, photographs_bytes=10**11)
+    assert on_this_machine(work, 4, 7 * GB).image_gb == 0.5
+    assert on_this_machine(work, 4, 6 * GB).image_gb == 0.1
+    assert [exceeds(work, 2, free) for free in (6 * GB, 7 * GB)] == [True, False]
+    assert exceeds(replace(work, image_gb=2), 2, 7 * GB)
+
+
+def test_people_are_told_what_blocks_and_their_photographs_take(question):
+    work = Work(4, 2 * GB, photographs_bytes=10**11)
+    with choose(ExecutorOptions(), work, Machine(4, 8 * GB), lambda: question) as chosen:
+        assert "a block takes at most 2.00 GB and 0.67 GB for photographs, of 8.00 GB free" in chosen.line
+        assert chosen.line.startswith("3 at once")
+        assert not chosen.notes
+    with choose(ExecutorOptions(), replace(work, jobs=4), Machine(4, 8 * GB), lambda: question) as chosen:
+        assert "4 at once may run out of memory. What helps: less --jobs" in chosen.notes[0]
 
 
 def test_what_a_person_asks_for_is_asked_of_the_cluster():

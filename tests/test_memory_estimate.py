@@ -11,6 +11,7 @@ import sys
 from dataclasses import replace
 
 import cv2
+import numpy as np
 import psutil
 import pytest
 import torch
@@ -20,6 +21,7 @@ from rich.console import Console
 
 from captures_support import tiny_scene, write_colmap
 from cli_support import entry_point, vdgs
+from vdgs.cameras import Camera
 from vdgs.memory.estimate import (
     COMPENSATED_GROWTH,
     GROWTH,
@@ -28,7 +30,9 @@ from vdgs.memory.estimate import (
     bytes_per_anchor,
     describe,
     estimate,
+    largest_picture,
     most_growth,
+    need_of_block,
 )
 from vdgs.memory.process import available_bytes, is_out_of_memory
 from vdgs.settings.method import CompensationConfig
@@ -64,6 +68,17 @@ def test_what_is_more_takes_more(need):
     for name in ("anchors", "offsets", "pixels", "images_bytes", "surroundings"):
         assert estimate(replace(need, **{name: 2 * getattr(need, name)})).total >= found.total
     assert estimate(replace(need, max_anchors=need.anchors)).total == estimate(replace(need, max_anchors=1)).total
+
+
+def test_the_picture_of_a_block_counts_in_the_largest_size_that_it_trains_with():
+    cameras = [Camera(np.eye(4), 1, 1, 0, 0, *size) for size in ((4000, 3000), (5472, 3648), (3648, 5472))]
+    assert largest_picture(cameras, ((0.0, 4), (0.1, 2), (0.4, 1))) == 5472 * 3648
+    assert largest_picture(cameras, ((0.0, 4), (0.5, 2))) == 2736 * 1824
+    paper, laptop = (need_of_block(PRESETS[name], 50_000, 400_000, 5472 * 3648) for name in ("paper", "laptop"))
+    assert estimate(laptop).picture == 150 * 5472 * 3648
+    assert (laptop.averaged, paper.averaged) == (True, False)
+    assert (laptop.grown, paper.grown) == (150_000, 750_000)
+    assert laptop.surroundings == 350_000
 
 
 def test_growth_below_a_fixed_threshold_is_expected_to_be_large():

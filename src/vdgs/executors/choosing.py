@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from vdgs.executors.executor import Executor
 from vdgs.executors.fitness import Question
 from vdgs.executors.local import LocalExecutor
-from vdgs.executors.placement import Share, Work, by_queue, on_cluster, on_this_machine
+from vdgs.executors.placement import Share, Work, by_queue, exceeds, on_cluster, on_this_machine
 from vdgs.memory.estimate import in_gb
 from vdgs.settings.executors import ExecutorOptions
 
@@ -73,15 +73,17 @@ def refuse_unreachable(asked: ExecutorOptions) -> None:
 
 def _local(work: Work, machine: Machine) -> Chosen:
     share = on_this_machine(work, machine.cores, machine.free_bytes)
+    photographs = min(work.photographs_bytes, round(1e9 * share.image_gb))
+    beside = f" and {in_gb(photographs)} for photographs" if photographs else ""
     line = (
         f"{share.at_once} at once with {share.needs.processors} thread(s) each; by estimate a {work.kind.one} takes "
-        f"at most {in_gb(work.piece_bytes)} beside its photographs, of {in_gb(machine.free_bytes)} free"
+        f"at most {in_gb(work.piece_bytes)}{beside}, of {in_gb(machine.free_bytes)} free"
     )
-    short = share.at_once * work.piece_bytes > machine.free_bytes
     note = (
         f"[yellow]warning[/] {share.at_once} at once may run out of memory. What helps: "
         f"{', '.join(('less --jobs', *work.kind.smaller))}"
     )
+    short = exceeds(work, share.at_once, machine.free_bytes)
     return Chosen(LocalExecutor(share.at_once), share, line, (note,) if short else ())
 
 

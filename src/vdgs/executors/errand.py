@@ -54,6 +54,8 @@ class Errand:
     """Memory of the largest by estimate, beside its photographs."""
     question: Callable[[], Question]
     """What machines must see; asked of other machines only."""
+    photographs_bytes: int = 0
+    """What all photographs of a piece take at most, decoded; 0 where it keeps none."""
 
     def run(self, wish: Wish, console: Console, ready: Callable[[], None] = lambda: None) -> None:
         """Do what is left; `ready` is called once machines are known to be fit, before anything starts.
@@ -62,7 +64,7 @@ class Errand:
         VdgsError where a machine of a cluster cannot do the work, before anything starts.
         """
         kind = self.kind
-        work = Work(len(self.left), self.piece_bytes, wish.jobs, wish.image_gb, kind)
+        work = Work(len(self.left), self.piece_bytes, wish.jobs, wish.image_gb, kind, self.photographs_bytes)
         machine = Machine(threads_available(), available_bytes())
         with choose(wish.where, work, machine, self.question) as chosen:
             line = f"{len(self.left)} of {self.total} {kind.many} to {kind.work}, {chosen.line}"

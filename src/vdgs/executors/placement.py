@@ -43,6 +43,8 @@ class Work:
     image_gb: float = 0.0
     """Memory for photographs that a person asked for; 0: by the memory that there is."""
     kind: Kind = BLOCKS
+    photographs_bytes: int = 0
+    """What all photographs of a piece take at most, decoded; 0 where it keeps none."""
 
 
 @dataclass(frozen=True)
@@ -55,13 +57,31 @@ class Share:
 
 
 def on_this_machine(work: Work, cores: int, free_bytes: int) -> Share:
-    """Of one machine: as many pieces at once as there are cores and memory for; photographs share one budget."""
-    at_once, threads = default_jobs(work.pieces, cores, free_bytes, work.piece_bytes)
+    """Of one machine: as many pieces at once as there are cores and memory for.
+
+    Photographs share one budget: what a person asked for, else a quarter of what is free, or less where pieces leave
+    less.
+    """
+    asked = 1e9 * work.image_gb
+    budget = asked or IMAGES_SHARE * free_bytes
+    at_once, threads = max(
+        default_jobs(work.pieces, cores, max(0, int(free_bytes - budget)), work.piece_bytes),
+        # Where all photographs take less than the budget.
+        default_jobs(work.pieces, cores, free_bytes, work.piece_bytes + work.photographs_bytes),
+    )
     if work.jobs:
         at_once = min(work.jobs, work.pieces)
         threads = max(1, cores // at_once)
-    budget = work.image_gb or free_bytes * IMAGES_SHARE / 1e9
-    return Share(at_once, Needs(threads, work.piece_bytes), budget / at_once)
+    if not asked:
+        budget = min(budget, max(1e9 * LEAST_IMAGES_GB * at_once, free_bytes - at_once * work.piece_bytes))
+    return Share(at_once, Needs(threads, work.piece_bytes), budget / 1e9 / at_once)
+
+
+def exceeds(work: Work, at_once: int, free_bytes: int) -> bool:
+    """Whether so many pieces at once may take more than one machine has free, with the least for photographs where
+    nobody asked for more."""
+    budget = 1e9 * (work.image_gb or LEAST_IMAGES_GB * at_once)
+    return at_once * work.piece_bytes + min(budget, at_once * work.photographs_bytes) > free_bytes
 
 
 def on_cluster(work: Work, places: Sequence[Place], asked: ExecutorOptions) -> Share:

@@ -5,10 +5,12 @@ The figures per anchor and per pixel are measured: `benchmarks/step.py`, docs/re
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from vdgs.settings.method import CompensationConfig
+from vdgs.cameras import Camera
+from vdgs.settings.method import CompensationConfig, MethodConfig, Resolutions, block_limit
 
 Kind = Literal["coarse", "block"]
 
@@ -26,6 +28,8 @@ GROWTH = 3.0
 #: ... where growth is compensated below a fixed T_low, under which nearly all of a real capture is (choice; blocks of
 #: seneca had 6 and 12 times as many after a ninth of the steps of preset `paper`: docs/findings.md).
 COMPENSATED_GROWTH = 15.0
+#: Share of a block's anchors that one photograph may see, for the estimate before a block is opened (choice).
+SEEN = 0.5
 #: Numbers of an anchor apart from its offsets: place, feature, log-scales.
 PLAIN_FLOATS = 3 + 32 + 6
 #: ... of which a mean of models holds all but the place, which never moves.
@@ -95,6 +99,28 @@ class Advice:
 def most_growth(config: CompensationConfig) -> float:
     """How many times their number anchors may become where nothing limits them."""
     return COMPENSATED_GROWTH if config.enabled and not config.t_low_quantile else GROWTH
+
+
+def largest_picture(cameras: Iterable[Camera], resolutions: Resolutions) -> int:
+    """Pixels of the largest photograph, at the largest size that a resolution schedule gives it."""
+    factor = min(factor for _, factor in resolutions)
+    return max((camera.width // factor) * (camera.height // factor) for camera in cameras)
+
+
+def decoded_bytes(cameras: Iterable[Camera]) -> int:
+    """What all photographs take decoded, in every size that a schedule asks for, each a quarter of the one before."""
+    return 3 * sum(camera.width * camera.height for camera in cameras) * 4 // 3
+
+
+def need_of_block(method: MethodConfig, anchors: int, of: int, pixels: int) -> Need:
+    """What training a block works on that has so many of all (`of`) coarse anchors and photographs of up to `pixels`;
+    before it is opened, and beside what photographs take. A part of a photograph may be all of it."""
+    block = method.block
+    return Need(
+        anchors=anchors, max_anchors=block_limit(block, anchors, of), offsets=method.training.anchors.offsets,
+        seen=SEEN, pixels=pixels, images_bytes=0, surroundings=of - anchors, averaged=block.average > 0,
+        growth=most_growth(block.compensation),
+    )  # fmt: skip
 
 
 def bytes_per_anchor(offsets: int, seen: float) -> float:

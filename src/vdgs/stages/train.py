@@ -6,28 +6,26 @@ import os
 import shutil
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from rich.console import Console
 
+from vdgs.cameras import Camera
 from vdgs.errors import RunError, VdgsError
 from vdgs.executors.errand import Errand, Wish
 from vdgs.executors.fitness import Question, photographs_of
 from vdgs.executors.kinds import BLOCKS
 from vdgs.executors.placement import Share
-from vdgs.memory.estimate import Need, estimate, most_growth
+from vdgs.memory.estimate import decoded_bytes, estimate, largest_picture, need_of_block
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_capture
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.executors import ExecutorOptions
-from vdgs.settings.method import block_limit
 from vdgs.settings.watching import WatchOptions
-
-#: Share of a block's anchors that one photograph may see, for the estimate before a block is opened (choice).
-SEEN = 0.5
 
 
 def train_blocks(
@@ -56,10 +54,12 @@ def train_blocks(
         if not left:
             console.print(f"{path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
             return
+        views = open_capture(run).train_views
+        cameras, files = [view.camera for view in views], [run.config_file, run.coarse.model, *photographs_of(views)]
         errand = Errand(
             BLOCKS, run.path / "blocks", len(blocks), left, run.block,
-            lambda index, share, device: _command(run, index, share, options, device), _block_bytes(run),
-            lambda: _question(run),
+            lambda index, share, device: _command(run, index, share, options, device), _block_bytes(run, cameras),
+            lambda: Question(run.path, files), photographs_bytes=decoded_bytes(cameras),
         )  # fmt: skip
 
         def ready() -> None:
@@ -70,11 +70,6 @@ def train_blocks(
         wish = Wish(where or ExecutorOptions(), jobs, options.image_memory_gb, device)
         errand.run(wish, console, ready)
     console.print(f"blocks trained in {(time.monotonic() - began) / 60:.1f} min", highlight=False)
-
-
-def _question(run: RunFolder) -> Question:
-    """What a machine must see: the run, its coarse model and its photographs."""
-    return Question(run.path, [run.config_file, run.coarse.model, *photographs_of(open_capture(run).train_views)])
 
 
 def _command(run: RunFolder, index: int, share: Share, options: WatchOptions, device: str) -> list[str]:
@@ -118,14 +113,9 @@ def _remove_beyond(run: RunFolder, count: int, console: Console) -> None:
             shutil.rmtree(folder.path)
 
 
-def _block_bytes(run: RunFolder) -> int:
-    """Memory by estimate that the largest block needs for the program, its anchors once they have grown, and those
-    around it. Photographs have a budget of their own."""
+def _block_bytes(run: RunFolder, cameras: Sequence[Camera]) -> int:
+    """Memory by estimate that the largest block needs for the program, its picture, its anchors once they have grown,
+    and those around it. Photographs that are kept have a budget of their own."""
     method, anchors = run.method(), [each.anchors_core for each in run.partition_record().blocks]
-    limit = block_limit(method.block, max(anchors), sum(anchors))
-    need = Need(
-        anchors=max(anchors), max_anchors=limit, offsets=method.training.anchors.offsets,
-        seen=SEEN, pixels=0, images_bytes=0, surroundings=sum(anchors) - max(anchors),
-        growth=most_growth(method.block.compensation),
-    )  # fmt: skip
-    return estimate(need).total
+    pixels = largest_picture(cameras, method.block.resolutions)
+    return estimate(need_of_block(method, max(anchors), sum(anchors), pixels)).total

@@ -8,7 +8,18 @@ import numpy as np
 import psutil
 from rich.console import Console
 
-from vdgs.memory.estimate import Advice, Kind, Need, advice, describe, estimate, in_gb, most_growth
+from vdgs.memory.estimate import (
+    Advice,
+    Kind,
+    Need,
+    advice,
+    decoded_bytes,
+    describe,
+    estimate,
+    in_gb,
+    largest_picture,
+    most_growth,
+)
 from vdgs.memory.process import available_bytes
 from vdgs.model.render import visible_rows
 from vdgs.training import Stage, TrainingState
@@ -23,19 +34,17 @@ def need_of(state: TrainingState, stage: Stage) -> Need:
     """What this training works on."""
     config, count = stage.config, stage.image_count
     cameras = [stage.images.camera(view) for view in range(count)]
-    pixels = [camera.width * camera.height for camera in cameras]
     chosen = np.unique(np.linspace(0, count - 1, min(count, VIEWS_COUNTED)).astype(int))
     anchors = state.anchors
     seen = [len(visible_rows(anchors, cameras[view])) for view in chosen]
-    # Every size that the resolution schedule asks for, each a quarter of the one before.
-    photographs = 3 * sum(pixels) * 4 // 3
+    photographs = decoded_bytes(cameras)
     growing = config.growth.levels > 0 and state.iteration <= config.growth.until * config.iterations
     return Need(
         anchors=len(anchors),
         max_anchors=config.growth.max_anchors if growing else len(anchors),
         offsets=anchors.offsets.shape[1],
         seen=max(seen) / max(len(anchors), 1),
-        pixels=max(pixels),
+        pixels=largest_picture(cameras, config.resolutions),
         images_bytes=min(photographs, getattr(stage.images, "budget_bytes", photographs)),
         surroundings=0 if stage.surroundings is None else len(stage.surroundings.anchors),
         averaged=config.average > 0,
