@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,14 +15,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.affinity import translate
 
+from vdgs.cameras import Camera
 from vdgs.captures.capture import GroundFrame
 from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.errors import RunError, VdgsError
-from vdgs.memory.estimate import Need, estimate
 from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks, save_blocks_wgs84
 from vdgs.partition.boundary import alpha_shape, widen
 from vdgs.partition.cut import choose_block_count, cut_scene
-from vdgs.settings.method import PartitionConfig
+from vdgs.runs.folder import RunFolder
+from vdgs.settings.method import BlockConfig, MethodConfig, PartitionConfig
+from vdgs.settings.presets import PRESETS
+from vdgs.stages.train import _block_bytes
 
 
 def town(n: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -237,35 +242,56 @@ def test_fewer_blocks_than_asked_for_are_said_with_the_reason() -> None:
 
 
 def test_the_number_of_blocks() -> None:
-    auto = PartitionConfig(blocks="auto")
-    assert choose_block_count(10**6, 500, 10**6, PartitionConfig(blocks=3)) == 3
-    assert choose_block_count(10**6, 500, 10**6, PartitionConfig(blocks=3, blocking=False)) == 1
-    assert [choose_block_count(10**5, cameras, 10**6, auto) for cameras in (33, 145, 400, 5000)] == [1, 1, 1, 1]
+    def count(anchors: int, cameras: int, **settings: Any) -> int:
+        method = replace(PRESETS["laptop"], partition=PartitionConfig(**settings))
+        return choose_block_count(anchors, cameras, 10**6, method)
+
+    assert count(10**6, 500, blocks=3) == 3
+    assert count(10**6, 500, blocks=3, blocking=False) == 1
+    assert [count(10**5, cameras, blocks="auto") for cameras in (33, 145, 400, 5000)] == [1, 1, 1, 1]
     # Memory asks for 20 blocks or so, photographs allow fewer.
-    tight = PartitionConfig(blocks="auto", block_memory_gb=3.0)
-    assert [choose_block_count(2 * 10**6, cameras, 10**6, tight) for cameras in (33, 145, 400)] == [1, 2, 8]
-    by_memory = [
-        choose_block_count(2 * 10**6, 5000, 10**6, PartitionConfig(blocks="auto", block_memory_gb=gb))
-        for gb in (2.5, 3, 4, 8, 64)
-    ]
+    few = [count(2 * 10**6, cameras, blocks="auto", block_memory_gb=3.0) for cameras in (33, 145, 400)]
+    assert few == [1, 2, 8]
+    by_memory = [count(2 * 10**6, 5000, blocks="auto", block_memory_gb=gb) for gb in (2.5, 3, 4, 8, 64)]
     assert by_memory == sorted(by_memory, reverse=True)
     assert by_memory[0] > by_memory[-1] == 1
 
 
-@pytest.mark.parametrize("offsets", [10, 32])
-@pytest.mark.parametrize("anchors", [10**6, 2 * 10**6, 25 * 10**5])
-def test_a_block_by_memory_fits_into_it(anchors: int, offsets: int) -> None:
-    gb = 3e-6 * anchors * (1 if offsets == 10 else 2.2)
-    auto = PartitionConfig(blocks="auto", block_memory_gb=gb)
-    count = choose_block_count(anchors, 50_000, 10**6, auto, offsets)
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize(("offsets", "pixels"), [(10, 10**6), (32, 10**6), (10, 2 * 10**7)])
+@pytest.mark.parametrize("limits", [{}, {"max_anchors": 15 * 10**5}, {"max_anchors_total": 2 * 10**6}])
+def test_a_block_by_memory_takes_at_most_that_in_training(
+    preset: str, offsets: int, pixels: int, limits: dict[str, int]
+) -> None:
+    """By the estimate of the stage that trains it: its growth, its limits of anchors, its mean, its picture."""
+    anchors, gb = 10**6, 1 + 150e-9 * pixels + 1.3 * offsets / 10
+    method = PRESETS[preset]
+    growth = replace(method.block.growth, max_anchors=limits.get("max_anchors", 0))
+    block = replace(method.block, growth=growth, max_anchors_total=limits.get("max_anchors_total", 0))
+    training = replace(method.training, anchors=replace(method.training.anchors, offsets=offsets))
+    partition = PartitionConfig(blocks="auto", block_memory_gb=gb)
+    method = MethodConfig(training, partition, method.assignment, block)
+    count = choose_block_count(anchors, 50_000, pixels, method)
     assert 1 < count < 1000
 
     def taken(blocks: int) -> int:
-        need = Need(-(-anchors // blocks), 0, offsets, 0.5, 10**6, 0, surroundings=anchors, averaged=True)
-        return estimate(need).total
+        own = [SimpleNamespace(anchors_core=anchors // blocks)] * blocks
+        run = SimpleNamespace(method=lambda: method, partition_record=lambda: SimpleNamespace(blocks=own))
+        return _block_bytes(cast(RunFolder, run), [Camera(np.eye(4), 1, 1, 0, 0, pixels // 1000, 1000)])
 
-    assert taken(count) <= 1.001e9 * gb
-    assert taken(count - 1) > 0.999e9 * gb
+    assert taken(count) <= 1e9 * gb < 1.001 * taken(count - 1)
+
+
+def test_more_growth_asks_for_more_blocks_and_limits_of_anchors_for_fewer() -> None:
+    auto, paper = PartitionConfig(blocks="auto"), PRESETS["paper"]
+
+    def count(block: BlockConfig) -> int:
+        return choose_block_count(10**6, 50_000, 10**6, MethodConfig(partition=auto, block=block))
+
+    plain = replace(paper.block, compensation=replace(paper.block.compensation, enabled=False))
+    limited = replace(paper.block, max_anchors_total=10**6)
+    assert count(paper.block) > count(plain) > count(limited)
+    assert count(replace(plain, average=0.5)) > count(plain)
 
 
 # ----------------------------------------------------------------------------------------------- shapes

@@ -18,18 +18,18 @@ from vdgs.captures.images import ImageCache
 from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import read_reconstruction
 from vdgs.errors import VdgsError
-from vdgs.executors.pieces import default_jobs
+from vdgs.executors.placement import Work, exceeds, on_this_machine
 from vdgs.kernels import threads as threads_available
-from vdgs.memory.estimate import GROWTH, Need, estimate, in_gb, most_growth
+from vdgs.memory.estimate import GROWTH, decoded_bytes, estimate, in_gb, largest_picture, need_of_block
 from vdgs.memory.process import available_bytes
-from vdgs.partition.cut import SEEN, choose_block_count
+from vdgs.partition.cut import choose_block_count
 from vdgs.runs.beginning import reads_otherwise, run_settings
 from vdgs.runs.config_file import changed_options
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.standing import RunStanding, standing_of
 from vdgs.runs.stereo import room_for_points
 from vdgs.settings.checks import validate
-from vdgs.settings.method import MethodConfig, TrainConfig, block_limit, block_training, with_iterations
+from vdgs.settings.method import MethodConfig, TrainConfig, block_training, with_iterations
 from vdgs.settings.ranges import refuse
 from vdgs.settings.requests import RunRequest
 from vdgs.sfm.preparing import prepare, tell
@@ -58,8 +58,13 @@ class Plan:
     block_iterations: int
     """Of one block, where all have equally many photographs and no step draws a part."""
     jobs: int
+    free_bytes: int
     coarse_bytes: int
     block_bytes: int
+    photographs_bytes: int
+    """Of one block, beside `block_bytes`."""
+    is_short: bool
+    """Whether it may take more than is free."""
     coarse_seconds: tuple[float, float]
     blocks_seconds: tuple[float, float]
 
@@ -130,20 +135,19 @@ def _plan(capture: Capture, method: MethodConfig, asked: RunRequest) -> Plan:
             timed[factor] = _seconds_a_step(start(anchors, at_size, config.exposure), at_size)
     dense = room_for_points(capture) if config.anchors.stereo else 0
     need, more = replace(alone, anchors=alone.anchors + dense), GROWTH * (1 + dense / max(alone.anchors, 1))
-    camera = capture.train_views[0].camera
-    blocks = choose_block_count(need.grown, views, camera.width * camera.height, method.partition, need.offsets)
-    in_block = -(-need.grown // blocks)
-    each = estimate(
-        Need(
-            in_block, block_limit(method.block, in_block, need.grown), need.offsets, SEEN, 0, 0,
-            surroundings=need.grown - in_block, growth=most_growth(method.block.compensation),
-        )
-    ).total  # fmt: skip
-    jobs = asked.jobs or default_jobs(blocks, threads_available(), available_bytes(), each)[0]
+    cameras, free = [view.camera for view in capture.train_views], available_bytes()
+    pixels = largest_picture(cameras, method.block.resolutions)
+    blocks = choose_block_count(need.grown, views, pixels, method)
+    each = estimate(need_of_block(method, -(-need.grown // blocks), need.grown, pixels)).total
+    whole = estimate(need).total
+    photographs = decoded_bytes(cameras)
+    work = Work(blocks, each, asked.jobs, asked.watching.image_memory_gb, photographs_bytes=photographs)
+    share = on_this_machine(work, threads_available(), free)
     block = block_training(method, max(1, round(views * min(1.0, 1.5 / blocks))))
     coarse = _seconds(config, timed)
     return Plan(
-        len(anchors), dense, blocks, config.iterations, block.iterations, min(jobs, blocks), estimate(need).total, each,
+        len(anchors), dense, blocks, config.iterations, block.iterations, share.at_once, free, whole, each,
+        min(photographs, round(1e9 * share.image_gb)), whole > free or exceeds(work, share.at_once, free),
         (coarse, coarse * (1 + more) / 2),
         (blocks * _seconds(block, timed), blocks * _seconds(block, timed) * more),
     )  # fmt: skip
@@ -186,14 +190,15 @@ def _say(plan: Plan, method: MethodConfig, standing: RunStanding | None, console
         f"coarse model: {plan.anchors:,} anchors at the start{stereo}, {plan.coarse_iterations:,} iterations, at most "
         f"{in_gb(plan.coarse_bytes)}, {_times(plan.coarse_seconds)}{done('coarse')}",
         f"{blocks}{chosen}: about {plan.block_iterations:,} iterations each, {plan.jobs} at once, at most "
-        f"{in_gb(plan.block_bytes)} each beside photographs, {per_block}{done(*names)}",
-        f"memory that is free: {in_gb(available_bytes())}",
+        f"{in_gb(plan.block_bytes)} each and {in_gb(plan.photographs_bytes)} for photographs, "
+        f"{per_block}{done(*names)}",
+        f"memory that is free: {in_gb(plan.free_bytes)}",
         "Times are of training alone, from steps timed now on this machine; the larger one is with "
         f"{GROWTH:g} times as many anchors{', and with those of stereo' if plan.dense_points else ''}. Nothing was "
         "written.",
     ]
     console.print("\n".join(lines), highlight=False)
-    if max(plan.coarse_bytes, plan.jobs * plan.block_bytes) > available_bytes():
+    if plan.is_short:
         console.print(
             "[yellow]warning[/] it may run out of memory. What helps: --downscale 2, --growth.max-anchors, less --jobs",
             highlight=False,

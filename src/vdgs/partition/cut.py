@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import shapely
 from jaxtyping import Float, Int
 
 from vdgs.errors import VdgsError
-from vdgs.memory.estimate import Need, estimate
+from vdgs.memory.estimate import estimate, need_of_block
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.boundary import LEAST_CELLS, cell_size, cores_of, extent_of, widen
 from vdgs.partition.cluster import cluster, features_of, refuse_too_many
 from vdgs.partition.nearest import Cores
 from vdgs.partition.plane import principal_plane
-from vdgs.settings.method import PartitionConfig
+from vdgs.settings.method import MethodConfig, PartitionConfig
 
 #: A block that would own less than this share of the anchors of an average block is not worth training.
 LEAST_SHARE = 0.05
 
-#: What `--blocks auto` reckons with (choices): photographs that an average block needs, and the share of the anchors
-#: that one photograph sees.
+#: What `--blocks auto` reckons with (choice): photographs that an average block needs.
 CAMERAS_PER_BLOCK = 50
-SEEN = 0.5
 
 
 def cut_scene(
@@ -87,27 +84,26 @@ def _why_fewer(
     )
 
 
-def choose_block_count(
-    n_anchors: int, n_cameras: int, image_pixels: int, config: PartitionConfig, offsets: int = 10
-) -> int:
-    """The number of blocks that `config` asks for; for "auto" it follows from the scene and the memory.
+def choose_block_count(n_anchors: int, n_cameras: int, image_pixels: int, method: MethodConfig) -> int:
+    """The number of blocks that the settings ask for; for "auto" it follows from the scene and the memory.
 
-    Choice: as few as keep a block within `block_memory_gb` in training by `memory.estimate`, with the rest of the scene
-    about it and half of all anchors in view, photographs aside; but never fewer than 50 photographs for an average
-    block. Few, because blocks cost steps: of one total, each place gets fewer the more there are (docs/findings.md).
+    Choice: as few as keep an average block within `block_memory_gb` in training by `memory.estimate`, with photographs
+    of up to `image_pixels`, the rest of the scene about it and half of all anchors in view; photographs that are kept
+    aside. But never fewer than 50 photographs for an average block: where that allows too few blocks, as many as it
+    allows. Few, because blocks cost steps: of one total, each place gets fewer the more there are (docs/findings.md).
     """
+    config = method.partition
     if not config.blocking:
         return 1
     if config.blocks != "auto":
         return config.blocks
-    whole = Need(n_anchors, 0, offsets, SEEN, image_pixels, 0, surroundings=n_anchors, averaged=True)
-    fixed = estimate(replace(whole, anchors=0)).total
-    free = config.block_memory_gb * 1e9 - fixed
-    grown = estimate(whole).total - fixed
-    most = max(1, n_cameras // CAMERAS_PER_BLOCK)
-    # Where even the scene about a block does not fit, smaller blocks help as far as the photographs allow.
-    wanted = most if free <= 0 else int(np.ceil(grown / free))
-    return max(1, min(most, wanted, n_anchors))
+    most = max(1, min(n_cameras // CAMERAS_PER_BLOCK, n_anchors))
+
+    def fits(blocks: int) -> bool:
+        need = need_of_block(method, -(-n_anchors // blocks), n_anchors, image_pixels)
+        return estimate(need).total <= 1e9 * config.block_memory_gb
+
+    return next((blocks for blocks in range(1, most + 1) if fits(blocks)), most)
 
 
 def _checked(positions: np.ndarray, visibility: np.ndarray) -> Float[np.ndarray, "n 2"]:

@@ -240,7 +240,9 @@ class PartitionConfig:
     default) that decides what is drawn when cameras are assigned and nothing else: no anchor beyond the core is
     trained, however wide the ring is."""
     block_memory_gb: Annotated[float, Range(0, LARGE, above=True)] = 4.0
-    """Memory that one block may take in training, by estimate; only `--blocks auto` looks at it."""
+    """Memory that an average block may take in training, by estimate and beside the photographs that are kept; only
+    `--blocks auto` looks at it. Larger blocks take more, and so do all where more blocks would have too few photographs
+    (fifty) each."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from vdgs.executors.fitness import Question, photographs_of
 from vdgs.executors.kinds import Kind
 from vdgs.executors.placement import Share
 from vdgs.executors.work import PieceWork, at_work, clear, remove, spans_of
-from vdgs.memory.estimate import drawing_bytes
+from vdgs.memory.estimate import drawing_bytes, largest_picture
 from vdgs.memory.process import forget_peak, peak_memory_bytes
 from vdgs.partition.assignment.assign import Assignment, assign
 from vdgs.partition.assignment.saving import load_part, load_scores, save_part, save_scores
@@ -94,7 +94,7 @@ def partition_run(run: RunFolder, console: Console, device: str = "cpu", wish: W
         elif kept is not None:
             blocks, warnings = kept, list(before.warnings)
         else:
-            blocks, warnings = _cut(scene, method.partition, method.training.seed)
+            blocks, warnings = _cut(scene, method)
         sends = wish is not None and wish.sends
         clear(run.partition, work.key if sends else None)
         if wish is not None and sends:
@@ -135,15 +135,12 @@ def explain_view(run: RunFolder, view: str, console: Console) -> None:
     console.print(table)
 
 
-def _cut(scene: _Scene, config: PartitionConfig, seed: int) -> tuple[Blocks, list[str]]:
-    camera = scene.cameras[0]
-    count = choose_block_count(
-        len(scene.visibility), len(scene.cameras), camera.width * camera.height, config,
-        offsets=scene.opened.model.anchors.offsets.shape[1],
-    )  # fmt: skip
+def _cut(scene: _Scene, method: MethodConfig) -> tuple[Blocks, list[str]]:
+    config, pixels = method.partition, largest_picture(scene.cameras, method.block.resolutions)
+    count = choose_block_count(len(scene.visibility), len(scene.cameras), pixels, method)
     if config.strategy != "visibility":
         return STRATEGIES[config.strategy].cut(scene.positions, scene.cameras, count)
-    return cut_scene(scene.positions, scene.visibility, replace(config, blocks=count), seed)
+    return cut_scene(scene.positions, scene.visibility, replace(config, blocks=count), method.training.seed)
 
 
 def _spatial(scene: _Scene, config: PartitionConfig, seed: int, cut: Blocks) -> Blocks:
