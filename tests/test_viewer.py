@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,10 +18,13 @@ from captures_support import camera_at, look_down
 from merging_support import opaque_plane, quadrants
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.evaluation.exposures import as_photographed
+from vdgs.evaluation.metering import metered
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.films.path_files import load_path
 from vdgs.films.paths import look_at
 from vdgs.model.anchor_model import AnchorModel, Part
+from vdgs.model.exposure import exposure_of
 from vdgs.model.render import render
 from vdgs.partition.blocks import save_blocks
 from vdgs.runs.folder import RunFolder
@@ -46,21 +50,28 @@ def two_floors() -> AnchorModel:
     return replace(ground, anchors=type(ground.anchors)(**tensors))
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    """Nine photographs that a model of two floors has itself drawn; four blocks."""
-    folder = tmp_path_factory.mktemp("viewer")
-    model, views = two_floors(), []
+def photographed(folder: Path, model: AnchorModel, change: Callable[[int, np.ndarray], np.ndarray]) -> Scene:
+    """Nine photographs that a model has itself drawn, each changed by its number, all of them masked where a mask
+    `N.mask.png` lies beside; the last one tests."""
+    views = []
     for number, (x, y) in enumerate((x, y) for x in (-1.5, 0.0, 1.5) for y in (-1.5, 0.0, 1.5)):
         camera, file = camera_at(x, y, 4.0, 8.0, 40.0 * number), folder / f"{number}.png"
-        cv2.imwrite(str(file), to_8bit(render(model, camera).image.numpy())[..., ::-1])
-        views.append(View(file.name, camera, file, None, "test" if number == 8 else "train"))
+        cv2.imwrite(str(file), to_8bit(change(number, render(model, camera).image.numpy()))[..., ::-1])
+        mask = file.with_suffix(".mask.png")
+        views.append(View(file.name, camera, file, mask if mask.exists() else None, "test" if number == 8 else "train"))
     points = model.anchors.positions.double().numpy()
     ground = GroundFrame(1.0, np.eye(3), np.zeros(3), True, "hand-made", PLACE)
     capture = Capture(folder, "colmap", ".", tuple(views), points, np.full((len(points), 3), 99, np.uint8), ground)
     run = TrainedRun(RunFolder(folder / "run"), model, folder / "model", "merged", Status(), "key", "", capture)
     coarse = replace(run, model=opaque_plane(), name="coarse")
-    opened = Scene(run, lambda name: coarse)
+    return Scene(run, lambda name: coarse)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Nine photographs that a model of two floors has itself drawn; four blocks."""
+    folder = tmp_path_factory.mktemp("viewer")
+    opened = photographed(folder, two_floors(), lambda number, image: image)
     save_blocks(folder / "run/partition/blocks.geojson", quadrants(), [{}] * 4)
     opened.__dict__["blocks"] = quadrants()
     yield opened
@@ -112,6 +123,65 @@ def test_photographs_that_the_model_draws_itself_show_no_error_and_others_do(sce
     # The coarse model has no roof: where that is, its picture differs.
     assert np.nanmax(painter._comparison.error_in("coarse", camera, camera)) > 0.05
     assert painter.paint(replace(shown, model="coarse"), camera, camera).shape == (48, 64, 3)
+
+
+def test_an_exposure_of_the_photograph_is_no_error_of_the_model(tmp_path):
+    gains = [0.7, 1.2, 0.8, 1.25, 0.9, 1.1, 0.85, 1.2]
+    fitted = torch.tensor(gains)[:, None, None] * torch.eye(3, 4) + 0.02 * torch.tensor([0.0, 0.0, 0.0, 1.0])
+    model = two_floors()
+    model = replace(model, decoder=replace(model.decoder, exposure=fitted - torch.eye(3, 4)))
+    # What all have in common is the scene's; the test photograph is the last of the flight, exposed as the one before.
+    own = [exposure_of(fitted - torch.eye(3, 4), min(number, 7)).double() for number in range(9)]
+    scene = photographed(tmp_path, model, lambda number, image: as_photographed(image, own[number]))
+    comparison = Painter(scene)._comparison
+    for index in (0, 3, 8):
+        camera = scene.capture.views[index].camera
+        values = comparison.error_in("merged", camera, camera)
+        assert np.isfinite(values).mean() > 0.8
+        assert np.nanmax(values) < 0.01
+    scene.close()
+
+
+def test_what_is_metered_of_thinner_models_differs_little(scene):
+    """The law takes many pictures: they are drawn from as many anchors as visitors can wait for."""
+    dense = opaque_plane(spacing=0.03)
+    opened = Scene(replace(scene.run, model=dense))
+    for camera in (camera_at(0.0, 0.0, 5.0), camera_at(-1.0, 0.5, 6.0, 20.0)):
+        level, _ = opened.level("merged", camera, 5_000)
+        assert len(level.model.anchors) < len(dense.anchors) / 4
+        whole, thin = (metered(render(each, camera).image.clamp(0, 1).numpy()) for each in (dense, level.model))
+        assert abs(whole - thin) < 0.03
+
+
+def test_what_is_masked_in_the_photograph_is_no_error_of_the_model(tmp_path):
+    mask = np.full((48, 64), 255, np.uint8)
+    mask[10:30, 20:50] = 0
+    cv2.imwrite(str(tmp_path / "4.mask.png"), mask)
+
+    def spoiled(number: int, image: np.ndarray) -> np.ndarray:
+        return np.where(mask[..., None] > 0, image, 1.0 - image)
+
+    scene = photographed(tmp_path, two_floors(), spoiled)
+    comparison = Painter(scene)._comparison
+    masked, other = (scene.capture.views[index].camera for index in (4, 0))
+    values = comparison.error_in("merged", masked, masked)
+    assert np.isnan(values[10:30, 20:50]).all()
+    assert np.nanmax(values) < 0.01
+    assert np.isfinite(values).mean() > 0.7
+    assert np.nanmax(comparison.error_in("merged", other, other)) > 0.1  # not masked: an error
+    scene.close()
+
+
+def test_a_newer_model_is_compared_anew(tmp_path):
+    model = two_floors()
+    scene = photographed(tmp_path, model, lambda number, image: image)
+    comparison, camera = Painter(scene)._comparison, scene.capture.views[4].camera
+    assert np.nanmax(comparison.error_in("merged", camera, camera)) < 0.01
+    # One that happens to lie where the older one lay in memory.
+    object.__setattr__(model, "anchors", opaque_plane().anchors)
+    scene.show(scene.run)
+    assert np.nanmax(comparison.error_in("merged", camera, camera)) > 0.05
+    scene.close()
 
 
 def test_two_models_stand_side_by_side(scene):

@@ -8,6 +8,7 @@ tell of that may be used: no pixel of a photograph that is compared is.
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable
 from functools import cache, cached_property
 
 import numpy as np
@@ -15,9 +16,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.order import places_in_flights
 from vdgs.evaluation.metering import SIDE_PX, Metering, learnt, metered
+from vdgs.kernels.types import Raster
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.exposure import exposed, exposure_of, interpolated, neighbours
 from vdgs.model.render import render
@@ -27,18 +30,20 @@ from vdgs.model.render import render
 SAMPLE = 64
 
 
-def exposures_of(model: AnchorModel, capture: Capture) -> Exposures | None:
+def exposures_of(
+    model: AnchorModel, capture: Capture, draw: Callable[[Camera], Raster] | None = None
+) -> Exposures | None:
     """The colour model (`model.exposure`) of any view of the capture that a model was trained on. None where training
-    fitted none."""
-    return None if model.decoder.exposure is None else Exposures(model, capture)
+    fitted none. `draw` makes the small pictures that are metered, where not the whole model shall."""
+    return None if model.decoder.exposure is None else Exposures(model, capture, draw)
 
 
 class Exposures:
     """The colour models of views: that of a training view was fitted, that of a test view is interpolated along its
     flight, and corrected for what the camera metered there."""
 
-    def __init__(self, model: AnchorModel, capture: Capture):
-        self._model = model
+    def __init__(self, model: AnchorModel, capture: Capture, draw: Callable[[Camera], Raster] | None = None):
+        self._render = draw or (lambda camera: render(model, camera))
         departures = model.decoder.exposure
         assert departures is not None, "training fitted no exposures"
         self._departures = departures.detach().to("cpu", torch.float64)
@@ -86,7 +91,7 @@ class Exposures:
         """A view in neutral colours, small."""
         shrunk = min(1.0, SIDE_PX / max(view.camera.width, view.camera.height))
         width, height = (max(1, round(shrunk * side)) for side in (view.camera.width, view.camera.height))
-        picture: np.ndarray = render(self._model, view.camera.resized(width, height)).image.clamp(0, 1).cpu().numpy()
+        picture: np.ndarray = self._render(view.camera.resized(width, height)).image.clamp(0, 1).cpu().numpy()
         return picture
 
 

@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from vdgs.cameras import Camera
 from vdgs.captures.heights import camera_height
+from vdgs.captures.images import shrink
+from vdgs.evaluation.exposures import as_photographed
 from vdgs.model.render import render
 from vdgs.viewer.scene import Scene
 
@@ -24,10 +26,10 @@ _KEPT = 6
 
 @dataclass(frozen=True, eq=False)
 class Misses:
-    """How far a model is from a photograph, in the photograph's own pixels."""
+    """How far a model, in the exposure of a photograph, is from it, in the photograph's own pixels."""
 
     camera: Camera
-    #: Mean absolute difference of the three channels, 0 to 1.
+    #: Mean absolute difference of the three channels, 0 to 1; NaN where the photograph is masked.
     error: Float[np.ndarray, "h w"]
     #: Median depth of the model; 0 where nothing is.
     depth: Float[np.ndarray, "h w"]
@@ -52,11 +54,11 @@ class Comparison:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._kept: OrderedDict[tuple[int, int], Misses] = OrderedDict()
+        self._kept: OrderedDict[tuple[int, str, int], Misses] = OrderedDict()
 
     def error_in(self, name: str, camera: Camera, whole: Camera) -> Float[np.ndarray, "h w"]:
         """The error against the photograph nearest to the `whole` view, as its part `camera` sees it; NaN where that
-        photograph does not show the place."""
+        photograph does not show the place, or is masked."""
         misses = self._misses(name, nearest_view(self._scene, whole))
         model = self._scene.model(name)
         depth = render(model, camera, depth=True).median_depth
@@ -64,20 +66,27 @@ class Comparison:
         return _carried(misses, camera, depth.cpu().numpy())
 
     def _misses(self, name: str, index: int) -> Misses:
-        model = self._scene.model(name)
-        key = (id(model), index)
+        key = (self._scene.generation, name, index)
         if key not in self._kept:
-            camera = self._scene.capture.views[index].camera.within(_COMPARED_PX)
-            photograph = picture_of(self._scene, index, camera.width, camera.height)
-            raster = render(model, camera, depth=True)
-            assert raster.median_depth is not None
-            drawn = raster.image.clamp(0, 1).cpu().numpy()
-            error = np.abs(drawn - photograph / 255.0).mean(axis=-1).astype(np.float32)
-            self._kept[key] = Misses(camera, error, raster.median_depth.cpu().numpy())
+            self._kept[key] = self._compared(name, index)
             while len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return self._kept[key]
+
+    def _compared(self, name: str, index: int) -> Misses:
+        view = self._scene.capture.views[index]
+        camera, exposures = view.camera.within(_COMPARED_PX), self._scene.exposures(name)
+        photograph = shrink(self._scene.photographs.get(index), camera.width, camera.height)
+        raster = render(self._scene.model(name), camera, depth=True)
+        assert raster.median_depth is not None
+        drawn = raster.image.cpu().numpy()
+        if exposures is not None:
+            drawn = as_photographed(drawn, exposures(view))
+        error = np.abs(drawn.clip(0, 1) - photograph.image.numpy() / 255.0).mean(axis=-1).astype(np.float32)
+        if photograph.mask is not None:
+            error[photograph.mask.numpy() == 0] = np.nan
+        return Misses(camera, error, raster.median_depth.cpu().numpy())
 
 
 def _carried(misses: Misses, camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -15,7 +15,9 @@ from torch import Tensor
 from vdgs.cameras import Camera
 from vdgs.captures.images import ImageCache
 from vdgs.errors import VdgsError
+from vdgs.evaluation.exposures import Exposures, exposures_of
 from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.render import render
 from vdgs.partition.blocks import Blocks, places_of
 from vdgs.placing.placement import Placement
 from vdgs.runs.cut import blocks_of
@@ -26,6 +28,9 @@ from vdgs.viewer.thinning import Level, Levels
 ModelChoice = Literal["coarse", "merged"]
 #: Photographs kept in memory, decoded (choice).
 _PHOTOGRAPH_BYTES = 128 << 20
+#: What a camera meters is drawn from at most about so many anchors (choice): the law of it takes up to two hundred
+#: pictures, and all visitors wait meanwhile.
+_METERED_ANCHORS = 10_000
 
 
 class Scene:
@@ -39,6 +44,7 @@ class Scene:
         self._seen: dict[str, Tensor] = {}
         self._tints: dict[str, Tensor] = {}
         self._levels: dict[str, Levels] = {}
+        self._exposures: dict[str, Exposures | None] = {}
         #: Grows with every newer model.
         self.generation = 0
 
@@ -69,7 +75,7 @@ class Scene:
         """Put a newer model in place of the one of its name."""
         self.run = run
         self._runs = {run.name: run}
-        self._seen, self._tints, self._levels = {}, {}, {}
+        self._seen, self._tints, self._levels, self._exposures = {}, {}, {}, {}
         self.generation += 1
         self.__dict__.pop("blocks", None)
 
@@ -79,6 +85,17 @@ class Scene:
             cameras = [view.camera for view in self.capture.train_views]
             self._seen[name] = visibility_of_run(self.opened(name), cameras).float()
         return self._seen[name]
+
+    def exposures(self, name: str) -> Exposures | None:
+        """The exposures that views are compared in with a model, as `vdgs eval` has them but for what is metered of
+        thinner models; None where training fitted none."""
+        if name not in self._exposures:
+            self._exposures[name] = exposures_of(
+                self.model(name),
+                self.capture,
+                lambda camera: render(self.level(name, camera, _METERED_ANCHORS)[0].model, camera),
+            )
+        return self._exposures[name]
 
     @cached_property
     def blocks(self) -> Blocks | None:
