@@ -165,10 +165,10 @@ def test_a_path_in_the_source_frame_shows_the_same(tmp_path: Path):
     np.testing.assert_allclose(scaled, 2.5 * depth, atol=1e-9)
 
 
-def test_a_path_of_nerfstudio(tmp_path: Path):
+def test_a_path_in_the_form_of_nerfstudio(tmp_path: Path):
     looking_north = np.array([[1, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3], [0, 0, 0, 1.0]])  # OpenGL: -z forward
     content = {
-        "render_width": 640, "render_height": 480, "fps": 25, "seconds": 1,
+        "frame": "source", "render_width": 640, "render_height": 480, "fps": 25, "seconds": 1,
         "camera_path": [{"camera_to_world": looking_north.ravel().tolist(), "fov": 90, "aspect": 4 / 3}] * 3,
     }  # fmt: skip
     path = load_path(write(tmp_path, content), TEMPLATE)
@@ -179,6 +179,65 @@ def test_a_path_of_nerfstudio(tmp_path: Path):
     np.testing.assert_allclose(camera.forward, [0, 1, 0], atol=1e-12)
     above, _ = camera.project(np.array([[1.0, 10, 4]]))
     assert above[0, 1] < 240
+
+
+def of_nerfstudio(motion: np.ndarray, scale: float, poses: list[np.ndarray]) -> dict[str, object]:
+    """What nerfstudio's viewer saves of cameras in the source frame: camera-to-world, OpenGL axes, moved, then their
+    places scaled."""
+    moved = [motion @ np.linalg.inv(pose) @ np.diag([1.0, -1, -1, 1]) for pose in poses]
+    for each in moved:
+        each[:3, 3] *= scale
+    return {"camera_path": [{"camera_to_world": each.ravel().tolist(), "fov": 50} for each in moved]}
+
+
+#: Where nerfstudio's frame may be said: beside camera_paths/a.json, one folder up, in the capture.
+@pytest.mark.parametrize("place", ["data/camera_paths", "data", "capture"])
+def test_a_path_of_nerfstudio_leads_back_to_the_capture(place: str, tmp_path: Path):
+    for folder in ("data/camera_paths", "capture"):
+        (tmp_path / folder).mkdir(parents=True)
+    # nerfstudio turns and moves what `applied_transform` has turned already.
+    applied, oriented = np.eye(4), np.eye(4)
+    applied[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    oriented[:3, :3] = Rotation.from_euler("xyz", [0.4, -1.1, 0.3]).as_matrix()
+    oriented[:3, 3] = [3.0, -20.0, 5.0]
+    motion, scale = oriented @ applied, 0.0125
+    said = {"transform": motion[:3].astype(np.float32).tolist(), "scale": scale}
+    (tmp_path / place / "dataparser_transforms.json").write_text(json.dumps(said))
+    poses = [look_at(np.array([x, 4.0, 30]), np.array([x, 20.0, 0])) for x in (-40.0, 0.0, 55.0)]
+    file = tmp_path / "data/camera_paths/a.json"
+    file.write_text(json.dumps(of_nerfstudio(motion, scale, poses)))
+    rotation = Rotation.from_euler("xyz", [1.2, 0.3, -0.4]).as_matrix()
+    ground = GroundFrame(2.5, rotation, np.array([10.0, -4, 7]), metric=False, how="test")
+    found = load_path(file, TEMPLATE, ground, capture=tmp_path / "capture").cameras
+    assert len(found) == 3
+    for camera, pose in zip(found, poses, strict=True):
+        assert is_rigid(camera)
+        position = np.linalg.inv(pose)[:3, 3]
+        np.testing.assert_allclose(camera.position, ground.to_ground(position[None])[0], atol=1e-3)
+        np.testing.assert_allclose(camera.camera_from_world[:3, :3], pose[:3, :3] @ rotation.T, atol=1e-6)
+
+
+def test_a_path_of_nerfstudio_without_its_frame_is_refused(tmp_path: Path):
+    content = of_nerfstudio(np.eye(4), 1.0, [look_at(np.array([0.0, 0, 9]), np.array([0.0, 1, 0]))])
+    file = write(tmp_path, content)
+    with pytest.raises(VdgsError, match=r"outputs/NAME/METHOD/DATE/dataparser_transforms.json") as caught:
+        load_path(file, TEMPLATE, capture=tmp_path / "capture")
+    assert str(file) in str(caught.value)
+    assert str(tmp_path / "capture") in str(caught.value)
+    assert '"frame": "source"' in str(caught.value)
+    for said, why in (
+        ({"transform": np.eye(4)[:3].tolist()}, "scale is None"),
+        ({"transform": np.eye(4)[:3].tolist(), "scale": 0}, "scale is 0"),
+        ({"transform": np.diag([1.0, 1, -1, 1]).tolist(), "scale": 1}, "mirrors the world"),
+        ({"scale": 1}, "transform needs a 4x4 matrix"),
+    ):
+        (tmp_path / "dataparser_transforms.json").write_text(json.dumps(said))
+        with pytest.raises(VdgsError, match=rf"dataparser_transforms.json: .*{why}"):
+            load_path(file, TEMPLATE)
+    ground = GroundFrame(2.0, np.eye(3), np.array([1.0, 0, 0]), metric=False, how="test")
+    for frame, x in (("source", 1.0), ("ground", 0.0)):
+        camera = load_path(write(tmp_path, {**content, "frame": frame}), TEMPLATE, ground).cameras[0]
+        assert camera.position[0] == pytest.approx(x)
 
 
 @pytest.mark.parametrize(
@@ -192,6 +251,7 @@ def test_a_path_of_nerfstudio(tmp_path: Path):
         ([{"position": [0, 0, 1], "look_at": [0, 0, 0], "fov_deg": 180}], "fov_deg"),
         ({"frame": "moon", "keyframes": [{}]}, "ground or source"),
         ({"camera_path": [{}]}, "camera_to_world"),
+        ({"camera_path": [{"camera_to_world": np.eye(4).tolist()}], "frame": "moon"}, "ground or source"),
         ("path", "list of key frames"),
         ({"keyframes": [{"position": [0, 0, 1], "look_at": [0, 0, 0]}], "fps": -3}, "fps is -3; it must be"),
         ({"keyframes": [{"position": [0, 0, 1], "look_at": [0, 0, 0]}], "second": 3}, "did you mean 'seconds'"),

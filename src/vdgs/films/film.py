@@ -169,7 +169,7 @@ def _cameras(asked: RenderRequest, flight: Flight) -> tuple[list[tuple[str, Came
     template = flight.cameras[0]
     length, rate = asked.seconds or paths.SECONDS, asked.fps or paths.FPS
     if asked.path is not None:
-        path = load_path(asked.path, template, flight.ground, asked.seconds or None, asked.fps or None)
+        path = load_path(asked.path, template, flight.ground, asked.seconds or None, asked.fps or None, flight.root)
     elif asked.views == "orbit":
         path = paths.orbit(flight.middle[None], flight.cameras, template, length, rate)
     else:

@@ -12,9 +12,10 @@
       ]
     }
 
-or a camera path exported by nerfstudio's viewer (`camera_path`, OpenGL cameras). `fov_deg` is the vertical angle of
-view. What a key frame leaves out of the intrinsics comes from the camera that the caller gives. What is not named here
-is a mistake, but in a file of nerfstudio's, which holds more than is of use here.
+or a camera path exported by nerfstudio's viewer (`camera_path`, OpenGL cameras): in nerfstudio's own frame, which
+dataparser_transforms.json leads back from (`films.nerfstudio`), unless it has a `frame` too. `fov_deg` is the vertical
+angle of view. What a key frame leaves out of the intrinsics comes from the camera that the caller gives. What is not
+named here is a mistake, but in a file of nerfstudio's, which holds more than is of use here.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from jaxtyping import Float
 from vdgs.cameras import Camera
 from vdgs.captures.capture import GroundFrame
 from vdgs.errors import VdgsError
+from vdgs.films.nerfstudio import frame_beside
 from vdgs.films.paths import FPS, SECONDS, CameraPath, frame_count, interpolate, look_at, rigid_at
 from vdgs.settings import requests
 from vdgs.settings.plain import suggestion
@@ -39,6 +41,7 @@ from vdgs.settings.ranges import Range
 
 #: What our own files may hold.
 _FILE_KEYS = ("frame", "seconds", "fps", "closed", "interpolate", "keyframes")
+_FRAMES = ("ground", "source")
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _SIZE = ("width", "height")
 _FRAME_KEYS = ("position", "look_at", "up", "camera_from_world", "fov_deg", *_INTRINSICS, *_SIZE)
@@ -56,25 +59,30 @@ def load_path(
     ground: GroundFrame | None = None,
     seconds: float | None = None,
     fps: float | None = None,
+    capture: Path | None = None,
 ) -> CameraPath:
     """Read a camera path (module docstring); `default` gives the size and intrinsics left out.
 
     `ground` brings paths in the source frame (and nerfstudio's) into the ground frame; `seconds` and
-    `fps` go before what the file says. Cameras come back in the ground frame (z up). Raises VdgsError naming the file,
-    the key frame and the field.
+    `fps` go before what the file says; `capture` is the folder where nerfstudio's frame is looked for last. Cameras
+    come back in the ground frame (z up). Raises VdgsError naming the file, the key frame and the field, and where
+    nerfstudio's frame is not known.
     """
     content = _read(file)
     try:
         if "camera_path" in content:
-            cameras, interpolated, source = _from_nerfstudio(content, default), False, True
+            cameras, interpolated, frame = _from_nerfstudio(content, default)
         else:
-            cameras, interpolated, source = _from_keyframes(content, default)
+            cameras, interpolated, frame = _from_keyframes(content, default)
         rate = fps or _number(content, "fps", requests.FPS) or FPS
         length = seconds or _number(content, "seconds", requests.SECONDS) or SECONDS
         closed = _flag(content, "closed", False)
     except (TypeError, ValueError, OverflowError) as error:
         raise VdgsError(f"{file}: {error}. `vdgs render --help` says under --path what a camera path holds.") from error
-    if source and ground is not None:
+    if frame == "nerfstudio":
+        known = frame_beside(file, capture)
+        cameras = [replace(each, camera_from_world=known.to_source(each.camera_from_world)) for each in cameras]
+    if frame != "ground" and ground is not None:
         cameras = [_to_ground(camera, ground) for camera in cameras]
     if interpolated or (seconds is not None and len(cameras) > 1):
         cameras = interpolate(cameras, frame_count(length, rate), closed=closed)
@@ -97,11 +105,11 @@ def _read(file: Path) -> Mapping[str, Any]:
     return content
 
 
-def _from_keyframes(content: Mapping[str, Any], default: Camera) -> tuple[list[Camera], bool, bool]:
+def _from_keyframes(content: Mapping[str, Any], default: Camera) -> tuple[list[Camera], bool, str]:
+    """The cameras, whether there shall be others between them, and the frame that they are in."""
     _know(content, _FILE_KEYS)
-    frames, frame = content.get("keyframes"), content.get("frame", "ground")
+    frames, frame = content.get("keyframes"), _frame(content, "ground")
     _require(isinstance(frames, list) and len(frames) > 0, "`keyframes` must be a list of at least one")
-    _require(frame in ("ground", "source"), f"`frame` is {frame!r}; it must be ground or source")
     cameras = []
     for number, entry in enumerate(frames or []):
         try:
@@ -109,7 +117,13 @@ def _from_keyframes(content: Mapping[str, Any], default: Camera) -> tuple[list[C
             cameras.append(_keyframe(entry, default))
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"key frame {number}: {error}") from error
-    return cameras, _flag(content, "interpolate", True) and len(cameras) > 1, frame == "source"
+    return cameras, _flag(content, "interpolate", True) and len(cameras) > 1, frame
+
+
+def _frame(content: Mapping[str, Any], default: str) -> str:
+    frame = content.get("frame", default)
+    _require(frame in (*_FRAMES, default), f"`frame` is {frame!r}; it must be {' or '.join(_FRAMES)}")
+    return str(frame)
 
 
 def _keyframe(entry: Mapping[str, Any], default: Camera) -> Camera:
@@ -138,8 +152,9 @@ def _keyframe(entry: Mapping[str, Any], default: Camera) -> Camera:
     return replace(camera, **given)  # type: ignore[arg-type]
 
 
-def _from_nerfstudio(content: Mapping[str, Any], default: Camera) -> list[Camera]:
-    """nerfstudio: camera_to_world of OpenGL cameras (+y up, +z backward), 16 numbers, vertical `fov`."""
+def _from_nerfstudio(content: Mapping[str, Any], default: Camera) -> tuple[list[Camera], bool, str]:
+    """nerfstudio: camera_to_world of OpenGL cameras (+y up, +z backward), 16 numbers, vertical `fov`; every frame is
+    there."""
     width, height = (_number(content, f"render_{name}", _SIDE) for name in _SIZE)
     size = int(width or default.width), int(height or default.height)
     entries = content["camera_path"]
@@ -154,7 +169,7 @@ def _from_nerfstudio(content: Mapping[str, Any], default: Camera) -> list[Camera
             cameras.append(_with_fov(camera, _number(entry, "fov", _FOV_DEG) or 50.0))
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"frame {number} of camera_path: {error}") from error
-    return cameras
+    return cameras, False, _frame(content, "nerfstudio")
 
 
 def _know(entry: Mapping[str, Any], keys: Sequence[str]) -> None:
