@@ -341,6 +341,24 @@ def test_the_browsers_camera_is_ours():
         navigation.camera_of(wxyz, np.zeros(3), 1.0, 0, 8)
 
 
+def test_no_canvas_is_larger_than_can_be_drawn():
+    def of(width: int, height: int) -> Camera:
+        return navigation.camera_of(np.array([1.0, 0, 0, 0]), np.zeros(3), 1.0, width, height)
+
+    most = navigation.most_pixels(1 << 40)
+    for width, height in ((1280, 800), (3840, 2160), (7680, 4320)):
+        whole = of(width, height)
+        assert navigation.drawable(whole, most) is whole
+    for width, height in ((200_000, 200_000), (200_000, 100), (1, 10**9), (20_000, 1)):
+        asked, drawn = of(width, height), navigation.drawable(of(width, height), most)
+        assert drawn.width * drawn.height <= most
+        assert max(drawn.width, drawn.height) <= 16_384
+        assert drawn.fy / drawn.height == pytest.approx(asked.fy / asked.height)  # it sees the same
+    # Little memory is left: small pictures, but pictures.
+    assert navigation.drawable(of(1280, 800), navigation.most_pixels(20_000_000)).height == 353
+    assert navigation.drawable(of(1280, 800), navigation.most_pixels(0)).width == 1
+
+
 def test_buttons_lead_where_they_say(scene):
     stand = navigation.whole_scene(scene.capture)
     whole = Camera(look_at(stand.position, stand.look_at), 500.0, 500.0, 320.0, 240.0, 640, 480)

@@ -34,12 +34,13 @@ from vdgs.films.paths import look_at
 from vdgs.model.render import render
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
+from vdgs.viewer import navigation
 from vdgs.viewer.door import Door
 from vdgs.viewer.following import newest, open_or_last_saved, standing_lines
 from vdgs.viewer.layers import Painter
 from vdgs.viewer.path_panel import PathPanel
 from vdgs.viewer.place_panel import PlacePanel
-from vdgs.viewer.serving import Viewer, free_port, serve
+from vdgs.viewer.serving import Viewer, free_port, invitation, serve
 from vdgs.viewer.studio import KEPT, Seat
 from vdgs.viewer.visitor import NAMES, Visitor
 from viewer_support import Guest, browser, open_page
@@ -297,6 +298,36 @@ def test_the_door_knows_its_own_name():
     assert guarded.refusal("/?token=ab%C3%A9", {"Host": "x"}) is not None
     assert guarded.refusal("/", {"Host": "x", "Cookie": "vdgs_view_8=abc"}) is not None
     assert guarded.refusal("/", {"Host": "x", "Cookie": 'a=b; vdgs_view_7="abc"'}) is None
+
+
+def test_others_are_told_an_address_that_they_can_use(monkeypatch):
+    monkeypatch.setattr(socket, "gethostname", lambda: "Drone-7.lab")
+    everyone = Door("0.0.0.0", "abc", 7)
+    said = "\n".join(invitation("merged model", everyone))
+    assert said.startswith("merged model: http://localhost:7/?token=abc\n")
+    assert "http://Drone-7.lab:7/?token=abc" in said
+    # Browsers write names small; the page's own socket comes with its origin.
+    own = {"Host": "drone-7.lab:7", "Origin": "http://drone-7.lab:7"}
+    assert everyone.refusal("/?token=abc", own) is None
+    assert everyone.refusal("/", {**own, "Cookie": "vdgs_view_7=abc"}) is None
+    assert everyone.refusal("/", own) is not None
+    assert everyone.refusal("/?token=abc", {**own, "Origin": "http://evil.example"}) is not None
+    # The address that was asked for is everyone's; nobody else can open that of this machine alone.
+    for door in (Door("192.168.1.5", "abc", 7), Door("127.0.0.1", None, 7)):
+        assert door.address_elsewhere() is None
+        assert "Drone-7" not in "\n".join(invitation("merged model", door))
+    monkeypatch.setattr(socket, "gethostname", lambda: "localhost.localdomain")
+    assert everyone.address_elsewhere() is None
+    assert "IP address in place of localhost" in "\n".join(invitation("merged model", everyone))
+
+
+@quiet
+def test_a_canvas_that_is_too_large_is_drawn_smaller(viewer, monkeypatch):
+    monkeypatch.setattr(navigation, "MOST_PX", 320 * 240)
+    guest = Guest(viewer.door.address())
+    guest.stand(above(width=200_000, height=150_000))
+    guest.sees(expected(viewer, above()))
+    guest.close()
 
 
 def test_ports_and_hosts_that_cannot_be_used_are_said_before_any_work(run):

@@ -28,14 +28,12 @@ from vdgs.runs.flight import Flight, flight_of, kept_flight
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import OpenedModel, open_capture, open_model
 from vdgs.settings.ranges import refuse
-from vdgs.settings.requests import LARGEST_SIDE_PX, RenderRequest
+from vdgs.settings.requests import BYTES_PER_PIXEL, LARGEST_SIDE_PX, RenderRequest
 from vdgs.storage.files import write_array
 from vdgs.watching.interrupts import stop_if_asked
 
 #: Pace of a film of separate views.
 SLIDES_PER_SECOND = 2.0
-#: What drawing takes at most of memory for each pixel: the raster, its depth, pictures made of it.
-BYTES_PER_PIXEL = 100
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,8 @@ BINS = Range(1, 100)
 SECONDS, FPS = Range(0, 86_400), Range(0, 1000)
 #: The longest side of a picture that is drawn, in pixels: more than any film and any screen holds.
 LARGEST_SIDE_PX = 16_384
+#: What drawing takes at most of memory for each pixel: the raster, its depth, pictures made of it.
+BYTES_PER_PIXEL = 100
 #: Frames of one film: nearly two hours at 30 a second.
 MOST_FRAMES = 200_000
 

@@ -8,6 +8,7 @@ token of the printed address, which the browser keeps as a cookie.
 from __future__ import annotations
 
 import hmac
+import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
@@ -15,6 +16,8 @@ from urllib.parse import parse_qs, urlsplit
 
 #: Names of the loopback address.
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
+#: Hosts that stand for all addresses of this machine.
+ALL = ("", "0.0.0.0", "::")
 
 
 @dataclass(frozen=True)
@@ -32,8 +35,16 @@ class Door:
         return f"vdgs_view_{self.port}"
 
     def address(self) -> str:
-        """What to open in a browser."""
-        name = self.host if self.host not in ("", "0.0.0.0", "::") else "localhost"
+        """What to open in a browser on this machine."""
+        return self._address("localhost" if self.host in ALL else self.host)
+
+    def address_elsewhere(self) -> str | None:
+        """What to open on another machine, by the name of this one, where `address` does not do there; None where it
+        does, where no other machine can come in, and where this one has no name."""
+        name = socket.gethostname()
+        return self._address(name) if self.host in ALL and name.partition(".")[0] not in ("", "localhost") else None
+
+    def _address(self, name: str) -> str:
         name = f"[{name}]" if ":" in name else name
         return f"http://{name}:{self.port}/" + (f"?token={self.token}" if self.token else "")
 

@@ -11,11 +11,14 @@ from jaxtyping import Float
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
 from vdgs.captures.overview import overview
+from vdgs.settings.requests import BYTES_PER_PIXEL, LARGEST_SIDE_PX
 
 #: Nearer to straight down than this, the direction on the map no longer follows from where one looks.
 _STEEP = 0.995
 #: How far a view from straight above is tilted, so that it knows which way is north.
 _TILT = 1e-3
+#: No canvas has more pixels: those of a screen of 8K (choice).
+MOST_PX = 7680 * 4320
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +48,21 @@ def camera_of(wxyz: np.ndarray, position: np.ndarray, fov: float, width: int, he
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ place
     focal = 0.5 * height / math.tan(0.5 * fov)
     return Camera(pose, focal, focal, width / 2, height / 2, width, height)
+
+
+def most_pixels(free: int) -> int:
+    """How many pixels a visitor's picture may have where so many bytes of memory are free."""
+    return max(1, min(MOST_PX, free // BYTES_PER_PIXEL))
+
+
+def drawable(camera: Camera, most: int) -> Camera:
+    """The same view no larger than can be drawn, `most` pixels and `LARGEST_SIDE_PX` a side: the browser enlarges what
+    comes. The very camera where it is no larger."""
+    pixels, longest = camera.width * camera.height, max(camera.width, camera.height)
+    scale = min((most / pixels) ** 0.5, LARGEST_SIDE_PX / longest)
+    if scale >= 1.0:
+        return camera
+    return camera.resized(max(1, int(scale * camera.width)), max(1, int(scale * camera.height)))
 
 
 def _matrix_of(wxyz: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:

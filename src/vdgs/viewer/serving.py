@@ -26,7 +26,7 @@ from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import TrainedRun
 from vdgs.settings.requests import ViewRequest
 from vdgs.viewer import navigation
-from vdgs.viewer.door import Door, is_loopback
+from vdgs.viewer.door import ALL, Door, is_loopback
 from vdgs.viewer.following import newest, open_or_last_saved, standing_lines
 from vdgs.viewer.scene import Scene
 from vdgs.viewer.studio import Studio
@@ -58,14 +58,25 @@ def view_run(asked: ViewRequest, console: Console, opened: Callable[[str], None]
     # captures has set a handler of its own.
     ending = contextlib.suppress(KeyboardInterrupt, Interrupted)
     with ending, stop_requests(interrupts=True), serve(run, asked.host, asked.port, console) as viewer:
-        console.print(f"{run.line}: {viewer.door.address()}", highlight=False, soft_wrap=True)
-        if viewer.door.token:
-            console.print("Whoever has this address can see the scene. Ctrl-C ends it.", highlight=False)
-        else:
-            console.print("Only this machine can open it (--host lets others in). Ctrl-C ends it.", highlight=False)
+        for line in invitation(run.line, viewer.door):
+            console.print(line, highlight=False, soft_wrap=True)
         if opened is not None:
             opened(viewer.door.address())
         _until_asked(viewer, asked, console)
+
+
+def invitation(scene: str, door: Door) -> list[str]:
+    """What to say once a scene can be opened: where, and by whom."""
+    lines = [f"{scene}: {door.address()}"]
+    if not door.token:
+        return [*lines, "Only this machine can open it (--host lets others in). Ctrl-C ends it."]
+    elsewhere = door.address_elsewhere()
+    if elsewhere is not None:
+        lines.append(f"from other machines: {elsewhere}")
+        lines.append("Where they do not know that name, write this machine's IP address in its place.")
+    elif door.host in ALL:
+        lines.append("From other machines, write this machine's IP address in place of localhost.")
+    return [*lines, "Whoever has this address can see the scene. Ctrl-C ends it."]
 
 
 @dataclass(eq=False)

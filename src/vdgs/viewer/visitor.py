@@ -15,6 +15,7 @@ from vdgs.cameras import Camera
 from vdgs.captures.heights import camera_height
 from vdgs.captures.overview import FOV_DEG
 from vdgs.errors import VdgsError
+from vdgs.memory.process import available_bytes
 from vdgs.viewer import navigation, overlays
 from vdgs.viewer.layers import LAYERS, Layer, Painter, Shown
 from vdgs.viewer.navigation import Stand
@@ -44,6 +45,8 @@ class Visitor:
         self._lock = threading.RLock()
         self._shown = Shown(model=scene.names[0])
         self._camera: Camera | None = None
+        # Found once: with another limit at every move, a camera that rests would seem to be another one.
+        self._most_px = navigation.most_pixels(available_bytes())
         self._arrived = False
         self._legend_of: object = None
         self.painter = Painter(scene)
@@ -59,7 +62,7 @@ class Visitor:
 
     @property
     def camera(self) -> Camera | None:
-        """Where they are, at the size of their canvas."""
+        """Where they are, at the size of their canvas, or the largest that is drawn."""
         return self._camera
 
     @property
@@ -128,6 +131,7 @@ class Visitor:
             )
         except (ValueError, AssertionError):  # a canvas that is just being laid out
             return
+        camera = navigation.drawable(camera, self._most_px)
         with self._lock:
             if self._camera is not None and is_same(camera, self._camera):
                 return  # the browser tells again what we know: the camera rests
