@@ -6,8 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from cli_support import PATIENCE_SECONDS, entry_point, vdgs
+from vdgs import verbs
 from vdgs.cli import HELP, VERBS, main
 from vdgs.verbs.shared import as_typed, open_console
 
@@ -27,8 +29,6 @@ def test_help_imports_nothing_heavy(arguments):
 
 
 def test_every_verb_is_in_the_help_and_has_an_action():
-    from vdgs import verbs
-
     for verb in VERBS:
         assert f"  {verb} " in HELP
         assert callable(getattr(verbs, verb))
@@ -81,6 +81,25 @@ def test_quiet_leaves_what_a_person_must_know(capsys):
         said = capsys.readouterr()
         assert said.out.replace("warning it may run out of memory\n", "") == heard
         assert "warning it may run out of memory" in said.out + said.err
+
+
+@pytest.mark.parametrize(
+    ("verb", "does"), [("report", "vdgs.report.write_report"), ("map", "vdgs.maps.mapping.map_run")]
+)
+def test_verbs_that_show_a_result_can_be_quiet(verb, does, monkeypatch, capsys):
+    def done(*given: object) -> Path:
+        for console in (each for each in given if isinstance(each, Console)):
+            console.print("how it goes")
+            console.print("[yellow]note[/] what a person must know")
+        return Path("result")
+
+    monkeypatch.setattr(does, done)
+    getattr(verbs, verb)(["run"])
+    assert capsys.readouterr().out.startswith({"report": "report: result", "map": "how it goes"}[verb])
+    getattr(verbs, verb)(["run", "--quiet"])
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err in ("", "note what a person must know\n")
 
 
 def test_the_command_that_is_kept_works_in_every_folder(tmp_path, monkeypatch):

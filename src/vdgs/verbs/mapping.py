@@ -28,6 +28,8 @@ class MapArguments(MapRequest):
     cluster as many as it has room for."""
     piece: Annotated[int | None, Range(0, 10_000)] = None
     """Only draw this piece of the tiles, in this process: what is sent out."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
     where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
@@ -40,10 +42,10 @@ def map(arguments: list[str]) -> None:
         from vdgs.maps.pieces import map_piece
 
         stop_when_parent_dies()
-        map_piece(replace(asked, device=device), asked.piece, open_console())
+        map_piece(replace(asked, device=device), asked.piece, open_console(asked.quiet))
         return
     from vdgs.executors.errand import Wish
     from vdgs.maps.mapping import map_run
 
     asked.where.check()
-    map_run(replace(asked, device=device), open_console(), Wish(asked.where, asked.jobs, device=device))
+    map_run(replace(asked, device=device), open_console(asked.quiet), Wish(asked.where, asked.jobs, device=device))

@@ -102,6 +102,8 @@ class ReportArguments:
 
     run: Positional[Path]
     """Run folder."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
 
 
 def report(arguments: list[str]) -> None:
@@ -109,7 +111,7 @@ def report(arguments: list[str]) -> None:
     from vdgs.report import write_report
     from vdgs.runs.folder import RunFolder
 
-    open_console().print(f"report: {write_report(RunFolder(asked.run))}", highlight=False)
+    open_console(asked.quiet).print(f"report: {write_report(RunFolder(asked.run))}", highlight=False)
 
 
 @dataclass(frozen=True)
