@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from dataclasses import replace
 
 import cv2
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from vdgs.cameras import Camera
+from vdgs.errors import VdgsError
 from vdgs.stereo import Cell, StereoInputs, StereoView, dense, dense_points, depth_of_pair, partners
 from vdgs.stereo.dense import SIZES, SPACING
 from vdgs.stereo.rectification import Rectified
@@ -225,6 +228,16 @@ def test_every_step_is_told_and_may_stop_the_work(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         dense_points(inputs, Cell(0.6, 0.0), tmp_path, stop)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_is_said_before_anything_is_matched(tmp_path, monkeypatch):
+    def full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(VdgsError, match=r"need .* GB there for a while \(No space left on device\). Free some space"):
+        points_of(flight(), tmp_path)
     assert not list(tmp_path.iterdir())
 
 

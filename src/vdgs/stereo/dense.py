@@ -6,22 +6,28 @@ ones would hold the noise of depths there, and nobody can bear so many.
 
 from __future__ import annotations
 
+import math
+import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int64, UInt8
 from scipy.spatial import cKDTree
 
 from vdgs.cameras import Camera
+from vdgs.errors import VdgsError
+from vdgs.model.groups import Groups
 from vdgs.stereo.matching import AGREEMENT, StereoView, depth_of
-from vdgs.stereo.partners import partners
+from vdgs.stereo.partners import held_by, partners
+from vdgs.storage.files import remedy
 
 #: Photographs are matched at this longest side, and enlarged at most by so much: steps of a sixteenth of a column tell
 #: depth better in larger pictures (choice).
@@ -106,15 +112,17 @@ def dense_points(
 
     `scratch` is a folder for a file of depths, gone afterwards: memory grows with the place, not with how many
     photographs show it. `tell(done, of)` is called in this thread after each photograph, once for matching and once for
-    confirming. Deterministic, whatever `threads`; raises what `read` raises.
+    confirming. Deterministic, whatever `threads`; raises what `read` raises, and VdgsError where the disk has no room.
     """
     cameras = [_matched_size(camera) for camera in inputs.cameras]
-    others = partners(inputs.cameras, inputs.places)
-    views = lru_cache(HELD)(lambda index: _view(inputs, cameras[index], index))
+    others, groups = partners(inputs.cameras, inputs.places), Groups.of(torch.from_numpy(inputs.points))
+    views = lru_cache(HELD)(lambda index: _view(inputs, groups, cameras[index], index))
     width, height = max(each.width for each in cameras), max(each.height for each in cameras)
     steps, of = iter(range(1, 2 * len(cameras) + 1)), 2 * len(cameras)
     with tempfile.TemporaryFile(dir=scratch) as file, ThreadPoolExecutor(max(1, threads)) as pool:
-        depths = np.memmap(file, np.float16, "w+", shape=(len(cameras), height, width))
+        shape = (len(cameras), height, width)
+        _reserve(file, 2 * math.prod(shape), scratch)
+        depths = np.memmap(file, np.float16, "r+", shape=shape)
 
         def match(index: int) -> None:
             if others[index]:
@@ -131,6 +139,20 @@ def dense_points(
     return _fused(found, cell)
 
 
+def _reserve(file: IO[bytes], size: int, folder: Path) -> None:
+    """Make a file so large with room on its disk: where a mapped file finds none, the system kills the process."""
+    try:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
+        else:
+            file.truncate(size)
+    except OSError as error:
+        raise VdgsError(
+            f"{folder}: depths of stereo need {size / 1e9:.2g} GB there for a while ({error.strerror}). "
+            f"{remedy(error)}, then run the same command again."
+        ) from error
+
+
 def _told(cells: Iterator[_Cells], steps: Iterator[int], of: int, tell: Callable[[int, int], None]) -> Iterator[_Cells]:
     for each in cells:
         tell(next(steps), of)
@@ -143,7 +165,7 @@ def _matched_size(camera: Camera) -> Camera:
     return camera.resized(max(1, round(zoom * camera.width)), max(1, round(zoom * camera.height)))
 
 
-def _view(inputs: StereoInputs, camera: Camera, index: int) -> StereoView:
+def _view(inputs: StereoInputs, groups: Groups, camera: Camera, index: int) -> StereoView:
     """A photograph grey, at the size at which it is matched."""
     picture, _ = inputs.read(index)
     small = camera.width < picture.shape[1]
@@ -151,7 +173,7 @@ def _view(inputs: StereoInputs, camera: Camera, index: int) -> StereoView:
         cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (camera.width, camera.height),
         interpolation=cv2.INTER_AREA if small else cv2.INTER_CUBIC,
     )  # fmt: skip
-    _, depth = camera.project(inputs.points[inputs.cameras[index].sees(inputs.points)])
+    _, depth = camera.project(inputs.points[held_by(inputs.cameras[index], inputs.points, groups)])
     near, far = np.quantile(depth, QUANTILES) if len(depth) else (1.0, 1.0)
     return StereoView(camera, grey, float(near) * (1 - MARGIN), float(far) * (1 + MARGIN))
 

@@ -11,10 +11,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int32, Int64
+from jaxtyping import Float, Int32, Int64
 from scipy.spatial import cKDTree
 
 from vdgs.cameras import Camera
+from vdgs.model.groups import Groups
 from vdgs.model.visibility import visibility_of
 
 #: So many others for each photograph.
@@ -32,9 +33,10 @@ LEAST_SERVED = 0.01
 
 def partners(cameras: Sequence[Camera], places: Float[np.ndarray, "n 3"], count: int = PARTNERS) -> list[list[int]]:
     """For each camera up to `count` others that see places of its picture from elsewhere, best first; none for one that
-    shows hardly any. `places` are those of the whole flight, roughly. Deterministic; O(cameras x places)."""
+    shows hardly any. `places` are those of the whole flight, roughly. Deterministic."""
     views = visibility_of(torch.from_numpy(places), cameras).numpy()
-    shown = [_speakers(camera.sees(places), views) for camera in cameras]
+    groups = Groups.of(torch.from_numpy(places))
+    shown = [_speakers(held_by(camera, places, groups), views) for camera in cameras]
     centres = np.stack([camera.position for camera in cameras])
     seen = [index for index, mine in enumerate(shown) if len(mine) >= LEAST_SPEAKERS]
     found: list[list[int]] = [[] for _ in cameras]
@@ -52,9 +54,14 @@ def partners(cameras: Sequence[Camera], places: Float[np.ndarray, "n 3"], count:
     return found
 
 
-def _speakers(shown: Bool[np.ndarray, " n"], views: Int32[np.ndarray, " n"]) -> Int64[np.ndarray, " s"]:
+def held_by(camera: Camera, places: Float[np.ndarray, "n 3"], groups: Groups) -> Int64[np.ndarray, " s"]:
+    """The places, of which `groups` are made, in a camera's picture, ascending; without a look at all of them."""
+    near = groups.about(camera).numpy()
+    return np.asarray(near[camera.sees(places[near])])
+
+
+def _speakers(rows: Int64[np.ndarray, " n"], views: Int32[np.ndarray, " m"]) -> Int64[np.ndarray, " s"]:
     """At most `SPEAKERS` of the rows that are shown, each as likely as it is seldom seen."""
-    rows = np.flatnonzero(shown)
     if len(rows) <= SPEAKERS:
         return rows
     upto = np.cumsum(1.0 / views[rows])
