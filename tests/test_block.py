@@ -107,6 +107,19 @@ def test_the_ramp_falls_from_core_to_boundary():
     torch.testing.assert_close(mobility(at), expected, atol=0.02, rtol=0)
 
 
+def test_the_ramp_falls_into_a_hole_as_it_does_outwards():
+    """Outskirts lie around a dense centre."""
+    middle = shapely.Point(0, 0)
+    outskirts = Block(middle.buffer(20, 64).difference(middle.buffer(12, 64)),
+                      middle.buffer(25, 64).difference(middle.buffer(7, 64)))  # fmt: skip
+    mobility = ramp(
+        Blocks((outskirts, Block(middle.buffer(12, 64), middle.buffer(14, 64)))), 0, BlockConfig(ring="ramp")
+    )
+    assert mobility is not None
+    at = torch.tensor([[15.0, 0, 0], [10.75, 0, 0], [0, 9.5, 0], [-8.25, 0, 0], [6.5, 0, 0]])
+    torch.testing.assert_close(mobility(at), torch.tensor([1.0, 0.75, 0.5, 0.25, 0.0]), atol=0.02, rtol=0)
+
+
 def test_ground_that_the_block_owns_beyond_its_boundary_moves_in_full():
     bent = shapely.union(shapely.box(-10, -10, 10, -6), shapely.box(-10, -10, -6, 10))
     blocks = Blocks((Block(bent, bent.buffer(1)), Block(shapely.box(20, 20, 30, 30), shapely.box(19, 19, 31, 31))))

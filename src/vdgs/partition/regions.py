@@ -7,6 +7,7 @@ Frozen around the core are the ring out to the widened boundary and, as context,
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 
 import numpy as np
 import shapely
@@ -70,17 +71,21 @@ def ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], 
     low, high = np.array(block.expanded.bounds[:2]), np.array(block.expanded.bounds[2:])
     centres = (np.indices((RAMP_CELLS, RAMP_CELLS)).reshape(2, -1).T + 0.5) / RAMP_CELLS * (high - low) + low
     points = shapely.points(centres)
-    inwards, outwards = shapely.distance(block.core, points), shapely.distance(block.expanded.exterior, points)
+    inwards, outwards = shapely.distance(block.core, points), shapely.distance(block.expanded.boundary, points)
     share = np.where(shapely.contains(block.expanded, points), outwards / np.maximum(inwards + outwards, 1e-12), 0.0)
     share = np.where(blocks.owner(centres) == index, 1.0, share)
-    table = torch.from_numpy(share.astype(np.float32).reshape(RAMP_CELLS, RAMP_CELLS))
-    origin, cell = torch.from_numpy(low), torch.from_numpy((high - low) / RAMP_CELLS)
+    made = share.astype(np.float32).reshape(RAMP_CELLS, RAMP_CELLS), low, (high - low) / RAMP_CELLS
+
+    @cache
+    def on(device: torch.device) -> list[Tensor]:
+        return [torch.from_numpy(each).to(device) for each in made]
 
     def rate_mask(positions: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
+        table, origin, cell = on(positions.device)
         cells: Int64[Tensor, "p 2"] = ((positions[:, :2].double() - origin) / cell).floor().long()
         inside = ((cells >= 0) & (cells < RAMP_CELLS)).all(1)
         cells = cells.clamp(0, RAMP_CELLS - 1)
         # What the block moves beyond the table it owns.
-        return torch.where(inside, table[cells[:, 0], cells[:, 1]], torch.ones(()))
+        return torch.where(inside, table[cells[:, 0], cells[:, 1]], 1.0)
 
     return rate_mask
