@@ -19,6 +19,7 @@ from vdgs.cameras import Camera
 from vdgs.captures.capture import GroundFrame
 from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.errors import RunError, VdgsError
+from vdgs.partition import cluster
 from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks, save_blocks_wgs84
 from vdgs.partition.boundary import alpha_shape, widen
 from vdgs.partition.cut import choose_block_count, cut_scene
@@ -189,6 +190,24 @@ def test_balanced_blocks_hold_about_equally_many_anchors() -> None:
         assert np.abs(sizes * count / len(positions) - 1).max() < 0.1
         plain = np.bincount(owners(cut(positions, views, count, lambda_vis=0.0), positions))
         assert np.ptp(sizes) < np.ptp(plain)
+
+
+@pytest.mark.parametrize(("count", "digits"), [(1, 9), (2, 9), (5, 9), (5, 1)])
+def test_weights_of_balanced_clusters_are_those_of_a_look_at_all_costs_in_each_step(count: int, digits: int) -> None:
+    """Ties too, among features that were rounded."""
+    features = np.round(np.random.default_rng(count).normal(size=(60 * count, 3)), digits)
+    squares = cluster._squares(features, features[:count])
+    share, weights = 60, np.zeros(count)
+    for _ in range(cluster.BALANCED_SWEEPS * count):
+        costs = squares - weights
+        sizes = np.bincount(costs.argmin(axis=1), minlength=count)
+        worst = int(np.abs(sizes - share).argmax())
+        if abs(sizes[worst] - share) <= 1:
+            break
+        costs[:, worst] = np.inf
+        margins = np.sort(squares[:, worst] - costs.min(axis=1))
+        weights[worst] = (margins[share - 1] + margins[share]) / 2
+    assert np.array_equal(cluster._balance(squares, np.zeros(count)), weights - weights.mean())
 
 
 def test_anchors_that_cannot_be_cut_are_refused() -> None:

@@ -25,6 +25,8 @@ MOST_COMPARED = 5_000
 
 #: Balanced clusters: anchors fitted to (at least, and for each cluster), Lloyd rounds, sweeps over the weights.
 BALANCED_FITTED, BALANCED_FITTED_EACH = 30_000, 4_000
+#: ... and at most so many distances from them to centres.
+BALANCED_DISTANCES = 100_000_000
 BALANCED_ROUNDS, BALANCED_SWEEPS = 30, 10
 BALANCED_TOLERANCE = 0.01
 #: Distances from features to centres that are in memory at once.
@@ -54,7 +56,8 @@ def cluster(features: Float[np.ndarray, "n 3"], count: int, seed: int, balanced:
     centres = _fit(_thinned(features, FITTED), count, seed)
     weights = np.zeros(count)
     if balanced:
-        sample = _thinned(features, max(BALANCED_FITTED, BALANCED_FITTED_EACH * count))
+        most = min(max(BALANCED_FITTED, BALANCED_FITTED_EACH * count), max(BALANCED_DISTANCES // count, count))
+        sample = _thinned(features, most)
         centres, weights = _fit_balanced(sample, centres)
     return _nearest(features, centres, weights)
 
@@ -115,16 +118,24 @@ def _balance(squares: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " co
     In its step a centre takes the weight at which exactly its share prefers it to the best of the others.
     """
     n, count = squares.shape
-    share, weights = n // count, weights.copy()
+    share, weights, columns = n // count, weights.copy(), np.asfortranarray(squares)
+    costs = squares - weights
+    labels, least = costs.argmin(axis=1), costs.min(axis=1)
     for _ in range(BALANCED_SWEEPS * count):
-        costs = squares - weights
-        sizes = np.bincount(costs.argmin(axis=1), minlength=count)
+        sizes = np.bincount(labels, minlength=count)
         worst = int(np.abs(sizes - share).argmax())
         if abs(sizes[worst] - share) <= max(BALANCED_TOLERANCE * share, 1):
             break
+        # One weight changes: all costs are looked at again only of features that prefer its centre.
+        own = np.flatnonzero(labels == worst)
+        costs = squares[own] - weights
         costs[:, worst] = np.inf
-        margins = np.partition(squares[:, worst] - costs.min(axis=1), [share - 1, share])
+        labels[own], least[own] = costs.argmin(axis=1), costs.min(axis=1)  # now the best of the others everywhere
+        margins = np.partition(columns[:, worst] - least, [share - 1, share])
         weights[worst] = (margins[share - 1] + margins[share]) / 2
+        cost = columns[:, worst] - weights[worst]
+        joins = (cost < least) | ((cost == least) & (worst < labels))
+        labels[joins], least[joins] = worst, cost[joins]
     return weights - weights.mean()
 
 
