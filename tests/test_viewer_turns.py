@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import CancelledError
+
 import numpy as np
 import pytest
 
@@ -229,6 +231,16 @@ def test_one_visitors_trouble_is_theirs_alone(studio):
     studio.step()
     with pytest.raises(ZeroDivisionError):
         future.result()
+
+
+def test_nobody_waits_for_errands_of_a_studio_that_closes(studio):
+    studio, _ = studio
+    before = studio.errand(lambda: 3)
+    studio.close()
+    after = studio.errand(lambda: 4)
+    for future in (before, after):
+        with pytest.raises(CancelledError):
+            future.result(timeout=0)
 
 
 def test_a_small_canvas_is_drawn_once(studio):

@@ -19,7 +19,7 @@ from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -104,7 +104,7 @@ class Studio:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._seats: list[Seat] = []
-        self._errands: deque[Callable[[], None]] = deque()
+        self._errands: deque[tuple[Future[Any], Callable[[], None]]] = deque()
         self._full_pictures: OrderedDict[Hashable, np.ndarray] = OrderedDict()
         self._changed = threading.Condition()
         self._closed = False
@@ -134,7 +134,8 @@ class Studio:
             self._changed.notify()
 
     def errand(self, do: Callable[[], _Result]) -> Future[_Result]:
-        """Something else that needs the kernels: done next, in the thread that draws."""
+        """Something else that needs the kernels: done next, in the thread that draws; cancelled once the studio closes,
+        so that nobody waits for what does not come."""
         future: Future[_Result] = Future()
 
         def run() -> None:
@@ -144,14 +145,20 @@ class Studio:
                 future.set_exception(error)
 
         with self._changed:
-            self._errands.append(run)
-            self._changed.notify()
+            if self._closed:
+                future.cancel()
+            else:
+                self._errands.append((future, run))
+                self._changed.notify()
         return future
 
     def close(self) -> None:
-        """Let `run` return."""
+        """Let `run` return. Errands that have not begun are cancelled."""
         with self._changed:
             self._closed = True
+            for future, _ in self._errands:
+                future.cancel()
+            self._errands.clear()
             self._changed.notify()
 
     def run(self) -> None:
@@ -184,7 +191,7 @@ class Studio:
     def step(self) -> float | None:
         """Do one piece of work. Returns 0 if there may be more, else seconds until there will be; None: not known."""
         with self._changed:
-            errand = self._errands.popleft() if self._errands else None
+            errand = self._errands.popleft()[1] if self._errands else None
             now = self._clock()
             seat = None if errand else self._next(now)
             quick = seat is not None and seat.quick_due

@@ -192,7 +192,7 @@ class Visitor:
         except VdgsError as error:
             self.notify("This cannot be shown", str(error))
         except CancelledError:
-            pass
+            pass  # the studio closes: nobody is there to be told
         return None
 
     # ------------------------------------------------------------------------------------- the panel
