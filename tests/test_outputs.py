@@ -49,8 +49,10 @@ def test_inputs_of_any_capture_are_known_without_reading_it(root: Path, inside: 
 
 @pytest.mark.parametrize("beside", ["", "run", "renders/images", "images_by_me", "undistorted/images", "film.mp4"])
 def test_other_places_in_a_capture_are_free(root: Path, beside: str) -> None:
-    refuse_in_a_capture(root / beside)
-    refuse_among_inputs(root / beside, load_capture(root))
+    before, capture = contents(root), load_capture(root)
+    refuse_in_a_capture(root / beside)  # raises nothing
+    refuse_among_inputs(root / beside, capture)
+    assert contents(root) == before  # nor makes what it was asked about
 
 
 def test_relative_names_and_links_lead_to_the_same_folder(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,12 +35,11 @@ from vdgs.model.render import render
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
 from vdgs.viewer import navigation
-from vdgs.viewer.door import Door
 from vdgs.viewer.following import newest, open_or_last_saved, standing_lines
 from vdgs.viewer.layers import Painter
 from vdgs.viewer.path_panel import PathPanel
 from vdgs.viewer.place_panel import PlacePanel
-from vdgs.viewer.serving import Viewer, free_port, invitation, serve
+from vdgs.viewer.serving import Viewer, free_port, serve
 from vdgs.viewer.studio import KEPT, Seat
 from vdgs.viewer.visitor import NAMES, Visitor
 from viewer_support import Guest, browser, open_page
@@ -90,7 +89,7 @@ def expected(viewer: Viewer, camera: Camera) -> np.ndarray:
 def test_a_visitor_sees_the_true_model(viewer, guest):
     for camera in (above(), above(1.0, 0.5), above(0.0, 0.0, 480, 300)):
         guest.stand(camera)
-        guest.sees(expected(viewer, camera))
+        guest.assert_sees(expected(viewer, camera))
 
 
 @quiet
@@ -183,7 +182,7 @@ def test_visitors_that_vanish_are_forgotten(viewer):
         guest.vanish()
     camera = above(0.3, 0.2)
     guests[3].stand(camera)
-    guests[3].sees(expected(viewer, camera))
+    guests[3].assert_sees(expected(viewer, camera))
     guests[3].close()
     wait_until(lambda: not viewer.visitors)
     assert not viewer.studio._seats
@@ -224,7 +223,7 @@ def test_a_photograph_lies_over_the_model_until_one_leaves(viewer, guest):
     assert visitor.shown.photograph == 0
     guest.stand(taken)
     wait_until(lambda: np.allclose(visitor.camera.position, taken.position))
-    guest.sees(visitor.painter.paint(visitor.shown, visitor.camera, visitor.camera))
+    guest.assert_sees(visitor.painter.paint(visitor.shown, visitor.camera, visitor.camera))
     guest.stand(above(0.3))
     wait_until(lambda: visitor.shown.photograph is None)
 
@@ -283,50 +282,12 @@ def test_others_need_the_token(run):
         guest.close()
 
 
-def test_the_door_knows_its_own_name():
-    alone = Door("127.0.0.1", None, 8080)
-    for host in ("localhost:8080", "127.0.0.1:9", "[::1]:8080", "LOCALHOST"):
-        assert alone.refusal("/", {"Host": host}) is None
-    for host in ("", "localhost.evil.example", "evil.example:8080", "[", "127.0.0.1.evil.example"):
-        assert alone.refusal("/", {"Host": host}) is not None
-    assert alone.refusal("/", {"Host": "localhost:8080", "Origin": "http://localhost:8080"}) is None
-    assert alone.refusal("/", {"Host": "localhost:8080", "Origin": "http://localhost:9999"}) is not None
-    assert alone.refusal("/", {"Host": "localhost:8080", "Origin": "null"}) is not None
-    assert Door("0.0.0.0", "abc", 7).address() == "http://localhost:7/?token=abc"
-    guarded = Door("0.0.0.0", "abc", 7)
-    assert guarded.refusal("/?token=abc", {"Host": "x"}) is None
-    assert guarded.refusal("/?token=ab%C3%A9", {"Host": "x"}) is not None
-    assert guarded.refusal("/", {"Host": "x", "Cookie": "vdgs_view_8=abc"}) is not None
-    assert guarded.refusal("/", {"Host": "x", "Cookie": 'a=b; vdgs_view_7="abc"'}) is None
-
-
-def test_others_are_told_an_address_that_they_can_use(monkeypatch):
-    monkeypatch.setattr(socket, "gethostname", lambda: "Drone-7.lab")
-    everyone = Door("0.0.0.0", "abc", 7)
-    said = "\n".join(invitation("merged model", everyone))
-    assert said.startswith("merged model: http://localhost:7/?token=abc\n")
-    assert "http://Drone-7.lab:7/?token=abc" in said
-    # Browsers write names small; the page's own socket comes with its origin.
-    own = {"Host": "drone-7.lab:7", "Origin": "http://drone-7.lab:7"}
-    assert everyone.refusal("/?token=abc", own) is None
-    assert everyone.refusal("/", {**own, "Cookie": "vdgs_view_7=abc"}) is None
-    assert everyone.refusal("/", own) is not None
-    assert everyone.refusal("/?token=abc", {**own, "Origin": "http://evil.example"}) is not None
-    # The address that was asked for is everyone's; nobody else can open that of this machine alone.
-    for door in (Door("192.168.1.5", "abc", 7), Door("127.0.0.1", None, 7)):
-        assert door.address_elsewhere() is None
-        assert "Drone-7" not in "\n".join(invitation("merged model", door))
-    monkeypatch.setattr(socket, "gethostname", lambda: "localhost.localdomain")
-    assert everyone.address_elsewhere() is None
-    assert "IP address in place of localhost" in "\n".join(invitation("merged model", everyone))
-
-
 @quiet
 def test_a_canvas_that_is_too_large_is_drawn_smaller(viewer, monkeypatch):
     monkeypatch.setattr(navigation, "MOST_PX", 320 * 240)
     guest = Guest(viewer.door.address())
     guest.stand(above(width=200_000, height=150_000))
-    guest.sees(expected(viewer, above()))
+    guest.assert_sees(expected(viewer, above()))
     guest.close()
 
 
@@ -402,7 +363,7 @@ def test_a_run_that_trains_is_shown_as_it_was_saved_last(run, viewer, guest, tmp
     viewer.tell(standing_lines(RunFolder(run)))
     shown = viewer.scene.run
     viewer.show(last)
-    guest.sees(expected(viewer, camera))
+    guest.assert_sees(expected(viewer, camera))
     viewer.show(shown)
     for _ in guest.messages():  # words and pictures take turns
         if "**coarse** done" in guest.text():

@@ -91,7 +91,7 @@ class Guest:
                 return picture
         raise AssertionError("no full picture came")
 
-    def sees(self, expected: np.ndarray) -> None:
+    def assert_sees(self, expected: np.ndarray) -> None:
         """Look until a picture comes that is the expected one but for what JPEG loses."""
         for picture in self.pictures():
             if picture.shape == expected.shape and np.abs(picture.astype(int) - expected).mean() < 3:
