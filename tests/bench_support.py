@@ -11,10 +11,10 @@ from rich.console import Console
 
 from captures_support import tiny_scene, write_colmap
 from cli_support import threads_as_before
-from vdgs.bench.bench import BenchSettings, run_bench
-from vdgs.bench.plan import Choices
-from vdgs.bench.results import Result
-from vdgs.bench.worker import Job, work
+from experiments.bench.bench import BenchSettings, run_bench
+from experiments.bench.plan import Choices
+from experiments.bench.results import Result
+from experiments.bench.worker import Job, work
 from vdgs.executors.executor import Listener, Outcome, Task
 
 

@@ -42,7 +42,7 @@ GLANCE_SECONDS = 0.01
 
 #: What the server imports, as far as it is there; the last ones are what commands import when they need it.
 IMPORTED = [
-    "vdgs.cli", "vdgs.verbs", "vdgs.pipeline", "vdgs.films.film", "vdgs.bench.bench", "vdgs.export.exporting",
+    "vdgs.cli", "vdgs.verbs", "vdgs.pipeline", "vdgs.films.film", "experiments.bench.bench", "vdgs.export.exporting",
     "vdgs.stages.block", "vdgs.kernels.native", "vdgs.kernels.reference", "vdgs.kernels.differentiable",
     "typeguard", "contourpy", "PIL.PngImagePlugin", "sklearn.cluster", "rasterio",
 ]  # fmt: skip
@@ -189,7 +189,7 @@ def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 def do_tasks_here() -> None:
     """Let this process do itself what it would start processes for."""
-    from vdgs.bench import bench
+    from experiments.bench import bench
     from vdgs.executors import choosing
 
     bench.LocalExecutor = choosing.LocalExecutor = CommandsHere  # type: ignore[assignment,misc]

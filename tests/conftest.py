@@ -27,7 +27,10 @@ from jaxtyping import install_import_hook
 if TYPE_CHECKING:
     from sfm_support import Flight
 
-PACKAGE = Path(__file__).parents[1] / "src" / "vdgs"
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "vdgs"
+#: Beside the package, and checked as it is. What is archived in its reports is not.
+EXPERIMENTS = (ROOT / "experiments" / "baselines", ROOT / "experiments" / "bench")
 #: Memory is what limits their number on machines of many cores (about 1 GB each).
 MOST_WORKERS = 4
 
@@ -38,14 +41,19 @@ settings.register_profile("search", settings.get_profile("vdgs"), derandomize=Fa
 settings.load_profile("vdgs")
 
 
+def checked_files() -> list[Path]:
+    """The files of the package and of the experiments."""
+    return sorted(file for folder in (PACKAGE, *EXPERIMENTS) for file in folder.rglob("*.py"))
+
+
 def files_with_shapes() -> list[Path]:
-    """The files of the package that annotate shapes: where the arithmetic is."""
-    return sorted(file for file in PACKAGE.rglob("*.py") if "from jaxtyping import" in file.read_text(encoding="utf-8"))
+    """Those that annotate shapes: where the arithmetic is."""
+    return [file for file in checked_files() if "from jaxtyping import" in file.read_text(encoding="utf-8")]
 
 
 def module_name(file: Path) -> str:
-    """`vdgs.model.gaps` for src/vdgs/model/gaps.py."""
-    parts = file.relative_to(PACKAGE.parent).with_suffix("").parts
+    """`vdgs.model.gaps` for src/vdgs/model/gaps.py, `experiments.bench.seen` for experiments/bench/seen.py."""
+    parts = file.relative_to(PACKAGE.parent if file.is_relative_to(PACKAGE) else ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from captures_support import tiny_scene, write_colmap
-from vdgs.bench.plan import Choices, make_plan
+from experiments.bench.plan import Choices, make_plan
 from vdgs.runs.beginning import begin_run
 from vdgs.runs.folder import RunFolder
 from vdgs.settings.capture import CaptureOptions

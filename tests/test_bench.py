@@ -13,12 +13,12 @@ import pytest
 from rich.console import Console
 
 from cli_support import begun, is_free, vdgs, wait_until
+from experiments.bench import bench
+from experiments.bench.bench import BenchSettings, run_bench
+from experiments.bench.grids import bounds_of
+from experiments.bench.plan import Choices
+from experiments.bench.seen import seen_by_frusta, seen_truly
 from forking import start_tasks
-from vdgs.bench import bench
-from vdgs.bench.bench import BenchSettings, run_bench
-from vdgs.bench.grids import bounds_of
-from vdgs.bench.plan import Choices
-from vdgs.bench.seen import seen_by_frusta, seen_truly
 from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
 from vdgs.settings.capture import CaptureOptions

@@ -9,15 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bench_support import InThisProcess, benched, write_data
-from vdgs.bench import bench
-from vdgs.bench.explicit import gaussians_config
-from vdgs.bench.measure import GROUPS_FILE
-from vdgs.bench.notes import notes_of
-from vdgs.bench.plan import Choices, make_plan
-from vdgs.bench.results import Result
-from vdgs.comparators.gaussians import watching as gaussian_watching
-from vdgs.comparators.gaussians.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS, scheduled
-from vdgs.comparators.gaussians.training import GaussiansConfig
+from experiments.baselines.gs3d import session as gaussian_session
+from experiments.baselines.gs3d.run import gaussians_folder
+from experiments.baselines.gs3d.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS, scheduled
+from experiments.baselines.gs3d.training import GaussiansConfig
+from experiments.bench import bench
+from experiments.bench.explicit import gaussians_config
+from experiments.bench.measure import GROUPS_FILE
+from experiments.bench.notes import notes_of
+from experiments.bench.plan import Choices, make_plan
+from experiments.bench.results import Result
 from vdgs.errors import RunError, Stopped
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
@@ -100,9 +101,9 @@ def test_alone_it_has_no_groups_and_other_settings_train_it_again(data, tmp_path
     assert (alone.state, alone.groups, alone.seen_by) == ("done", (), "")
     run = RunFolder(tmp_path / alone.folder)
     assert not (run.path / GROUPS_FILE).exists()
-    with pytest.raises(RunError, match=r"is a run of 3DGS .* pictures and figures are in .*evaluation"):
+    with pytest.raises(RunError, match="has no coarse model"):
         open_run(run.path)
-    model = run.gaussians.model
+    model = gaussians_folder(run).model
     before = model.stat().st_mtime_ns
     (run.path / "bench.json").unlink()  # measured again, not trained
     assert benched(data, tmp_path, "3dgs")["3dgs"].figures["psnr"] == alone.figures["psnr"]
@@ -114,16 +115,16 @@ def test_alone_it_has_no_groups_and_other_settings_train_it_again(data, tmp_path
 def test_a_stopped_run_continues(data, tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
     whole = benched(data, tmp_path / "whole", "3dgs")["3dgs"]
-    train = gaussian_watching.train
+    train = gaussian_session.train
 
     def half(state, stage, *, stop, after_step):
         return train(state, stage, stop=lambda: state.iteration == 20, after_step=after_step)
 
     with monkeypatch.context() as patched:
-        patched.setattr(gaussian_watching, "train", half)
+        patched.setattr(gaussian_session, "train", half)
         with pytest.raises(Stopped):
             benched(data, tmp_path / "half", "3dgs")
-    folder = RunFolder(tmp_path / "half" / whole.folder).gaussians
+    folder = gaussians_folder(RunFolder(tmp_path / "half" / whole.folder))
     assert json.loads(folder.status_file.read_text())["iteration"] == 20
     continued = benched(data, tmp_path / "half", "3dgs")["3dgs"]
     assert continued.figures["psnr"] == whole.figures["psnr"]

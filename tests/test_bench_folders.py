@@ -13,13 +13,13 @@ from rich.console import Console
 
 from bench_support import InThisProcess
 from captures_support import tiny_scene, write_colmap
-from vdgs.bench import bench
-from vdgs.bench.bench import BenchSettings, run_bench
-from vdgs.bench.definitions import Budget
-from vdgs.bench.folders import budget_for, scenes_of
-from vdgs.bench.plan import Choices, make_plan
-from vdgs.bench.results import Result
-from vdgs.bench.scenes import LAPTOP_BUDGET, SCENES
+from experiments.bench import bench
+from experiments.bench.bench import BenchSettings, run_bench
+from experiments.bench.definitions import Budget
+from experiments.bench.folders import budget_for, scenes_of
+from experiments.bench.plan import Choices, make_plan
+from experiments.bench.results import Result
+from experiments.bench.scenes import LAPTOP_BUDGET, SCENES
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.method import with_iterations

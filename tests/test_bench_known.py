@@ -9,10 +9,10 @@ import pytest
 from rich.console import Console
 
 from bench_support import InThisProcess, write_data
-from vdgs.bench.bench import BenchSettings, run_bench
-from vdgs.bench.known import left_to_train, on_the_same_pixels, read_known
-from vdgs.bench.plan import Choices, make_plan
-from vdgs.bench.results import Result
+from experiments.bench.bench import BenchSettings, run_bench
+from experiments.bench.known import left_to_train, on_the_same_pixels, read_known
+from experiments.bench.plan import Choices, make_plan
+from experiments.bench.results import Result
 from vdgs.errors import VdgsError
 
 pytestmark = pytest.mark.xdist_group("bench known")
@@ -40,8 +40,8 @@ def there(data, tmp_path_factory) -> Path:
     """The results of a bench on another machine."""
     output = tmp_path_factory.mktemp("known") / "there"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("vdgs.bench.bench.LocalExecutor", InThisProcess)
-        patch.setattr("vdgs.bench.origin.origin", lambda threads: "1999-12-31, another machine")
+        patch.setattr("experiments.bench.bench.LocalExecutor", InThisProcess)
+        patch.setattr("experiments.bench.origin.origin", lambda threads: "1999-12-31, another machine")
         bench(asked(data, output))
     return output / "table2" / "results.json"
 
@@ -52,7 +52,7 @@ def known_psnr(file: Path, method: str) -> float:
 
 @pytest.fixture(autouse=True)
 def here(monkeypatch) -> None:
-    monkeypatch.setattr("vdgs.bench.bench.LocalExecutor", InThisProcess)
+    monkeypatch.setattr("experiments.bench.bench.LocalExecutor", InThisProcess)
 
 
 def test_what_is_known_is_not_trained(data, there, tmp_path):

@@ -9,8 +9,8 @@ import pytest
 
 from captures_support import TinyScene, write_colmap
 from cli_support import do_tasks_here, vdgs
+from experiments.bench.scenes import SCENES
 from layouts_support import halves, write_matrixcity, write_mega_nerf
-from vdgs.bench.scenes import SCENES
 from vdgs.captures.capture import Capture
 from vdgs.captures.loading import load_capture
 from vdgs.runs.folder import RunFolder

@@ -5,20 +5,20 @@ from dataclasses import replace
 
 import pytest
 
-from vdgs.bench.definitions import Budget, Method, Scene
-from vdgs.bench.methods import METHODS
-from vdgs.bench.plan import Choices, make_plan
-from vdgs.bench.quoted import QUOTED
-from vdgs.bench.scenes import PUBLISHED, SCENES
-from vdgs.bench.tables import TABLES
-from vdgs.bench.worker import STAGES
+from experiments.bench.cli import BenchArguments
+from experiments.bench.definitions import Budget, Method, Scene
+from experiments.bench.methods import METHODS
+from experiments.bench.plan import Choices, make_plan
+from experiments.bench.quoted import QUOTED
+from experiments.bench.scenes import PUBLISHED, SCENES
+from experiments.bench.tables import TABLES
+from experiments.bench.worker import STAGES
 from vdgs.errors import VdgsError
 from vdgs.runs.keys import SINCE
 from vdgs.settings.checks import validate
 from vdgs.settings.method import block_training
 from vdgs.settings.plain import differences, to_dict
 from vdgs.settings.presets import PRESETS
-from vdgs.verbs.benching import BenchArguments
 
 
 def total_iterations(method: Method, scene: Scene) -> int:
@@ -201,7 +201,7 @@ def test_a_setting_that_came_later_leaves_older_runs_finished(monkeypatch):
 
     now = keys()
     assert len(now) > 3
-    monkeypatch.setattr("vdgs.bench.plan.to_dict", of_then)
+    monkeypatch.setattr("experiments.bench.plan.to_dict", of_then)
     assert keys() == now
 
 

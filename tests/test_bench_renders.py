@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from bench_support import InThisProcess, benched, write_data
-from vdgs.bench import bench
-from vdgs.bench.measure import evaluated
-from vdgs.bench.notes import notes_of
-from vdgs.bench.plan import Choices, make_plan
-from vdgs.bench.results import NEUTRAL, SOLIDITY
-from vdgs.bench.verdict import verdict
+from experiments.bench import bench
+from experiments.bench.measure import evaluated
+from experiments.bench.notes import notes_of
+from experiments.bench.plan import Choices, make_plan
+from experiments.bench.results import NEUTRAL, SOLIDITY
+from experiments.bench.verdict import verdict
 from vdgs.errors import VdgsError
 from vdgs.evaluation import saving
 

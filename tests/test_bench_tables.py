@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vdgs.bench.figure import draw_groups
-from vdgs.bench.grids import Cell, Grid, Row, grids_of
-from vdgs.bench.measure import group_names
-from vdgs.bench.notes import notes_of
-from vdgs.bench.plan import Choices, make_plan
-from vdgs.bench.results import Result
-from vdgs.bench.statistics import Summary, difference, marks, summarise
-from vdgs.bench.verdict import verdict
-from vdgs.bench.writing import escape_latex, escape_markdown, latex, markdown, tidy_csv
+from experiments.bench.figure import draw_groups
+from experiments.bench.grids import Cell, Grid, Row, grids_of
+from experiments.bench.measure import group_names
+from experiments.bench.notes import notes_of
+from experiments.bench.plan import Choices, make_plan
+from experiments.bench.results import Result
+from experiments.bench.statistics import Summary, difference, marks, summarise
+from experiments.bench.verdict import verdict
+from experiments.bench.writing import escape_latex, escape_markdown, latex, markdown, tidy_csv
 
 
 def test_mean_and_spread():

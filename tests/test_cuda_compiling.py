@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from cli_support import python_begun
+from experiments.microbench.cuda_resources import resources_of
 from vdgs.errors import VdgsError
 from vdgs.kernels.cuda import cache, launching, nvrtc
 from vdgs.kernels.cuda.nvrtc import CompileError, CudaUnavailable, Found, Nvrtc, Target
-from vdgs.kernels.cuda.resources import resources_of
 
 try:
     COMPILER: Nvrtc | None = nvrtc.nvrtc()

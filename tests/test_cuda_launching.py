@@ -144,8 +144,8 @@ def test_no_card_and_no_driver(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_the_benchmark_says_that_there_is_no_gpu():
-    benchmark = Path(__file__).parents[1] / "benchmarks" / "gpu.py"
-    done = subprocess.run([sys.executable, str(benchmark)], capture_output=True, text=True, timeout=120)
+    command = [sys.executable, "-m", "experiments.microbench.gpu"]
+    done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True, timeout=120)
     assert done.returncode == 2
     assert done.stderr.startswith("No GPU to measure: ")
     assert "Traceback" not in done.stderr

@@ -16,8 +16,8 @@ import pytest
 from rich.console import Console
 
 from captures_support import tiny_scene, write_colmap
+from experiments.bench.worker import Job, work
 from sfm_support import write_photograph
-from vdgs.bench.worker import Job, work
 from vdgs.captures.facts import capture_facts
 from vdgs.cli import main
 from vdgs.errors import RunError

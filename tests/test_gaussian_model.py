@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from checkerboard import Photographs
+from experiments.baselines.gs3d.density import DensityConfig, control_density, reset_logits, split
+from experiments.baselines.gs3d.model import GaussiansModel, initial_gaussians
 from vdgs.cameras import Camera
-from vdgs.comparators.gaussians.density import DensityConfig, control_density, reset_logits, split
-from vdgs.comparators.gaussians.model import GaussiansModel, initial_gaussians
 from vdgs.errors import VdgsError
 from vdgs.kernels.spherical_harmonics import view_colours
 from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows

@@ -10,13 +10,14 @@ import torch
 from rich.console import Console
 
 from checkerboard import Photographs
-from vdgs.comparators.gaussians import training as gaussian_training
-from vdgs.comparators.gaussians.density import DensityConfig
-from vdgs.comparators.gaussians.model import (
+from experiments.baselines.gs3d import training as gaussian_training
+from experiments.baselines.gs3d.density import DensityConfig
+from experiments.baselines.gs3d.model import (
     GaussiansModel,
     initial_gaussians,
 )
-from vdgs.comparators.gaussians.training import (
+from experiments.baselines.gs3d.session import train_watched
+from experiments.baselines.gs3d.training import (
     GaussianRates,
     GaussiansConfig,
     GaussiansStage,
@@ -30,7 +31,6 @@ from vdgs.comparators.gaussians.training import (
     train,
     train_step,
 )
-from vdgs.comparators.gaussians.watching import train_watched
 from vdgs.errors import TrainingDiverged, VdgsError
 from vdgs.kernels import native, set_threads, threads
 from vdgs.runs.stage_folder import StageFolder

@@ -1,9 +1,6 @@
-"""benchmarks/gpu.py without a card, so that it does not fail on its first day: all of it, on a pretended card."""
+"""The microbenchmark `gpu` without a card, so that it does not fail on its first day: all of it, on a pretended card."""
 
 from __future__ import annotations
-
-from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
@@ -11,6 +8,7 @@ import torch
 from captures_support import tiny_scene, write_colmap
 from composition_on_host import build, install
 from cuda_on_host import host_compiler
+from experiments.microbench import gpu
 from gsplat_stand_in import needs_gsplat
 from pretended_device import CARD, pretended_card
 from test_cuda_compiling import needs_nvrtc
@@ -24,20 +22,12 @@ pytestmark = [
 ]  # fmt: skip
 
 
-@pytest.fixture
-def gpu(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
-    import gpu
-
-    return gpu
-
-
 @pytest.fixture(scope="module")
 def drivers(tmp_path_factory):
     return build(tmp_path_factory.mktemp("kernels"))
 
 
-def test_all_of_it_runs_and_agrees(gpu, drivers, compiled_code, tmp_path, monkeypatch, capsys):
+def test_all_of_it_runs_and_agrees(drivers, compiled_code, tmp_path, monkeypatch, capsys):
     install(drivers, compiled_code, monkeypatch, "cuda", "")
     monkeypatch.setattr(devices, "_no_card", lambda index: "")
     monkeypatch.setattr(gpu, "TOWN_DB", 3.0)  # after eight iterations, less says nothing
@@ -59,7 +49,7 @@ def test_all_of_it_runs_and_agrees(gpu, drivers, compiled_code, tmp_path, monkey
     assert "capture: " in said.out
 
 
-def test_what_differs_or_fails_is_told_and_the_rest_goes_on(gpu, monkeypatch, capsys):
+def test_what_differs_or_fails_is_told_and_the_rest_goes_on(monkeypatch, capsys):
     machine = gpu.Machine(torch.device("cpu"), lambda: None, lambda: None, lambda: 0, (8, 6))
     for name in ("print_resources", "train_town", "print_memory"):
         monkeypatch.setattr(gpu, name, lambda *_: None)
@@ -77,12 +67,12 @@ def test_what_differs_or_fails_is_told_and_the_rest_goes_on(gpu, monkeypatch, ca
     assert "memory" in said.out
 
 
-def test_what_there_is_no_time_for_is_named(gpu, capsys):
+def test_what_there_is_no_time_for_is_named(capsys):
     machine = gpu.Machine(torch.device("cpu"), lambda: None, lambda: None, lambda: 0, (8, 6))
     assert gpu.main(["--small", "--minutes", "-1"], machine) == 0
     assert "no time was left for: parity with the processor" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("size", [float("nan"), float("inf"), 2e-4])
-def test_a_number_that_is_none_is_no_agreement(gpu, size):
+def test_a_number_that_is_none_is_no_agreement(size):
     assert not gpu.gpu_parity.Difference("decode", "", "conics", "value", size).agrees

@@ -1,7 +1,8 @@
 """Which room of the package may import which: downwards only, in no circle, and kernels through their door.
 
 A room is a folder or a module right below `src/vdgs`. All imports count, those inside functions and those for type
-checkers too: what a file names, it must be able to know.
+checkers too: what a file names, it must be able to know. `experiments/` lies outside the package and above it: its folders import
+every room, and of the package only the verb that hands over to it imports it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parents[1] / "src" / "vdgs"
+ROOT = Path(__file__).parents[1]
+PACKAGE, EXPERIMENTS = ROOT / "src" / "vdgs", ROOT / "experiments"
 
 #: Lowest first. A room imports lower layers only: neither higher ones nor the other rooms of its own.
 LAYERS: tuple[tuple[str, ...], ...] = (
@@ -29,17 +31,21 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("runs",),
     ("watching",),
     ("executors", "evaluation", "sfm"),
-    ("stages", "films", "maps", "report", "comparators", "export"),
-    ("pipeline", "planning", "doctor", "bench", "viewer"),
+    ("stages", "films", "maps", "report", "export"),
+    ("pipeline", "planning", "doctor", "viewer"),
     ("verbs",),
     ("cli",),
 )
+#: The folders of the experiments, lowest first, as the rooms of a package of its own.
+EXPERIMENT_LAYERS: tuple[tuple[str, ...], ...] = (("baselines", "microbench"), ("bench",), ("reports",))
+#: The only module of the package that may import the experiments.
+HANDS_OVER = "vdgs.verbs.experiments"
 #: What other rooms may import of a room, beside the room itself.
 DOORS: Mapping[str, tuple[str, ...]] = {
     "kernels": ("types", "constants", "operations", "devices", "moving", "rotations", "spherical_harmonics")
 }
-#: Rooms that may look behind the doors: `doctor` says what the machine can do.
-LOOKS_BEHIND = ("doctor",)
+#: Rooms that may look behind the doors: `doctor` says what the machine can do, `microbench` measures single kernels.
+LOOKS_BEHIND = ("doctor", "microbench")
 #: Rooms whose files import nothing from each other: what two stages need lies below both.
 STRANGERS = ("stages",)
 
@@ -62,15 +68,16 @@ def modules_of(package: Path) -> dict[str, Path]:
     return found
 
 
-def imports_of(package: Path) -> list[Import]:
-    """All imports inside the package, wherever in a file they stand."""
-    modules, found = modules_of(package), list[Import]()
-    for name, file in modules.items():
+def imports_of(package: Path, of: Path | None = None) -> list[Import]:
+    """All imports inside the package, or of another one `of`, wherever in a file they stand."""
+    of = of or package
+    modules, found = modules_of(of), list[Import]()
+    for name, file in modules_of(package).items():
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"), str(file))):
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 where = f"{file.relative_to(package.parent).as_posix()}:{node.lineno}"
                 within = name if file.name == "__init__.py" else name.rpartition(".")[0]
-                found += [Import(where, name, each) for each in _imported(node, within, modules, package.name)]
+                found += [Import(where, name, each) for each in _imported(node, within, modules, of.name)]
     return found
 
 
@@ -187,6 +194,15 @@ def test_rooms_import_downwards_in_no_circle_and_stages_nothing_of_each_other():
 def test_kernels_are_asked_at_their_door():
     found = past_doors(imports_of(PACKAGE))
     assert not found, "\n" + "\n".join(found)
+
+
+def test_experiments_are_the_top_floor():
+    assert unlisted(EXPERIMENTS, EXPERIMENT_LAYERS) == []
+    found = [*upwards(inside := imports_of(EXPERIMENTS), EXPERIMENT_LAYERS), *circles(inside)]
+    found += past_doors(used := imports_of(EXPERIMENTS, PACKAGE))
+    assert not found, "\n" + "\n".join(found)
+    assert len(used) > 100
+    assert {each.importer for each in imports_of(PACKAGE, EXPERIMENTS)} == {HANDS_OVER}
 
 
 @pytest.fixture

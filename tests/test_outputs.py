@@ -10,9 +10,9 @@ import pytest
 from rich.console import Console
 
 from captures_support import tiny_scene, write_colmap
+from experiments.bench.bench import BenchSettings, run_bench
+from experiments.bench.plan import Choices
 from layouts_support import write_mega_nerf
-from vdgs.bench.bench import BenchSettings, run_bench
-from vdgs.bench.plan import Choices
 from vdgs.captures.loading import load_capture
 from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
 from vdgs.errors import VdgsError

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from experiments.bench.cli import BenchArguments
 from vdgs.cli import main
 from vdgs.errors import VdgsError
 from vdgs.settings.capture import CaptureOptions
@@ -19,7 +20,6 @@ from vdgs.settings.plain import from_dict, to_dict
 from vdgs.settings.presets import PRESETS
 from vdgs.settings.ranges import Number, Range, numbers, problems, refuse
 from vdgs.synth.options import SynthOptions
-from vdgs.verbs.benching import BenchArguments
 from vdgs.verbs.captures import InspectArguments, SynthArguments
 from vdgs.verbs.exporting import ExportArguments
 from vdgs.verbs.mapping import MapArguments

@@ -11,7 +11,7 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from conftest import PACKAGE, files_with_shapes, module_name
+from conftest import checked_files, files_with_shapes, module_name
 from vdgs.captures.heights import reach
 from vdgs.evaluation.metrics import squared_error
 from vdgs.kernels import native, reference, rotations
@@ -34,7 +34,7 @@ def imports_jaxtyping(file: Path) -> bool:
 
 
 def test_every_file_that_names_shapes_is_among_the_checked():
-    assert files_with_shapes() == sorted(file for file in PACKAGE.rglob("*.py") if imports_jaxtyping(file))
+    assert files_with_shapes() == [file for file in checked_files() if imports_jaxtyping(file)]
 
 
 @pytest.mark.parametrize("name", [module_name(file) for file in files_with_shapes()])

@@ -147,7 +147,7 @@ def test_truth_is_read_back_at_the_size_in_use(capture: Path) -> None:
         np.testing.assert_array_equal(np.isnan(visibility), np.isinf(truth.depth(view.name)))
         assert np.nanmax(visibility) <= 24
         assert np.nanmean(visibility > 0) > 0.6
-        assert truth.visibility_maps(half)(small.camera).shape == (24, 32)
+        assert truth.visibility_map(small).shape == (24, 32)
     with pytest.raises(VdgsError, match="test and validation"):
         truth.visibility_map(whole.train_views[0])
     with pytest.raises(VdgsError, match="no truth"):

@@ -1,1 +1,1 @@
-"""The evidence: methods × scenes × seeds turned into tables, figures and a verdict (`vdgs bench TABLE`)."""
+"""The evidence: methods × scenes × seeds turned into tables, figures and a verdict (`python -m experiments.bench`)."""

@@ -10,6 +10,7 @@ OUTPUT/
 from __future__ import annotations
 
 import fcntl
+import os
 import sys
 import time
 import typing
@@ -21,19 +22,19 @@ from pathlib import Path
 import psutil
 from rich.console import Console
 
-from vdgs.bench.definitions import Scene
-from vdgs.bench.figure import draw_groups
-from vdgs.bench.grids import grids_of
-from vdgs.bench.known import left_to_train, on_the_same_pixels, read_known
-from vdgs.bench.measure import FRUSTA_FILE, GROUPS_FILE, measure_groups
-from vdgs.bench.notes import notes_of
-from vdgs.bench.plan import Choices, Plan, PlannedRun, make_plan
-from vdgs.bench.renders import check_renders
-from vdgs.bench.results import Result, as_json, gather
-from vdgs.bench.seen import Seen, seen_by_frusta, seen_by_model, seen_truly
-from vdgs.bench.verdict import verdict
-from vdgs.bench.worker import RECORD, Job
-from vdgs.bench.writing import latex, markdown, tidy_csv
+from experiments.bench.definitions import Scene
+from experiments.bench.figure import draw_groups
+from experiments.bench.grids import grids_of
+from experiments.bench.known import left_to_train, on_the_same_pixels, read_known
+from experiments.bench.measure import FRUSTA_FILE, GROUPS_FILE, measure_groups
+from experiments.bench.notes import notes_of
+from experiments.bench.plan import Choices, Plan, PlannedRun, make_plan
+from experiments.bench.renders import check_renders
+from experiments.bench.results import Result, as_json, gather
+from experiments.bench.seen import Seen, seen_by_frusta, seen_by_model, seen_truly
+from experiments.bench.verdict import verdict
+from experiments.bench.worker import RECORD, Job
+from experiments.bench.writing import latex, markdown, tidy_csv
 from vdgs.captures.loading import load_capture
 from vdgs.captures.outputs import refuse_among_files, refuse_in_a_capture
 from vdgs.errors import Stopped, VdgsError
@@ -162,13 +163,19 @@ def _train(
         stem = settings.output / "jobs" / run.name.replace("/", "__")
         job.write(stem.with_name(stem.name + ".json"))
         after = None if run.coarse_from is None else str(run.coarse_from.relative_to("runs"))
-        command = [sys.executable, "-m", "vdgs.bench.worker", str(stem.with_name(stem.name + ".json"))]
+        command = [sys.executable, "-m", "experiments.bench.worker", str(stem.with_name(stem.name + ".json"))]
         output = stem.with_name(stem.name + ".log")
-        tasks.append(Task(run.name, command, output, {"OMP_WAIT_POLICY": "PASSIVE"}, after=after))
+        tasks.append(Task(run.name, command, output, _environment(), after=after))
     if done:
         console.print(f"{len(done)} of {len(wanted)} runs are finished already", highlight=False)
     outcomes = LocalExecutor(settings.jobs).run(tasks, _Teller(len(tasks), console))
     return done | {outcome.name: outcome for outcome in outcomes}
+
+
+def _environment() -> dict[str, str]:
+    """Variables of a worker: `experiments` is not installed, so that the folder above it has to be named."""
+    paths = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
+    return {"OMP_WAIT_POLICY": "PASSIVE", "PYTHONPATH": os.pathsep.join(path for path in paths if path)}
 
 
 class _Teller(Lines):

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-from vdgs.bench.definitions import Budget, Change
+from experiments.bench.definitions import Budget, Change
 from vdgs.settings.method import CompensationConfig, MergeConfig, MethodConfig, PartitionStrategy
 
 #: So many cameras has each block of the factorial: every camera joins its best block, and each block is topped up to

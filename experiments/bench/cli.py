@@ -70,8 +70,8 @@ class BenchArguments:
 
 def bench(arguments: list[str]) -> None:
     asked = parse(BenchArguments, arguments, "vdgs bench")
-    from vdgs.bench.bench import BenchSettings, run_bench
-    from vdgs.bench.plan import Choices
+    from experiments.bench.bench import BenchSettings, run_bench
+    from experiments.bench.plan import Choices
 
     choices = Choices(
         asked.seeds, asked.scenes, asked.methods, asked.scale_iterations, asked.iterations_total, asked.max_anchors,

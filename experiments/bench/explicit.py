@@ -8,10 +8,10 @@ from pathlib import Path
 
 from rich.console import Console
 
+from experiments.baselines.gs3d.run import gaussians_folder, run_gaussians
+from experiments.baselines.gs3d.schedule import scheduled
+from experiments.baselines.gs3d.training import GaussiansConfig
 from vdgs.captures.capture import Capture
-from vdgs.comparators.gaussians.run import run_gaussians
-from vdgs.comparators.gaussians.schedule import scheduled
-from vdgs.comparators.gaussians.training import GaussiansConfig
 from vdgs.runs.folder import RunFolder
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import to_dict
@@ -36,5 +36,5 @@ def train_explicit(run: RunFolder, capture: Capture, lpips_weights: Path | None,
     config = gaussians_config(run.method())
     made_for = json.dumps([run.keys().coarse, to_dict(config)], sort_keys=True)
     with run.locked():
-        run.gaussians.discard_unless(hashlib.sha256(made_for.encode()).hexdigest()[:16])
+        gaussians_folder(run).discard_unless(hashlib.sha256(made_for.encode()).hexdigest()[:16])
     run_gaussians(run, capture, config, console, lpips_weights=lpips_weights)

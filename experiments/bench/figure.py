@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from vdgs.bench.grids import bounds_of
-from vdgs.bench.measure import group_names
-from vdgs.bench.plan import Plan
-from vdgs.bench.results import Result
-from vdgs.bench.statistics import Summary, summarise
+from experiments.bench.grids import bounds_of
+from experiments.bench.measure import group_names
+from experiments.bench.plan import Plan
+from experiments.bench.results import Result
+from experiments.bench.statistics import Summary, summarise
 from vdgs.figures.style import ACCENT, DPI, FAINT, INK, plain, titles
 
 #: Colours and markers of the other methods, told apart without colour too.

@@ -8,8 +8,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from vdgs.bench.definitions import Budget, Scene
-from vdgs.bench.scenes import LAPTOP_BUDGET, SCENES
+from experiments.bench.definitions import Budget, Scene
+from experiments.bench.scenes import LAPTOP_BUDGET, SCENES
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import fingerprint
 from vdgs.captures.loading import load_capture

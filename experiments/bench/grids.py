@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from vdgs.bench.definitions import Group
-from vdgs.bench.measure import group_names
-from vdgs.bench.plan import Plan
-from vdgs.bench.quoted import COLUMNS, QUOTED
-from vdgs.bench.results import Result
-from vdgs.bench.statistics import Mark, Summary, marks, summarise
+from experiments.bench.definitions import Group
+from experiments.bench.measure import group_names
+from experiments.bench.plan import Plan
+from experiments.bench.quoted import COLUMNS, QUOTED
+from experiments.bench.results import Result
+from experiments.bench.statistics import Mark, Summary, marks, summarise
 from vdgs.evaluation.by_visibility import bounds_of as named_bounds
 
 

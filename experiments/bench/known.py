@@ -12,8 +12,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from vdgs.bench.plan import Plan
-from vdgs.bench.results import Result
+from experiments.bench.plan import Plan
+from experiments.bench.results import Result
 from vdgs.errors import VdgsError
 from vdgs.storage.files import read_json
 

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from vdgs.bench.seen import Seen
-from vdgs.bench.worker import RECORD
+from experiments.bench.seen import Seen
+from experiments.bench.worker import RECORD
 from vdgs.captures.images import ImageCache
 from vdgs.errors import VdgsError
 from vdgs.evaluation import metrics

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-from vdgs.bench.changes import (
+from experiments.baselines.gs3d.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS
+from experiments.bench.changes import (
     FACTORIAL_CAMERAS,
     as_printed,
     best_seen,
@@ -43,8 +44,7 @@ from vdgs.bench.changes import (
     without_blocking,
     without_blocking_as_long,
 )
-from vdgs.bench.definitions import COARSE_ONLY, EXPLICIT, Change, Method
-from vdgs.comparators.gaussians.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS
+from experiments.bench.definitions import COARSE_ONLY, EXPLICIT, Change, Method
 from vdgs.settings.method import CompensationConfig
 
 LAMBDA_VIS = (0.0, 0.5, 1.0, 1.3)

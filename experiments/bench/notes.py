@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from vdgs.bench.definitions import Method
-from vdgs.bench.grids import SEEN_BY, all_bounds_of
-from vdgs.bench.plan import Plan
-from vdgs.bench.quoted import CONTRADICTIONS, EFFICIENCY, QUOTED
-from vdgs.bench.results import Result
-from vdgs.bench.verdict import Line
-from vdgs.bench.writing import escape_markdown as plain
+from experiments.bench.definitions import Method
+from experiments.bench.grids import SEEN_BY, all_bounds_of
+from experiments.bench.plan import Plan
+from experiments.bench.quoted import CONTRADICTIONS, EFFICIENCY, QUOTED
+from experiments.bench.results import Result
+from experiments.bench.verdict import Line
+from experiments.bench.writing import escape_markdown as plain
 from vdgs.partition.strategies import STRATEGIES
 
 

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from vdgs.bench.definitions import EXPLICIT, Budget, Method, Scene, Table
-from vdgs.bench.explicit import gaussians_config
-from vdgs.bench.folders import scenes_of
-from vdgs.bench.methods import METHODS
-from vdgs.bench.renders import folder_of, foreign_method, identity
-from vdgs.bench.tables import TABLES
+from experiments.bench.definitions import EXPLICIT, Budget, Method, Scene, Table
+from experiments.bench.explicit import gaussians_config
+from experiments.bench.folders import scenes_of
+from experiments.bench.methods import METHODS
+from experiments.bench.renders import folder_of, foreign_method, identity
+from experiments.bench.tables import TABLES
 from vdgs.errors import VdgsError
 from vdgs.runs.keys import counted
 from vdgs.settings.capture import CaptureOptions

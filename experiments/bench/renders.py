@@ -21,7 +21,7 @@ from jaxtyping import Float
 from rich.console import Console
 from torch import Tensor
 
-from vdgs.bench.definitions import RENDERS, Method
+from experiments.bench.definitions import RENDERS, Method
 from vdgs.captures.capture import Capture, View
 from vdgs.errors import VdgsError
 from vdgs.evaluation.evaluate import evaluate

@@ -7,13 +7,15 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from vdgs.bench.definitions import EXPLICIT
-from vdgs.bench.measure import FRUSTA_FILE, GROUPS_FILE, evaluated
-from vdgs.bench.plan import Plan, PlannedRun
-from vdgs.bench.worker import RECORD
+from experiments.baselines.gs3d.run import gaussians_folder
+from experiments.bench.definitions import EXPLICIT
+from experiments.bench.measure import FRUSTA_FILE, GROUPS_FILE, evaluated
+from experiments.bench.plan import Plan, PlannedRun
+from experiments.bench.worker import RECORD
 from vdgs.errors import VdgsError
 from vdgs.executors.executor import Outcome
 from vdgs.runs.folder import RunFolder
+from vdgs.runs.status import Status
 from vdgs.storage.files import read_json
 
 #: What evaluations report, raw and after colour correction.
@@ -113,18 +115,23 @@ def _sizes(metrics: Mapping[str, Any], planned: PlannedRun) -> dict[str, float |
     return {"anchors": anchors, "gaussians": decoded if explicit is None else explicit}
 
 
+def _photographs_drawn(status: Status) -> float:
+    """How many photographs' worth of pixels a stage drew: fewer than its steps where these draw parts."""
+    return float(status.photographs if status.photographs is not None else status.iteration or 0)
+
+
 def _costs(run: RunFolder, names: Sequence[str], stages: Mapping[str, float]) -> dict[str, float | None]:
     """Iterations, photographs drawn, seconds, memory and cameras of a run with the stages `names`. The shared coarse
     stage counts in full for each run that takes it."""
     blocks = "blocks" in names
-    coarse = (run.gaussians if tuple(names) == EXPLICIT else run.coarse).status()
+    coarse = (gaussians_folder(run) if tuple(names) == EXPLICIT else run.coarse).status()
     trained = [folder.status() for folder in run.block_folders()] if blocks else []
     rows = run.partition_record().blocks if blocks else ()
     seconds = [float(each.seconds or 0) for each in trained]
     peaks = [each.peak_memory_bytes or 0 for each in [coarse, *trained]]
     return {
         "iterations": (coarse.iteration or 0) + sum(each.iteration or 0 for each in trained),
-        "photographs": coarse.photographs_drawn + sum(each.photographs_drawn for each in trained),
+        "photographs": sum(_photographs_drawn(each) for each in [coarse, *trained]),
         "coarse_seconds": coarse.seconds,
         "block_seconds": sum(seconds) if blocks else None,
         "longest_block_seconds": max(seconds, default=None),

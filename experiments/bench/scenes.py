@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from vdgs.bench.definitions import Budget, Scene
+from experiments.bench.definitions import Budget, Scene
 from vdgs.settings.method import MethodConfig
 
 #: What the paper gives every scene: 100 000 iterations, then 50 000 for each of eight blocks.

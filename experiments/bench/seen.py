@@ -57,7 +57,12 @@ def seen_truly(root: Path, options: CaptureOptions) -> Seen | None:
     if known is None:
         return None
     truth, capture, parts = known
-    return Seen(capture, truth.visibility_maps(capture), "truth", f"seen at all: {parts}")
+    views = _by_pose(capture.test_views)
+
+    def counted(camera: Camera) -> Float[np.ndarray, "h w"]:
+        return truth.visibility_map(views[camera.camera_from_world.tobytes()])
+
+    return Seen(capture, counted, "truth", f"seen at all: {parts}")
 
 
 def seen_by_frusta(root: Path, options: CaptureOptions) -> Seen | None:
@@ -67,13 +72,17 @@ def seen_by_frusta(root: Path, options: CaptureOptions) -> Seen | None:
     if known is None:
         return None
     truth, capture, parts = known
-    views = {view.camera.camera_from_world.tobytes(): view for view in capture.test_views}
-    cameras, unit = [view.camera for view in capture.train_views], capture.ground.scale
+    views, unit = _by_pose(capture.test_views), capture.ground.scale
+    cameras = [view.camera for view in capture.train_views]
 
     def counted(camera: Camera) -> Float[np.ndarray, "h w"]:
         return held_by_frusta(truth, views[camera.camera_from_world.tobytes()], unit, cameras)
 
     return Seen(capture, counted, "frusta", f"by frusta: {parts}")
+
+
+def _by_pose(views: Sequence[View]) -> dict[bytes, View]:
+    return {view.camera.camera_from_world.tobytes(): view for view in views}
 
 
 def held_by_frusta(truth: Truth, view: View, unit: float, cameras: Sequence[Camera]) -> Float[np.ndarray, "h w"]:

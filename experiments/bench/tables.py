@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from vdgs.bench.definitions import Group, Table
-from vdgs.bench.methods import BETA_G, BLOCKS, EAGER, FACTORIAL, GAMMA, LAMBDA_VIS, T_LOW
+from experiments.bench.definitions import Group, Table
+from experiments.bench.methods import BETA_G, BLOCKS, EAGER, FACTORIAL, GAMMA, LAMBDA_VIS, T_LOW
 
 LAB = ("lab-uneven", "lab-distant", "lab-even")
 #: Where the paper's premise holds.

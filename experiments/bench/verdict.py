@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from vdgs.bench.grids import bounds_of
-from vdgs.bench.plan import Plan
-from vdgs.bench.results import Result
-from vdgs.bench.statistics import Difference, difference, summarise
+from experiments.bench.grids import bounds_of
+from experiments.bench.plan import Plan
+from experiments.bench.results import Result
+from experiments.bench.statistics import Difference, difference, summarise
 
 #: dB by which the full method may fall behind where many cameras look, and on even flights.
 ALLOWED_DB = 0.1

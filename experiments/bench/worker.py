@@ -1,4 +1,4 @@
-"""One run of a table, in a process of its own: `python -m vdgs.bench.worker JOB.json`.
+"""One run of a table, in a process of its own: `python -m experiments.bench.worker JOB.json`.
 
 Its folder is an ordinary run: the verbs `partition`, `train`, `merge`, `eval`, `render` and `report` work on it.
 """
@@ -100,13 +100,13 @@ def _evaluate(at: _Working) -> None:
 
 
 def _gaussians(at: _Working) -> None:
-    from vdgs.bench.explicit import train_explicit
+    from experiments.bench.explicit import train_explicit
 
     train_explicit(at.run, at.capture, at.job.lpips_weights, at.console)
 
 
 def _renders(at: _Working) -> None:
-    from vdgs.bench.renders import measure_renders
+    from experiments.bench.renders import measure_renders
 
     assert at.job.renders is not None
     measure_renders(at.capture, at.job.renders, at.run.evaluation, at.job.lpips_weights, at.console)
@@ -151,7 +151,7 @@ def work(job: Job) -> None:
     """All stages of a job, noting how long each took; the record says done only at the end."""
     from rich.console import Console
 
-    from vdgs.bench.origin import origin
+    from experiments.bench.origin import origin
     from vdgs.kernels import set_threads
 
     set_threads(job.threads)

@@ -7,7 +7,7 @@ import io
 import re
 from collections.abc import Sequence
 
-from vdgs.bench.grids import Cell, Grid
+from experiments.bench.grids import Cell, Grid
 
 _LATEX = {
     "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$",

@@ -1,6 +1,6 @@
 """Adam on the rows that a view has touched: the native kernel beside torch, in one run.
 
-OMP_WAIT_POLICY=PASSIVE python benchmarks/adam.py [--anchors 100000] [--visible 20000] [--threads 2]
+OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.adam [--anchors 100000] [--visible 20000] [--threads 2]
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from types import ModuleType
 
 import torch
 
-from machine import describe
-from stopwatch import medians_ms
+from experiments.microbench.machine import describe
+from experiments.microbench.stopwatch import medians_ms
 from vdgs.kernels.native import adam as native
 from vdgs.kernels.native import module
 from vdgs.kernels.reference import adam as reference

@@ -1,7 +1,7 @@
 """How fast cameras are scored for blocks: cameras a second in each mode.
 
-    python benchmarks/assignment.py [--threads 2] [--visible 20000] [--blocks 8] [--cameras 40]
-    python benchmarks/assignment.py --run RUN           the training views of a trained run instead
+    python -m experiments.microbench.assignment [--threads 2] [--visible 20000] [--blocks 8] [--cameras 40]
+    python -m experiments.microbench.assignment --run RUN           the training views of a trained run instead
 
 The generated scene is a strip of bumpy ground, one block after the other along it, anchors one voxel apart, Gaussians
 about as large as their spacing. Every view holds about `--visible` anchors of about two blocks, as drone photographs
@@ -25,8 +25,8 @@ import numpy as np
 import shapely
 import torch
 
-from machine import describe
-from stopwatch import medians_ms
+from experiments.microbench.machine import describe
+from experiments.microbench.stopwatch import medians_ms
 from vdgs.cameras import Camera
 from vdgs.kernels import native as kernels
 from vdgs.kernels.native.module import set_threads, threads

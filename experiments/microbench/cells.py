@@ -1,6 +1,6 @@
 """Cells of space and Morton order: the native hash and sort beside torch, in one run.
 
-OMP_WAIT_POLICY=PASSIVE python benchmarks/cells.py [--points 1000000] [--threads 2]
+OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.cells [--points 1000000] [--threads 2]
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from types import ModuleType
 
 import torch
 
-from machine import describe
-from stopwatch import medians_ms
+from experiments.microbench.machine import describe
+from experiments.microbench.stopwatch import medians_ms
 from vdgs.kernels.native import cells as native
 from vdgs.kernels.native import module
 from vdgs.kernels.reference import cells as reference

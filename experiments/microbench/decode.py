@@ -1,6 +1,6 @@
 """How long culling and decoding take, and their derivative: native kernels beside the torch twin.
 
-    OMP_WAIT_POLICY=PASSIVE python benchmarks/decode.py [--anchors 20000 100000] [--isa avx512 avx2]
+    OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.decode [--anchors 20000 100000] [--isa avx512 avx2]
 
 The best of the repeats, which on a busy machine says more than the median; ns are per visible anchor
 (cull: per anchor of the model). Forward and backward are those of the public function, autograd included.

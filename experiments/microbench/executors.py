@@ -1,6 +1,6 @@
 """What Ray costs over processes of this machine: the blocks of one run, trained by both, and whether they are the same.
 
-    OMP_WAIT_POLICY=PASSIVE python benchmarks/executors.py RUN [--jobs 2] [--rounds 1]
+    OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.executors RUN [--jobs 2] [--rounds 1]
 
 RUN is cut into blocks and not trained yet, or trained: copies are trained, in a folder beside it that is deleted. The
 start of Ray is measured apart, with nothing to do. Rounds take turns (local, Ray, Ray, local, ...).
@@ -17,7 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from machine import describe
+from experiments.microbench.machine import describe
 from vdgs.executors.on_ray import connected
 from vdgs.runs.folder import RunFolder
 

@@ -1,7 +1,8 @@
 """How long the export of a large scene takes, and how much memory: a made-up model of many anchors.
 
-    OMP_WAIT_POLICY=PASSIVE python benchmarks/exporting.py --anchors 20000 60000 200000 [--to a.ply b.spz]
-    OMP_WAIT_POLICY=PASSIVE python benchmarks/exporting.py --anchors 1000000 --folder /large/disk --no-measure
+    export OMP_WAIT_POLICY=PASSIVE
+    python -m experiments.microbench.exporting --anchors 20000 60000 200000 [--to a.ply b.spz]
+    python -m experiments.microbench.exporting --anchors 1000000 --folder /large/disk --no-measure
 
 Each anchor has 10 Gaussians; there are as many photographs to an anchor as in a real flight (one for 1600), 400 x 300
 pixels, and a place is seen by about ten. Every size runs in a process of its own. Seconds are wall clock and processor
@@ -120,7 +121,16 @@ def main() -> None:
     rows = []
     for anchors in asked.anchors:
         with tempfile.TemporaryDirectory(dir=asked.folder) as folder:
-            command = [sys.executable, __file__, "--one", "--anchors", str(anchors), "--folder", folder]
+            command = [
+                sys.executable,
+                "-m",
+                "experiments.microbench.exporting",
+                "--one",
+                "--anchors",
+                str(anchors),
+                "--folder",
+                folder,
+            ]
             command += ["--to", *asked.to, "--measure" if asked.measure else "--no-measure"]
             row = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout.splitlines()[-1])
         rows.append(row)

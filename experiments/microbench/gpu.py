@@ -1,6 +1,6 @@
 """What a card does, within a few minutes: whether it computes what the processor computes, and how long that takes.
 
-    python benchmarks/gpu.py [--minutes 8] [--capture PLACE] [--small]
+    python -m experiments.microbench.gpu [--minutes 8] [--capture PLACE] [--small]
 
 In this order: what the kernels take of the card, parity of every operation with the processor, a generated town trained
 and measured on both, milliseconds and bytes of a training step by each rasteriser, and a capture of one's own if it is
@@ -27,14 +27,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
 
-import gpu_parity
-import step
-from machine import describe
+from experiments.microbench import gpu_parity, step
+from experiments.microbench.cuda_resources import resources_of
+from experiments.microbench.machine import describe
 from vdgs.cli import main as vdgs
 from vdgs.kernels.composed import rasteriser
 from vdgs.kernels.cuda.driver import CudaUnavailable, cuda_driver
 from vdgs.kernels.cuda.nvrtc import Target, nvrtc
-from vdgs.kernels.cuda.resources import resources_of
 from vdgs.kernels.gsplat.rasterise import GsplatUnavailable
 
 #: Sources and the headers that they include.

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from step import scene
+from experiments.microbench.step import scene
 from vdgs.kernels import cuda, gsplat
 from vdgs.kernels.gsplat.rasterise import GsplatUnavailable
 from vdgs.kernels.operations import Operations

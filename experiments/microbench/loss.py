@@ -1,6 +1,6 @@
 """Photometric loss with its gradient: the native kernel beside torch, in one run.
 
-OMP_WAIT_POLICY=PASSIVE python benchmarks/loss.py [--threads 2] [--rounds 5]
+OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.loss [--threads 2] [--rounds 5]
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from types import ModuleType
 
 import torch
 
-from machine import describe
-from stopwatch import medians_ms
+from experiments.microbench.machine import describe
+from experiments.microbench.stopwatch import medians_ms
 from vdgs.kernels.native import loss as native
 from vdgs.kernels.native import module
 from vdgs.kernels.reference import loss as reference

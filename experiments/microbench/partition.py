@@ -1,6 +1,6 @@
 """Visibility, cut and owners of a large scene, in one run.
 
-    OMP_WAIT_POLICY=PASSIVE python benchmarks/partition.py [--anchors 1000000] [--cameras 1000] [--threads 2]
+    OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.partition [--anchors 1000000] [--cameras 1000]
 
 The owners are looked up for places in the cores' own box and in one four times as wide, most of which lies outside
 every core; a part of each is compared with the distances to all cores.
@@ -18,13 +18,13 @@ import numpy as np
 import shapely
 import torch
 
-from machine import describe
+from experiments.microbench.machine import describe
+from experiments.microbench.visibility import flight
 from vdgs.kernels.native import module
 from vdgs.model.visibility import visibility_of
 from vdgs.partition.blocks import Blocks
 from vdgs.partition.cut import cut_scene
 from vdgs.settings.method import PartitionConfig
-from visibility import flight
 
 EXTENT_M = 2000.0
 #: Places whose owner is compared with brute force.

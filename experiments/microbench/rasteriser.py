@@ -1,8 +1,8 @@
 """How fast the rasteriser draws and differentiates: nine scenes, one and two threads, every instruction set.
 
-    python benchmarks/rasteriser.py
-    python benchmarks/rasteriser.py --prototype DIR     beside the feasibility study in DIR, interleaved
-    python benchmarks/rasteriser.py --run RUN           test views of a trained run instead of the nine scenes
+    python -m experiments.microbench.rasteriser
+    python -m experiments.microbench.rasteriser --prototype DIR     beside the feasibility study in DIR, interleaved
+    python -m experiments.microbench.rasteriser --run RUN           test views of a trained run instead
 
 Times are medians in milliseconds of the public function, autograd included, from tensors to gradients;
 the study is timed from arrays to arrays. Repetitions alternate, so that a busy machine slows both alike:
@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from machine import describe
+from experiments.microbench.machine import describe
 from vdgs.kernels.native.module import load, supported
 from vdgs.kernels.native.rasterise import rasterise
 from vdgs.kernels.types import Splats

@@ -1,7 +1,8 @@
 """Time and memory of every stage that grows with a scene, and the exponent with which each grows.
 
-    python benchmarks/scaling.py measure RESULTS [--stages cut ...] [--anchors 100000 1000000] [--photographs 100 1000]
-    python benchmarks/scaling.py table RESULTS
+    python -m experiments.microbench.scaling measure RESULTS \\
+      [--stages cut ...] [--anchors 100000 1000000] [--photographs 100 1000]
+    python -m experiments.microbench.scaling table RESULTS
 
 Every case runs in a process of its own, one after the other, and is a line of the file RESULTS. What is there is not
 measured again: stopped, the same command goes on; to measure a stage anew, delete its lines. Seconds are of the wall
@@ -35,8 +36,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-import made_up
-from machine import describe
+from experiments.microbench import made_up
+from experiments.microbench.machine import describe
 from vdgs.memory.process import forget_peak, peak_memory_bytes
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.partition.blocks import Blocks
@@ -299,7 +300,8 @@ def measure(results: Path, wanted: list[Case]) -> None:
         if (case.stage, case.anchors, case.photographs) in known:
             continue
         words = [case.stage, str(case.anchors), str(case.photographs)]
-        done = subprocess.run([sys.executable, __file__, "one", *words], stdout=subprocess.PIPE, text=True, check=False)
+        command = [sys.executable, "-m", "experiments.microbench.scaling", "one", *words]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
         if done.returncode != 0:
             print(f"{' '.join(words)}: failed with exit code {done.returncode}", flush=True)
             continue

@@ -1,7 +1,7 @@
 """Where the time of one whole training step goes: cull, decode, rasterise, loss, its way back to the
 splats, from them to anchors that move, statistics.
 
-    python benchmarks/step.py [--threads 2] [--visible 20000] [--own 0.125]
+    python -m experiments.microbench.step [--threads 2] [--visible 20000] [--own 0.125]
 
 A random anchor scene seen from above, in which all anchors are visible, with about half of the opacities positive
 (what a fresh decoder gives). Prints the median of each phase. With `--own` it is the step of a block: this share of
@@ -29,7 +29,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import numpy as np
 import torch
 
-from machine import describe
+from experiments.microbench.machine import describe
 from vdgs.cameras import Camera
 from vdgs.kernels import choose, set_threads
 from vdgs.kernels.types import OrderedSplats
@@ -167,7 +167,7 @@ def measure(visible: int, width: int, height: int, repeats: int, own: float) -> 
 
 def peaks(visible: int, hidden: int) -> tuple[int, int, int]:
     """Bytes of a fresh process: once all is imported, at most during three steps, and what saving adds after them."""
-    asked = [sys.executable, __file__, "--peak", str(visible), str(hidden)]
+    asked = [sys.executable, "-m", "experiments.microbench.step", "--peak", str(visible), str(hidden)]
     imported, steps, saving = subprocess.run(asked, check=True, capture_output=True, text=True).stdout.split()
     return int(imported), int(steps), int(saving)
 

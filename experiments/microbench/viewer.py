@@ -1,6 +1,6 @@
 """How quick `vdgs view` is: to the first picture, while a camera moves, at rest, and with several visitors.
 
-    python benchmarks/viewer.py RUN [--visitors 8] [--seconds 20] [--size 1280 800] [--load 300]
+    python -m experiments.microbench.viewer RUN [--visitors 8] [--seconds 20] [--size 1280 800] [--load 300]
 
 Visitors speak the browser's protocol on the loopback address; the server is another process. Prints one line
 each. `--load` adds a long test in which half of the visitors vanish and come again.
@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 from vdgs.cameras import Camera
 from vdgs.captures.overview import FOV_DEG

@@ -1,6 +1,6 @@
 """Counting views (V_i) of a drone flight: the native kernel beside brute force, in one run.
 
-    OMP_WAIT_POLICY=PASSIVE python benchmarks/visibility.py [--points 1000000] [--cameras 1000] [--threads 2]
+    OMP_WAIT_POLICY=PASSIVE python -m experiments.microbench.visibility [--points 1000000] [--cameras 1000]
 
 Brute force runs on the first few cameras only and is scaled up; both counts of those are compared.
 """
@@ -14,7 +14,7 @@ import time
 import numpy as np
 import torch
 
-from machine import describe
+from experiments.microbench.machine import describe
 from vdgs.cameras import Camera
 from vdgs.kernels.native import module
 from vdgs.kernels.native import visibility as native

@@ -25,15 +25,15 @@ import numpy as np
 from jaxtyping import Float
 from rich.console import Console
 
+from experiments.baselines.gs3d.model import GaussiansModel
+from experiments.baselines.gs3d.session import continue_or_start, finish, train_watched
+from experiments.baselines.gs3d.training import GaussiansConfig, GaussiansStage, scene_extent
 from vdgs import __version__
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import capture_facts, refuse_another_capture
 from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
-from vdgs.comparators.gaussians.model import GaussiansModel
-from vdgs.comparators.gaussians.training import GaussiansConfig, GaussiansStage, scene_extent
-from vdgs.comparators.gaussians.watching import continue_or_start, finish, train_watched
 from vdgs.errors import RunError, VdgsError
 from vdgs.evaluation.evaluate import evaluate
 from vdgs.evaluation.lpips import load_lpips
@@ -57,6 +57,11 @@ NAME = "3dgs"
 VisibilityMap = Callable[[Camera], Float[np.ndarray, "h w"]]
 
 
+def gaussians_folder(run: RunFolder) -> StageFolder:
+    """Where 3DGS keeps its model, in runs that have it in place of all other stages."""
+    return StageFolder(run.path / "gaussians")
+
+
 def run_gaussians(
     run: RunFolder,
     capture: Capture,
@@ -71,7 +76,7 @@ def run_gaussians(
 
     Raises what `train_gaussians` and `evaluate_gaussians` raise.
     """
-    folder = run.gaussians
+    folder = gaussians_folder(run)
     with run.locked():
         model = train_gaussians(capture, config, folder.path, console, options=options)
         write_json(run.capture_file, capture_facts(capture))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from vdgs.comparators.gaussians.training import GaussiansConfig
+from experiments.baselines.gs3d.training import GaussiansConfig
 
 #: What the schedule was published for (3DGS section 7.1).
 PUBLISHED_ITERATIONS = 30_000

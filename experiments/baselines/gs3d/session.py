@@ -12,9 +12,8 @@ from collections.abc import Callable
 
 from rich.console import Console
 
-from vdgs.captures.capture import Capture
-from vdgs.comparators.gaussians.model import GaussiansModel, initial_gaussians
-from vdgs.comparators.gaussians.training import (
+from experiments.baselines.gs3d.model import GaussiansModel, initial_gaussians
+from experiments.baselines.gs3d.training import (
     GaussiansConfig,
     GaussiansReport,
     GaussiansStage,
@@ -26,6 +25,7 @@ from vdgs.comparators.gaussians.training import (
     to_saved,
     train,
 )
+from vdgs.captures.capture import Capture
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.watching import WatchOptions
@@ -99,7 +99,7 @@ class _Journal:
     def status(self, state: GaussiansState) -> Status:
         """Where training stands."""
         return Status(
-            "running", iteration=state.iteration, iterations=self._config.iterations, gaussians=len(state.gaussians),
+            "running", iteration=state.iteration, iterations=self._config.iterations,
             psnr_training=_number(state.psnr), seconds=round(state.seconds, 1),
             peak_memory_bytes=state.peak_memory_bytes,
         )  # fmt: skip
@@ -122,7 +122,7 @@ def finish(folder: StageFolder, state: GaussiansState, model: GaussiansModel, co
     save_state(folder.checkpoints, to_saved(state))
     model.save(folder.model)
     status = Status(
-        "done", iteration=state.iteration, iterations=state.iteration, gaussians=len(state.gaussians),
+        "done", iteration=state.iteration, iterations=state.iteration,
         seconds=state.seconds, psnr_training=_number(state.psnr), peak_memory_bytes=state.peak_memory_bytes,
     )  # fmt: skip
     folder.set_status(status)

@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from experiments.baselines.gs3d.density import DensityConfig, control_density, reset_logits
 from vdgs.cameras import Camera
-from vdgs.comparators.gaussians.density import DensityConfig, control_density, reset_logits
 from vdgs.errors import TrainingDiverged
 from vdgs.kernels import choose
 from vdgs.kernels.types import AdamState, Finite

@@ -2,7 +2,7 @@
 
     vdgs synth city --size city --images 600 --width 320 --height 240 --samples-per-pixel 1 --truth
     vdgs run city --preset laptop --blocks 8 --iterations 12000 --output run
-    python benchmarks/ceiling.py run [--views 75]
+    python -m experiments.reports.analyses.ceiling run [--views 75]
 
 The capture is built again from the options in its capture.md, and its test views are drawn with 32 samples per pixel:
 what a picture without aliasing looks like. PSNR of that against the photographs bounds what any model can reach on
@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from experiments.microbench.machine import describe
 from PIL import Image
 
-from machine import describe
 from vdgs.captures.capture import View
 from vdgs.model.render import render
 from vdgs.runs.opening import open_run

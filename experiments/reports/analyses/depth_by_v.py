@@ -1,6 +1,6 @@
 """Where few photographs look, is it depth that is wrong? Errors of a run's test views by true V and by error of depth.
 
-    python benchmarks/depth_by_v.py RUN [--model coarse]
+    python -m experiments.reports.analyses.depth_by_v RUN [--model coarse]
 
 Needs a generated capture with its truth. For quarters of the pixels by V: the median error of median depth, relative to
 the true one, the share of pixels beyond 3 %, their part of all squared error, and PSNR of those within 1 % and of all.
@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from experiments.microbench.machine import describe
+from experiments.reports.analyses.ceiling import picture, psnr
 
-from ceiling import picture, psnr
-from machine import describe
 from vdgs.model.render import render
 from vdgs.runs.opening import open_run
 from vdgs.synth.truth import load_truth

@@ -1,6 +1,6 @@
 """How brightness differs between photographs, and how much of it those before and after tell, from sparse points.
 
-    python benchmarks/exposures.py DATA/copr --images images_4
+    python -m experiments.reports.analyses.exposures DATA/copr --images images_4
 
 What `--exposure-spread` decides by: nothing is trained. Needs a capture with tracks, and photographs in one folder.
 """
@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 
 import numpy as np
+from experiments.microbench.machine import describe
 
-from machine import describe
 from vdgs.captures.brightness import point_colours
 from vdgs.captures.images import ImageCache
 from vdgs.captures.loading import load_capture

@@ -1,6 +1,6 @@
 """How much of what photographs show of a place one colour could explain: a bound for files without changing colours.
 
-    python benchmarks/fixed_colours.py CAPTURE --images images_4
+    python -m experiments.reports.analyses.fixed_colours CAPTURE --images images_4
 
 Each sparse point is looked up in the photographs that it was matched in: the mean colour of a few pixels about it, so
 that neither noise nor detail counts. The one colour that says most of a photograph which was not looked at is the mean

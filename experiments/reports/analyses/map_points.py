@@ -1,8 +1,8 @@
 """Heights of a map against sparse points of the capture that training never had.
 
-    python benchmarks/map_points.py hold CAPTURE FOLDER --every 5      # FOLDER: the capture without every fifth point
+    python -m experiments.reports.analyses.map_points hold CAPTURE FOLDER --every 5      # FOLDER: the capture without every fifth point
     vdgs run FOLDER --images images_4 --preset laptop --blocks 4 --output run
-    python benchmarks/map_points.py compare FOLDER run/maps
+    python -m experiments.reports.analyses.map_points compare FOLDER run/maps
 
 FOLDER links to the photographs and holds the points that were left out in held_out.npy: those with tracks of at least
 three photographs and a reprojection error below a pixel, for others are no truth. `compare` also takes CAPTURE in place

@@ -3,7 +3,7 @@
     vdgs synth town --size toy --truth --seed 0
     vdgs run town --output run --preset laptop
     vdgs map run --crs source --output maps
-    python benchmarks/map_truth.py town maps
+    python -m experiments.reports.analyses.map_truth town maps
 
 The town is built again from the options in its capture.md; its world is that of the capture (`--crs source`).
 """

@@ -1,6 +1,6 @@
 """How well the exposure of a photograph is foretold by its neighbours in the flight, and by what its camera metered.
 
-    python benchmarks/metering.py RUN
+    python -m experiments.reports.analyses.metering RUN
 
 RUN was trained with --exposure. Errors are those of photographs that the law was not learnt from, one left out after
 the other; all are training photographs, against the training photographs before and after them.
@@ -12,8 +12,8 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from experiments.microbench.machine import describe
 
-from machine import describe
 from vdgs.evaluation.exposures import exposures_of
 from vdgs.runs.opening import open_run
 

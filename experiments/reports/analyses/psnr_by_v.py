@@ -1,6 +1,6 @@
 """PSNR of methods by how many training photographs look at a place, in bands that one chooses.
 
-    python benchmarks/psnr_by_v.py METHOD [METHOD ...] [--views training] [--by truth] [--bands 1 4 16] [--every 4]
+    python -m experiments.reports.analyses.psnr_by_v METHOD [METHOD ...] [--views training] [--by truth] [--bands 1 4 16] [--every 4]
 
 METHOD is a folder of a bench, runs/SCENE/METHOD, that holds a run for each seed, or a run; the scene is a generated
 capture with its truth. V counts the training cameras whose frustum holds the true place at a pixel, as the paper does,
@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from experiments.bench.seen import held_by_frusta
+from experiments.microbench.machine import describe
+from experiments.reports.analyses.ceiling import drawn, picture, psnr, squares
 
-from ceiling import drawn, picture, psnr, squares
-from machine import describe
-from vdgs.bench.seen import held_by_frusta
 from vdgs.cameras import Camera
 from vdgs.captures.heights import camera_height
 from vdgs.model.visibility import visibility_of

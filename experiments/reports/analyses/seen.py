@@ -2,7 +2,7 @@
 
     vdgs synth town --truth
     vdgs run town --preset laptop --blocks 4 --output run
-    python benchmarks/seen.py run
+    python -m experiments.reports.analyses.seen run
 
 A pixel's place is where the coarse model is half opaque; pixels less opaque than a limit continue the depth of the
 nearest others (`evaluation.seen`). Printed by limit: pixels taken for seen that are not, and the other way round,
@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from experiments.microbench.machine import describe
 
-from machine import describe
 from vdgs.cameras import Camera
 from vdgs.evaluation.of_run import true_depth
 from vdgs.evaluation.seen import SEEN_BY, continued

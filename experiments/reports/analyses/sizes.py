@@ -1,6 +1,6 @@
 """How large new anchors may be (`model/sizes.py`), asked of all cameras at once, beside one camera after the other.
 
-    python benchmarks/sizes.py [--threads 1]
+    python -m experiments.reports.analyses.sizes [--threads 1]
 
 New anchors of one decision of growth, all over a square of 640 m, under cameras tilted by 30 degrees. Both must agree
 bit for bit.
@@ -13,14 +13,14 @@ import time
 from collections.abc import Sequence
 
 import torch
+from experiments.microbench.machine import describe
+from experiments.microbench.visibility import flight, scene
 from torch import Tensor
 
-from machine import describe
 from vdgs.cameras import Camera
 from vdgs.model.frustum import project
 from vdgs.model.groups import Groups
 from vdgs.model.sizes import REACH, SPAN, largest_log_scales
-from visibility import flight, scene
 
 EXTENT_M = 640.0
 #: New anchors, cameras.

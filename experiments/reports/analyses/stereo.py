@@ -2,7 +2,7 @@
 
     vdgs synth CAPTURE --size district --flight uneven --images 240 --width 128 --height 96 --extent-m 184 \\
       --points 2000 --test-images 32 --validation-images 32 --truth
-    python benchmarks/stereo.py CAPTURE
+    python -m experiments.reports.analyses.stereo CAPTURE
 
 Precision: the share of the points that lie within a cell of a true surface that some photograph shows. Recall: of what
 the test views show, the share with a point within 1.25 cells, by the sparse points alone and with those of stereo.
@@ -19,9 +19,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from experiments.microbench.machine import describe
 from scipy.spatial import cKDTree
 
-from machine import describe
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.images import ImageCache

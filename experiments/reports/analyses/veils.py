@@ -1,6 +1,6 @@
 """Whether some blocks of a run hang before the ground of others.
 
-    python benchmarks/veils.py RUN --blocks 0 5
+    python -m experiments.reports.analyses.veils RUN --blocks 0 5
 
 Draws the anchors of these blocks alone, on the test views, with the coarse and with the merged model, and prints their
 mean alpha over pixels that look at ground (height 0) of other blocks.
@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from experiments.microbench.machine import describe
 
-from machine import describe
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import render
 from vdgs.partition.blocks import Blocks, places_of

@@ -85,11 +85,6 @@ class RunFolder:
         return StageFolder(self.path / "merged")
 
     @property
-    def gaussians(self) -> StageFolder:
-        """Where 3DGS keeps its model, in runs of the bench that have it in place of all other stages."""
-        return StageFolder(self.path / "gaussians")
-
-    @property
     def evaluation(self) -> Path:
         return self.path / "evaluation"
 

@@ -121,11 +121,6 @@ def find_model(folder: RunFolder, which: ModelName = "best") -> FoundModel:
 
 def _not_there(folder: RunFolder, name: str) -> str:
     """Why a model cannot be opened, and what to do."""
-    if folder.gaussians.path.is_dir():
-        return (
-            f"{folder.path}: is a run of 3DGS from `vdgs bench`; only runs with anchors can be opened. Its pictures "
-            f"and figures are in {folder.evaluation}."
-        )
     standing = standing_of(folder)
     found = standing.of("merge" if name == "merged" else "coarse")
     why = f"state: {found.state}" + (f", {found.why}" if found.why else "")

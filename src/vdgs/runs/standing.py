@@ -258,8 +258,6 @@ class _Survey:
         made = json.dumps([record.get(each) for each in ("model", "lpips_weights", "bins")])
         found = record.get("model")
         known = [model.made for model in models if model.state == "done" and model.made]
-        if self.run.gaussians.path.is_dir():  # of 3DGS: its figures are of no model with anchors
-            found = None
         return self._judged(name, folder, there, found, found if found in known else None, made, OTHER_MODEL)
 
 

@@ -20,8 +20,6 @@ class Status:
     photographs: float | None = None
     """How many photographs' worth of pixels were drawn; None where every iteration draws a whole one."""
     anchors: int | None = None
-    gaussians: int | None = None
-    """Of an explicit model, which has no anchors."""
     psnr_training: float | None = None
     seconds: float | None = None
     seconds_left: int | None = None
@@ -36,8 +34,3 @@ class Status:
     """`model` of each block; None for one that is missing."""
     merge_seconds: float | None = None
     merge_peak_memory_bytes: int | None = None
-
-    @property
-    def photographs_drawn(self) -> float:
-        """How many photographs' worth of pixels the stage drew: fewer than its steps where these draw parts."""
-        return float(self.photographs if self.photographs is not None else self.iteration or 0)

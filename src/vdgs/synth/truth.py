@@ -11,7 +11,6 @@ truth/
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.cameras import Camera
-from vdgs.captures.capture import Capture, View
+from vdgs.captures.capture import View
 from vdgs.errors import VdgsError
 
 _FOLDER = "truth"
@@ -62,18 +61,6 @@ class Truth:
     def visibility_map(self, view: View) -> Float[np.ndarray, "h w"]:
         """The true visibility at the size at which the view is used (nearest pixel)."""
         return self._at_size(self.visibility(view.name), view.camera)
-
-    def visibility_maps(self, capture: Capture) -> Callable[[Camera], Float[np.ndarray, "h w"]]:
-        """The true visibility by camera of a view of the capture, for `evaluation.evaluate.evaluate_views`."""
-        names = {view.camera.camera_from_world.tobytes(): view.name for view in capture.views}
-
-        def visibility_map(camera: Camera) -> np.ndarray:
-            name = names.get(camera.camera_from_world.tobytes())
-            if name is None:
-                raise VdgsError(f"{self.folder}: the truth knows only the capture's own photographs, not other views.")
-            return self._at_size(self.visibility(name), camera)
-
-        return visibility_map
 
     @staticmethod
     def _at_size(values: np.ndarray, camera: Camera) -> np.ndarray:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import os
 
-from vdgs.verbs.benching import bench
 from vdgs.verbs.captures import inspect, synth
+from vdgs.verbs.experiments import bench
 from vdgs.verbs.exporting import export
 from vdgs.verbs.machine import doctor
 from vdgs.verbs.mapping import map

@@ -33,7 +33,7 @@ def open_or_last_saved(path: Path, which: ModelName = "best", device: str = "cpu
     Raises RunError where nothing is saved yet, and what `open_run` raises.
     """
     run = RunFolder(path)
-    if which != "best" or run.gaussians.path.is_dir():
+    if which != "best":
         return open_run(path, which, device)
     keys = run.keys()
     if run.merged.is_done(keys.merge):

@@ -23,7 +23,7 @@ class Resources:
 def resources_of(
     name: str, target: Target, headers: Sequence[str] = (), compiler: Nvrtc | None = None
 ) -> tuple[Resources, ...]:
-    """Of each kernel of a source of this package, compiled for a target (machine code, not PTX).
+    """Of each kernel of a source of `vdgs.kernels.cuda`, compiled for a target (machine code, not PTX).
 
     Raises CompileError, CudaUnavailable.
     """

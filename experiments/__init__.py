@@ -1,0 +1,1 @@
+"""Evidence about the package, which is not in the wheel: bench, other methods, microbenchmarks and dated reports."""

@@ -1,0 +1,27 @@
+"""The verb whose code is not in the package: `bench` lies in `experiments/` of a checkout."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from vdgs.errors import VdgsError
+
+#: The root of the checkout, where the package is used from one.
+CHECKOUT = Path(__file__).parents[3]
+
+
+def bench(arguments: list[str]) -> None:
+    """Hand over to the bench. Raises VdgsError where there is no `experiments` to import it from."""
+    if (CHECKOUT / "experiments" / "bench" / "cli.py").is_file() and str(CHECKOUT) not in sys.path:
+        sys.path.insert(0, str(CHECKOUT))
+    try:
+        from experiments.bench import cli
+    except ImportError as error:
+        if error.name not in ("experiments", "experiments.bench", "experiments.bench.cli"):
+            raise
+        raise VdgsError(
+            "the package `experiments` is missing, which an installation does not hold: clone the repository of vdgs, "
+            "and run `python -m experiments.bench` in its root."
+        ) from error
+    cli.bench(arguments)
