@@ -1,4 +1,4 @@
-"""The microbenchmark `gpu` without a card, so that it does not fail on its first day: all of it, on a pretended card."""
+"""`experiments.microbench.gpu` without a card, so that it does not fail on its first day: all, on a pretended card."""
 
 from __future__ import annotations
 

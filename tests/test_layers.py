@@ -1,8 +1,8 @@
 """Which room of the package may import which: downwards only, in no circle, and kernels through their door.
 
 A room is a folder or a module right below `src/vdgs`. All imports count, those inside functions and those for type
-checkers too: what a file names, it must be able to know. `experiments/` lies outside the package and above it: its folders import
-every room, and of the package only the verb that hands over to it imports it.
+checkers too: what a file names, it must be able to know. `experiments/` lies outside the package and above it: its
+folders import every room, and of the package only the verb that hands over to it imports it.
 """
 
 from __future__ import annotations
