@@ -33,7 +33,7 @@ more:
   map RUN                           orthophoto, surface model and visibility as GeoTIFFs
   export RUN --to FILE              the scene for other programs: PLY, SPZ, SOG, glTF, 3D Tiles, LAZ
   synth OUTPUT                      generate a small aerial town with known truth
-  bench TABLE --output FOLDER       methods x scenes x seeds: the paper's tables, a figure and a verdict
+  bench TABLE --output FOLDER       methods x scenes x seeds: the paper's tables and a verdict; needs a checkout
   doctor                            what this machine can use, and what to install for the rest
 
 vdgs VERB --help explains the options of a verb. A capture is a folder with images/ and sparse/0 (COLMAP),
