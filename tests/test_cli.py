@@ -1,5 +1,6 @@
 """The command line: help comes without heavy imports, errors come without tracebacks."""
 
+import os
 import shlex
 import subprocess
 import sys
@@ -57,6 +58,24 @@ def test_an_unknown_verb_is_a_usage_error(capsys):
         main(["trian"])
     assert ended.value.code == 2
     assert "there is no verb 'trian'; did you mean 'train'?" in capsys.readouterr().err
+
+
+def test_the_bench_is_named_where_there_is_only_the_package(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "experiments.bench", None)  # as if it could not be imported
+    with pytest.raises(SystemExit) as ended:
+        main(["bench", "toy", "--output", "bench"])
+    assert ended.value.code == 1
+    assert "run `python -m experiments.bench` in its root" in capsys.readouterr().err
+
+
+def test_the_bench_is_found_from_any_folder(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(Path(verbs.__file__).parents[2])}
+    done = subprocess.run(
+        [sys.executable, "-m", "vdgs.cli", "bench", "--help"], cwd=tmp_path, env=environment,
+        capture_output=True, text=True, timeout=PATIENCE_SECONDS,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "usage: vdgs bench" in done.stdout
 
 
 def test_a_missing_capture_is_one_line_and_no_traceback(tmp_path):

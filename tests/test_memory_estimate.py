@@ -56,7 +56,7 @@ needs = st.builds(
 
 
 def test_an_anchor_takes_what_was_measured():
-    """experiments/microbench/step.py in experiments/reports/results.md: 0.92 kB out of view, 2.43 to 2.50 kB in view."""
+    """experiments/microbench/step.py in reports/results.md: 0.92 kB out of view, 2.43 to 2.50 kB in view."""
     assert bytes_per_anchor(10, 0.0) == pytest.approx(920, rel=0.05)
     assert bytes_per_anchor(10, 1.0) == pytest.approx(2460, rel=0.05)
 

@@ -13,7 +13,7 @@ from vdgs.settings.method import CompensationConfig, MergeConfig, MethodConfig, 
 
 #: So many cameras has each block of the factorial: every camera joins its best block, and each block is topped up to
 #: these. With as few as one block's share (160) the cameras of the least seen places join none: the dense ones show
-#: more of a block. What was left out, more than how it was cut, then made the difference (experiments/reports/findings.md).
+#: more of a block. What was left out, more than how it was cut, then made the difference (reports/findings.md).
 FACTORIAL_CAMERAS = 256
 
 

@@ -73,7 +73,7 @@ _COMMON = (
     "trained as ours, with plain growth",
 )
 _3DGS = "Kerbl et al., 3D Gaussian Splatting for Real-Time Radiance Field Rendering, SIGGRAPH 2023"
-#: On which the paper is silent, and by which compensated growth gains where few cameras look (experiments/reports/findings.md).
+#: On which the paper is silent, and by which compensated growth gains where few cameras look (reports/findings.md).
 _GATE = "the gate of growth is lower where few cameras look, our choice"
 #: As the docstring of `experiments.baselines.gs3d.run` has it.
 _3DGS_LEAVES_OUT = (
@@ -164,7 +164,7 @@ _OTHERS = [
     ),
 ]  # fmt: skip
 _BLOCKS = [Method(f"blocks-{count}", f"{count} block{'s' * (count > 1)}", in_blocks(count)) for count in BLOCKS]
-#: Plain growth: after few steps compensated growth costs one block more than several (experiments/reports/findings.md).
+#: Plain growth: after few steps compensated growth costs one block more than several (reports/findings.md).
 _EACH_AS_LONG = [
     Method(
         "each-half", "half as many blocks, each as long, w/o anchor generation",

@@ -30,8 +30,8 @@ def seen_map(
     The place is where the model behind `draw_depth` (a render with depth) is half opaque, in pixels that are solid. All
     others continue the depth of the nearest solid ones, down to the ground but not up into the sky: beyond what cameras
     cover, half-open splats lie at any depth, and by that depth in pictures that never saw the place (against the truth
-    of a generated town, experiments/reports/solid-ground.md). V as it is drawn from anchors would not do: at the edge of what cameras
-    cover, splats reach far beyond the anchors that V is counted for.
+    of a generated town, reports/solid-ground.md). V as it is drawn from anchors would not do: at the edge of what
+    cameras cover, splats reach far beyond the anchors that V is counted for.
     """
 
     def seen(camera: Camera) -> Bool[np.ndarray, "h w"]:

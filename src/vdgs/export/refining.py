@@ -18,7 +18,7 @@ from vdgs.kernels import choose
 from vdgs.kernels.types import AdamState
 from vdgs.model.gaussians import Gaussians, draw_gaussians
 
-#: Learning rates: half of what trains Gaussians from nothing (`experiments.baselines.gs3d`), for these start near the end.
+#: Learning rates: half of what trains Gaussians from nothing (3DGS), for these start near the end.
 RATES = {"dc": 1.25e-3, "rest": 6e-5, "logits": 0.025, "log_scales": 2.5e-3, "quaternions": 5e-4}
 
 

@@ -1,6 +1,6 @@
 """How much memory training will take, before it takes it, and which settings make it less.
 
-The figures per anchor and per pixel are measured: `experiments/microbench/step.py`, experiments/reports/results.md.
+The figures per anchor and per pixel are measured: `experiments/microbench/step.py`, reports/results.md.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MEASURED_BYTES_PER_PIXEL, LPIPS_BYTES_PER_PIXEL = 400, 2000
 #: Anchors may grow to so many times their number where nothing limits them (choice; real captures: 1.2 to 3).
 GROWTH = 3.0
 #: ... where growth is compensated below a fixed T_low, under which nearly all of a real capture is (choice; blocks of
-#: seneca had 6 and 12 times as many after a ninth of the steps of preset `paper`: experiments/reports/findings.md).
+#: seneca had 6 and 12 times as many after a ninth of the steps of preset `paper`: reports/findings.md).
 COMPENSATED_GROWTH = 15.0
 #: Share of a block's anchors that one photograph may see, for the estimate before a block is opened (choice).
 SEEN = 0.5

@@ -28,10 +28,10 @@ from vdgs.model.groups import Groups
 
 #: Length of a Gaussian over the longer side of the picture, at most (choice: a Gaussian may lie nearer to a camera than
 #: its anchor, and a view nearer than all cameras. With larger bounds, views of a town held some that were larger than
-#: the picture: experiments/reports/solid-ground.md).
+#: the picture: reports/solid-ground.md).
 SPAN = 0.25
 #: The unit of an anchor's offsets over the largest Gaussian's standard deviation, at most (choice: at 1, ground that
-#: few photographs show stays open; experiments/reports/solid-ground.md).
+#: few photographs show stays open; reports/solid-ground.md).
 SPREAD = 4.0
 #: From the middle of a Gaussian of opacity 1 to where it is no longer drawn, in standard deviations.
 REACH = math.sqrt(-2.0 * math.log(ALPHA_MIN))

@@ -90,7 +90,7 @@ def choose_block_count(n_anchors: int, n_cameras: int, image_pixels: int, method
     Choice: as few as keep an average block within `block_memory_gb` in training by `memory.estimate`, with photographs
     of up to `image_pixels`, the rest of the scene about it and half of all anchors in view; photographs that are kept
     aside. But never fewer than 50 photographs for an average block: where that allows too few blocks, as many as it
-    allows. Few, because blocks cost steps: of one total, each place gets fewer the more there are (experiments/reports/findings.md).
+    allows. Few, because blocks cost steps: of one total, a place gets fewer the more there are (reports/findings.md).
     """
     config = method.partition
     if not config.blocking:

@@ -33,7 +33,7 @@ FILE = "stereo.safetensors"
 #: has ten Gaussians; growth makes more where that is too few.
 CELL_VOXELS, CELL_PX = 1.2, 3.0
 #: Photographs are to have so many pixels for each point that anchors start from, sparse and dense together: more
-#: anchors than that cost time and are learnt by heart (choice; experiments/reports/few-cameras.md). Seldom seen places come first.
+#: anchors than that cost time and are learnt by heart (choice; reports/few-cameras.md). Seldom seen places come first.
 PIXELS_A_POINT = 180
 
 

@@ -8,7 +8,7 @@
             only anchors that a photograph shows are moved.
 `literal`   none of those. What remains ours has no reading without a choice: the threshold tau, the number of clusters'
             starts, the width of a ring, who owns a place, how volumes are weighted in scenes of another scale.
-`laptop`    a good result in minutes on a CPU; experiments/reports/choices.md says what each of its departures brings. Growth in
+`laptop`    a good result in minutes on a CPU; reports/choices.md says what each of its departures brings. Growth in
             blocks is plain: compensated growth (`--block.compensation.enabled`) lost where few cameras look, and places
             start by stereo there instead.
 """

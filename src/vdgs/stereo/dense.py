@@ -37,7 +37,7 @@ QUANTILES, MARGIN = (0.01, 0.99), 0.2
 #: Edges of cells are the least one times these. Keys have room for so many.
 SIZES = 2.0 ** np.arange(4)
 #: A cell holds a point where the confirmed pixels of all photographs in it would together cover so much of one of its
-#: faces: what is matched wrongly is strewn over many cells (choice; experiments/reports/few-cameras.md).
+#: faces: what is matched wrongly is strewn over many cells (choice; reports/few-cameras.md).
 LEAST_COVER = 0.05
 #: Points keep so many cells from each other: a surface cuts the corners of cells, and each corner would have its own.
 SPACING = 0.7

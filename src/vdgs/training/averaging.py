@@ -1,7 +1,7 @@
 """The mean of the last models that training passes through (Polyak and Juditsky, 1992), in place of the very last one.
 
 Where rates do not fade (features, log-scales), Adam ends about the optimum: where the last few photographs pulled it.
-What few photographs show is pulled farthest. The mean over many of those places is nearer (choice; experiments/reports/choices.md).
+What few photographs show is pulled farthest. The mean over many of those places is nearer (choice; reports/choices.md).
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ class Target:
         The background is a colour of the place, so a model can leave ground half transparent and borrow its colour:
         photographs alone do not object. Before any other background such a scene is a ghost, and its depth is wrong.
         The root pulls hardest where little is left to do, so that a small weight makes ground opaque and hardly bends
-        what is far from it (choice; experiments/reports/solid-ground.md).
+        what is far from it (choice; reports/solid-ground.md).
         """
         assert self.ground is not None
         counted = self.counted or (alpha.numel() if self.mask is None else max(int(self.mask.count_nonzero()), 1))
