@@ -63,7 +63,7 @@ WRONG = {
     "captures": lambda: reach(FLAT, np.zeros((5, 3)), np.zeros(3)),
     "evaluation, two that disagree": lambda: squared_error(*(np.zeros((n, 4, 3), np.uint8) for n in (4, 5))),
     "evaluation, another type": lambda: squared_error(*(np.zeros((4, 4, 3), np.float32) for _ in range(2))),
-    "comparators": lambda: basis(torch.zeros(5, 2), 1),
+    "spherical harmonics": lambda: basis(torch.zeros(5, 2), 1),
 }
 
 
