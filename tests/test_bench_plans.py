@@ -14,7 +14,6 @@ from experiments.bench.scenes import PUBLISHED, SCENES
 from experiments.bench.tables import TABLES
 from experiments.bench.worker import STAGES
 from vdgs.errors import VdgsError
-from vdgs.runs.keys import SINCE
 from vdgs.settings.checks import validate
 from vdgs.settings.method import block_training
 from vdgs.settings.plain import differences, to_dict
@@ -70,7 +69,7 @@ def test_the_ablations_change_what_they_are_named_after():
     assert settings["full"] == base
     assert (base.training.iterations, base.partition.blocks, base.block.iterations) == (100_000, 8, 50_000)
     assert settings["baseline"].training.iterations == 500_000
-    assert not settings["no-blocking"].partition.blocking
+    assert settings["no-blocking"].partition.blocks == 1
     assert settings["no-blocking"].block.compensation.enabled
     off = replace(base.block.compensation, enabled=False)
     assert settings["no-anchor-generation"] == replace(base, block=replace(base.block, compensation=off))
@@ -178,31 +177,6 @@ def test_runs_with_the_same_settings_are_one_run():
     assert len({run.folder for run in defaults}) == 1
     assert len(plan.runs) == 17 - 3
     assert len(plan.coarse) == 1
-
-
-def test_a_setting_that_came_later_leaves_older_runs_finished(monkeypatch):
-    def keys() -> list[str]:
-        made = make_plan("table2", Choices(scenes=("residence",), seeds=1))
-        return [f"{run.folder} {run.key({}, {})}" for run in made.coarse + made.runs]
-
-    def of_then(config) -> dict:
-        settings = to_dict(config)  # of everything, or of the coarse stage alone
-        for section, since in SINCE.items():
-            for part in (settings, settings.get(section, {})):
-                leave_out(part, since)
-        return settings
-
-    def leave_out(part: dict, since: dict) -> None:
-        for name, value in since.items():
-            if isinstance(value, dict) and name in part:
-                leave_out(part[name], value)
-            if not isinstance(value, dict) or part.get(name) == {}:
-                part.pop(name, None)
-
-    now = keys()
-    assert len(now) > 3
-    monkeypatch.setattr("experiments.bench.plan.to_dict", of_then)
-    assert keys() == now
 
 
 def test_the_coarse_row_trains_nothing_of_its_own():

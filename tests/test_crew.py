@@ -202,7 +202,7 @@ def test_photographs_give_way_to_blocks_that_a_person_asked_for():
 def test_people_are_told_what_blocks_and_their_photographs_take(question):
     work = Work(4, 2 * GB, photographs_bytes=10**11)
     with choose(ExecutorOptions(), work, Machine(4, 8 * GB), lambda: question) as chosen:
-        assert "a block takes at most 2.00 GB and 0.67 GB for photographs, of 8.00 GB free" in chosen.line
+        assert "a block takes at most 2.00 GB and 667 MB for photographs, of 8.00 GB free" in chosen.line
         assert chosen.line.startswith("3 at once")
         assert not chosen.notes
     with choose(ExecutorOptions(), replace(work, jobs=4), Machine(4, 8 * GB), lambda: question) as chosen:

@@ -31,8 +31,9 @@ def _two_cards(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_sets_are_complete():
-    assert operations.OPERATIONS == tuple(sorted(native.__all__)) == tuple(sorted(reference.__all__))
-    assert operations.OPERATIONS == tuple(sorted(composed.__all__)) == tuple(sorted(operations.ON_A_CARD))
+    assert tuple(sorted(operations.ON_A_CARD)) == operations.OPERATIONS
+    for name in operations.OPERATIONS:
+        assert all(callable(getattr(room, name)) for room in (native, reference, composed))
 
 
 @pytest.mark.parametrize("operation", operations.OPERATIONS)

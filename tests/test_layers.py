@@ -21,7 +21,7 @@ PACKAGE, EXPERIMENTS = ROOT / "src" / "vdgs", ROOT / "experiments"
 
 #: Lowest first. A room imports lower layers only: neither higher ones nor the other rooms of its own.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "cameras"),
+    ("errors", "cameras", "units"),
     ("settings", "storage"),
     ("kernels",),
     ("memory",),

@@ -134,10 +134,9 @@ def test_the_first_of_equally_near_cores_owns_a_place_and_no_place_is_no_trouble
         blocks.owner(np.array([[np.nan, 0.0]]))
 
 
-@pytest.mark.parametrize("config", [PartitionConfig(blocks=1), PartitionConfig(blocks=5, blocking=False)])
-def test_one_block_owns_everything(config: PartitionConfig) -> None:
+def test_one_block_owns_everything() -> None:
     positions, views = town(500)
-    blocks, warnings = cut_scene(positions, views, config, seed=0)
+    blocks, warnings = cut_scene(positions, views, PartitionConfig(blocks=1), seed=0)
     assert len(blocks) == 1
     assert warnings == []
     assert shapely.contains_xy(blocks.items[0].core, positions[:, :2]).all()
@@ -266,7 +265,6 @@ def test_the_number_of_blocks() -> None:
         return choose_block_count(anchors, cameras, 10**6, method)
 
     assert count(10**6, 500, blocks=3) == 3
-    assert count(10**6, 500, blocks=3, blocking=False) == 1
     assert [count(10**5, cameras, blocks="auto") for cameras in (33, 145, 400, 5000)] == [1, 1, 1, 1]
     # Memory asks for 20 blocks or so, photographs allow fewer.
     few = [count(2 * 10**6, cameras, blocks="auto", block_memory_gb=3.0) for cameras in (33, 145, 400)]

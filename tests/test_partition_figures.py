@@ -218,6 +218,6 @@ def test_axes_are_east_and_north_only_where_the_place_is_known() -> None:
 
 def test_a_cut_is_called_by_its_strategy() -> None:
     assert how_cut(PartitionConfig(lambda_vis=0.7)) == "λ_vis = 0.7"
-    assert how_cut(PartitionConfig(blocking=False)) == "not cut"
+    assert how_cut(PartitionConfig(blocks=1)) == "not cut"
     names = [how_cut(PartitionConfig(strategy=name)) for name in ("vastgaussian", "citygaussian", "dogs")]
     assert names == ["VastGaussian partition", "CityGaussian partition", "DOGS partition"]

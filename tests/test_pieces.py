@@ -235,7 +235,7 @@ def test_exposed_views_are_the_same_in_pieces_and_where_a_file_is_compared(uncut
     assert is_measured(RunFolder(run), "coarse", None, 4)
     status = json.loads((measured / "status.json").read_text())
     assert status.pop("exposed") == "interpolated and metered"
-    (measured / "status.json").write_text(json.dumps(status))  # as of a version that measured neutral colours
+    (measured / "status.json").write_text(json.dumps(status))  # as if measured in neutral colours
     assert not is_measured(RunFolder(run), "coarse", None, 4)
     done = vdgs("eval", run, "--jobs", "2", prepare=do_tasks_here)
     assert done.returncode == 0, done.stderr + done.stdout

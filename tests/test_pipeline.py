@@ -377,7 +377,7 @@ def test_a_missing_block_stops_the_merge_unless_the_coarse_model_may_stand_in(co
 
 
 def test_one_block_is_the_whole_scene_and_merging_it_the_identity(copied):
-    for command in (("partition", copied, "--no-blocking", "--redo"), ("train", copied), ("merge", copied)):
+    for command in (("partition", copied, "--blocks", "1", "--redo"), ("train", copied), ("merge", copied)):
         done = vdgs(*command, prepare=do_tasks_here)
         assert done.returncode == 0, done.stderr
     assert [path.name for path in (copied / "blocks").iterdir()] == ["00"]

@@ -119,7 +119,7 @@ def test_the_command_line_says_so_at_once(arguments, tmp_path, monkeypatch, caps
         ({"training": {"rates": {"offsets": [1]}}}, "must be a list of 2: a number, a number"),
         ({"training": {"anchors": 3}}, "not a group of settings"),
         ({"partition": {"blocks": "most"}}, "must be a whole number or auto"),
-        ({"partition": {"blocking": 1}}, "must be true or false"),
+        ({"partition": {"balanced": 1}}, "must be true or false"),
         ({"block": {"ring": "frozn"}}, "must be frozen or ramp or free"),
         ({"block": {"sampeling": "even"}}, "block has no 'sampeling'; did you mean 'sampling'"),
     ],

@@ -88,19 +88,16 @@ def step(monkeypatch: pytest.MonkeyPatch, stage: Stage, own: bool, narrowing: bo
         draw = loop.draw_view
         patch.setattr(loop, "draw_view", lambda *given: drawn.append(given) or draw(*given))
         train_step(state, stage)
-    ((_, camera, _, around, _),) = drawn
+    ((_, camera, _, around),) = drawn
     return Stepped(state, camera.width * camera.height, len(around.depths))
 
 
 def stages() -> dict[str, Stage]:
     stage, _ = block_stage(BlockConfig())
-    ground = [torch.ones(3, 4, dtype=torch.bool)] * stage.image_count
-    opaque = replace(stage.config, loss=replace(stage.config.loss, alpha_weight=0.05, background_noise=0.3))
     return {
         "whole": stage,
         "part": replace(stage, crops=(Crop(0.1, 0.1, 0.95, 0.9),) * stage.image_count),
         "masked": replace(stage, images=Masked()),
-        "opaque": replace(stage, config=opaque, ground=ground),
     }
 
 

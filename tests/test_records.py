@@ -1,4 +1,4 @@
-"""What stages note of themselves comes back as it was written, from older and newer versions too."""
+"""What stages note of themselves comes back as it was written."""
 
 import json
 
@@ -27,7 +27,7 @@ def test_what_is_read_is_what_was_written(record, written):
     assert record_of(type(record), json.loads(json.dumps(written(record)))) == record
 
 
-def test_files_of_newer_and_older_versions_are_read(tmp_path):
+def test_what_is_missing_or_foreign_in_a_status_is_left_out(tmp_path):
     folder = StageFolder(tmp_path)
     folder.status_file.write_text('{"state": "done", "seconds": 3, "psnr_training": null, "of_the_future": [1]}')
     assert folder.status() == Status("done", seconds=3.0)

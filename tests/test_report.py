@@ -17,7 +17,7 @@ from vdgs.report import write_report
 from vdgs.report.charts import running_median
 from vdgs.report.page import escaped
 from vdgs.report.pictures import MOST_BYTES, reduced
-from vdgs.report.words import duration, gain, memory
+from vdgs.report.words import gain
 from vdgs.runs.folder import RunFolder
 
 pytestmark = pytest.mark.xdist_group("report")
@@ -410,13 +410,5 @@ def test_running_medians_pass_over_gaps():
 
 
 def test_words():
-    assert [duration(s) for s in (None, 2.34, 59.6, 146.4, 7260)] == [
-        "–",
-        "2.3 s",
-        "1 min 00 s",
-        "2 min 26 s",
-        "2 h 01 min",
-    ]
-    assert [memory(b) for b in (None, 638_279_680, 1.5e9)] == ["–", "638 MB", "1.50 GB"]
     assert [gain(1.0, before) for before in (1.25, 1.001, None)] == ["−0.25", "+0.00", "–"]
     assert escaped("<a>&\"'\x01") == "&lt;a&gt;&amp;&quot;&#x27;\N{REPLACEMENT CHARACTER}"

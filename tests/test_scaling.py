@@ -17,7 +17,6 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.model.frustum import Frusta, project
-from vdgs.model.ground import solid_cells, solid_cells_of_all
 from vdgs.model.groups import GROUP, Groups
 from vdgs.model.sizes import REACH, SPAN, largest_log_scales
 from vdgs.partition import boundary
@@ -113,14 +112,6 @@ def test_bounds_of_sizes_are_those_of_all_cameras_asked_about_all_places() -> No
     assert held.isinf().any()
     assert held.isfinite().any()
     torch.testing.assert_close(largest_log_scales(places, cameras), expected, rtol=1e-6, atol=1e-6)
-
-
-def test_ground_of_many_pictures_is_that_of_each() -> None:
-    places, cameras = site(4000, 300.0), flight(25, 300.0)
-    together = solid_cells_of_all(places, cameras)
-    assert all(torch.equal(cells, solid_cells(places, camera)) for cells, camera in zip(together, cameras, strict=True))
-    nothing = solid_cells_of_all(places[:0], cameras)
-    assert all(torch.equal(a, solid_cells(places[:0], c)) for a, c in zip(nothing, cameras, strict=True))
 
 
 # ---------------------------------------------------------------------------------------- many blocks

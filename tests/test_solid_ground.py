@@ -1,11 +1,9 @@
-"""Solid ground: where pictures show it, what training asks of alpha there, and how large Gaussians may be."""
+"""Solid ground: where pictures show it, how it becomes opaque, and how large Gaussians may be."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,17 +14,14 @@ from hypothesis import strategies as st
 from block_support import block_stage
 from checkerboard import Photographs
 from vdgs.cameras import NEAR, Camera
-from vdgs.captures.capture import Capture, View
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.frustum import project
-from vdgs.model.ground import CELLS, at_size, known_cells, solid_cells
+from vdgs.model.ground import BELOW_HORIZON_DEG, below_horizon
 from vdgs.model.render import decode_view, render
 from vdgs.model.sizes import REACH, SPAN, SPREAD, largest_log_scales
-from vdgs.runs.ground import ground_of
-from vdgs.settings.method import AnchorConfig, BlockConfig, GrowthConfig, LossConfig
+from vdgs.settings.method import BlockConfig, GrowthConfig, LossConfig
 from vdgs.training import Stage, train
 from vdgs.training.background import background_at
-from vdgs.training.target import Target
 
 FOCAL, WIDTH, HEIGHT = 100.0, 200, 160
 
@@ -39,11 +34,6 @@ def camera_at(x: float = 0.0, height: float = 20.0, tilt: float = 0.0) -> Camera
     pose[:3, :3] = turn @ down
     pose[:3, 3] = -pose[:3, :3] @ np.array([x, 0.0, height])
     return Camera(pose, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
-
-
-def plain(step: float = 0.4, half: float = 60.0) -> torch.Tensor:
-    x, y = torch.meshgrid(torch.arange(-half, half, step), torch.arange(-half, half, step), indexing="ij")
-    return torch.stack([x.ravel(), y.ravel(), torch.zeros(x.numel())], dim=1)
 
 
 @settings(max_examples=20)
@@ -60,106 +50,20 @@ def test_points_fall_where_the_camera_says(seed, tilt):
     assert depth[inside].min(initial=1.0) > NEAR
 
 
-def wall(low: float = 0.0, high: float = 60.0, step: float = 0.4) -> torch.Tensor:
-    """A cliff 20 in front of a camera that looks along y from the origin, up to a height."""
-    x, z = torch.meshgrid(torch.arange(-60.0, 60.0, step), torch.arange(low, high, step), indexing="ij")
-    return torch.stack([x.ravel(), torch.full((x.numel(),), 20.0), z.ravel()], dim=1)
-
-
-#: Looks along y, at no height: the lower half of its picture lies below the horizon.
-LEVEL = camera_at(height=0.0, tilt=math.pi / 2)
-UPPER = slice(0, HEIGHT // 2)
-
-
-def wanted(points: torch.Tensor, camera: Camera) -> np.ndarray:
-    return at_size(solid_cells(points, camera), WIDTH, HEIGHT).numpy()
-
-
 @settings(max_examples=20)
-@given(tilt=st.floats(-0.4, 0.4))
-def test_below_the_horizon_there_is_no_sky(tilt):
-    """Whatever is known of the place: water and woods may hold no sparse points."""
-    assert wanted(torch.zeros(0, 3), camera_at(tilt=tilt)).all()
+@given(tilt=st.floats(-1.5, 1.5))
+def test_pixels_well_below_the_horizon_show_no_sky(tilt):
+    camera = camera_at(tilt=tilt)
+    below = below_horizon(camera, HEIGHT, WIDTH)
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+    rays = np.stack([x / FOCAL, y / FOCAL, np.ones_like(x)], axis=-1)
+    up = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ camera.camera_from_world[:3, :3][:, 2]
+    down = np.degrees(np.arcsin(-up))
+    assert below[down > BELOW_HORIZON_DEG + 0.01].all()
+    assert not below[down < BELOW_HORIZON_DEG - 0.01].any()
 
 
-def test_sky_is_left_alone():
-    for camera in (camera_at(tilt=1.5), camera_at(tilt=1.3)):
-        horizon = camera.project(np.array([[0.0, 1e6, 0.0]]))[0][0, 1]
-        cell, limit = WIDTH / CELLS, FOCAL * 2 * math.tan(math.radians(5.0))
-        below, above = np.arange(HEIGHT) > horizon + cell + limit, np.arange(HEIGHT) < horizon
-        for points in (torch.zeros(0, 3), plain(step=0.1)):
-            assert wanted(points, camera)[below].all()
-            assert not wanted(points, camera)[above].any()
-
-
-def test_what_stands_above_the_horizon_is_solid_but_for_its_border():
-    top = 6.0
-    picture = wanted(wall(high=top), LEVEL)
-    edge, cell = HEIGHT / 2 - FOCAL * top / 20.0, WIDTH / CELLS
-    assert not picture[: math.floor(edge)].any()
-    assert picture[math.ceil(edge + 2 * cell) : HEIGHT // 2 - 1].all()
-
-
-def test_a_hole_that_known_ground_encloses_is_known_and_one_that_it_does_not_is_none():
-    points = wall()
-    window = (points[:, [0, 2]] - torch.tensor([0.0, 8.0])).norm(dim=1) > 4
-    assert wanted(points[window], LEVEL)[UPPER].all()
-    half = wanted(points[points[:, 0] < 0], LEVEL)[UPPER]
-    edge = WIDTH / CELLS
-    assert half[:, : int(WIDTH / 2 - 2 * edge)].all()
-    assert not half[: HEIGHT // 4, WIDTH // 2 :].any()
-
-
-def test_ground_that_no_camera_sees_is_not_known():
-    cameras = [camera_at(x) for x in (-20.0, 0.0, 20.0, 30.0)]
-    points = plain(2.0).double().numpy()
-    views = tuple(View(f"{i}.png", camera, Path(f"{i}.png"), None, "train") for i, camera in enumerate(cameras))
-    frame: Any = None  # asked by nobody
-    capture = Capture(Path(), "colmap", "images", views, points, np.zeros(points.shape, np.uint8), frame)
-    known = ground_of(capture, AnchorConfig(voxel=2.0)).double().numpy()
-    times = sum(camera.sees(known).astype(int) for camera in cameras)
-    assert 0 < len(known) < len(points)
-    assert times.min() == 1
-
-
-def test_no_ground_at_all_is_not_known():
-    assert not known_cells(torch.zeros(0, 3), camera_at()).any()
-
-
-# ------------------------------------------------------------------------------------------ the term of the loss
-
-
-def target(ground: torch.Tensor, mask: torch.Tensor | None = None) -> Target:
-    height, width = ground.shape
-    return Target(torch.zeros(height, width, 3, dtype=torch.uint8), mask, ground, camera_at())
-
-
-@pytest.mark.parametrize("masked", [False, True])
-def test_the_gradient_of_transparency_is_that_of_finite_differences(masked):
-    generator = torch.Generator().manual_seed(0)
-    alpha = torch.rand(5, 7, generator=generator, dtype=torch.float64)
-    mask = (torch.rand(5, 7, generator=generator) > 0.3).to(torch.uint8) if masked else None
-    ground = torch.rand(5, 7, generator=generator) > 0.3
-    term = target(ground if mask is None else ground & (mask > 0), mask)
-    _, gradient = term.transparency(alpha, 0.3)
-    for pixel in np.ndindex(5, 7):
-        step = torch.zeros_like(alpha)
-        step[pixel] = 1e-6
-        above, below = (term.transparency(alpha + sign * step, 0.3)[0] for sign in (1, -1))
-        assert float(gradient[pixel]) == pytest.approx(float(above - below) / 2e-6, rel=1e-5, abs=1e-12)
-
-
-def test_opaque_ground_costs_nothing_and_what_is_no_ground_neither():
-    ground = torch.zeros(4, 6, dtype=torch.bool)
-    ground[:, :3] = True
-    opaque, clear = torch.ones(4, 6), torch.ones(4, 6)
-    clear[:, 3:] = 0.0
-    assert float(target(ground).transparency(opaque, 0.5)[0]) == pytest.approx(0.0, abs=1e-7)
-    cost, gradient = target(ground).transparency(clear, 0.5)
-    assert float(cost) == pytest.approx(0.0, abs=1e-7)
-    assert not gradient[:, 3:].any()
-    half = float(target(ground).transparency(torch.zeros(4, 6), 0.5)[0])
-    assert half == pytest.approx(0.5 * 0.5, rel=0.05)  # half of the pixels, weight a half
+# ------------------------------------------------------------------------------------------ backgrounds
 
 
 class Grey(Photographs):
@@ -169,28 +73,22 @@ class Grey(Photographs):
         return torch.full_like(super().get(index, downscale)[0], 128), None
 
 
-def light_through(loss: LossConfig, photographs: Photographs) -> float:
+def light_through(loss: LossConfig) -> float:
     """The median of 1 - alpha, of a model that was trained before the colour of grey."""
     stage, state = block_stage(BlockConfig())
     config = replace(stage.config, iterations=300, loss=loss, growth=GrowthConfig(levels=0, start=10_000))
-    ground, grey = [torch.ones(24, 32, dtype=torch.bool)] * 8, (128 / 255,) * 3
-    stage = replace(
-        stage, config=config, background=grey, surroundings=None, ground=ground, images=photographs
-    )  # fmt: skip
+    photographs, grey = Grey(), (128 / 255,) * 3
+    stage = replace(stage, config=config, background=grey, surroundings=None, images=photographs)
     train(state, stage, stop=lambda: False, after_step=lambda *_: None)
     model = AnchorModel(*state.result(), stage.voxel, grey, {})
     return float((1.0 - render(model, photographs.camera(0)).alpha.clamp(0, 1)).quantile(0.5))
 
 
-@pytest.mark.parametrize(
-    ("means", "photographs"),
-    [(LossConfig(), Grey()), (LossConfig(alpha_weight=0.05, background_noise=0.0), Photographs())],
-)
-def test_ground_becomes_opaque_although_the_background_has_its_colour(means, photographs):
-    """Without any means light shines through, with one nearly none does."""
-    board = light_through(means, photographs)
+def test_ground_becomes_opaque_although_the_background_has_its_colour():
+    """Without backgrounds of random colour light shines through, with them nearly none does."""
+    board = light_through(LossConfig())
     assert board < 0.02
-    assert light_through(LossConfig(background_noise=0.0), photographs) > 3 * board
+    assert light_through(LossConfig(background_noise=0.0)) > 3 * board
 
 
 def test_backgrounds_are_of_all_colours_the_same_for_a_seed_and_no_others_without_noise():

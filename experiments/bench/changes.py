@@ -42,7 +42,7 @@ def without_blocking(config: MethodConfig, budget: Budget) -> MethodConfig:
     one = budget.shared_by(1)
     return replace(
         config,
-        partition=replace(config.partition, blocking=False, blocks=1),
+        partition=replace(config.partition, blocks=1),
         block=replace(config.block, iterations=one.per_block),
     )
 
@@ -216,11 +216,6 @@ def with_gamma(value: float) -> Change:
 def with_literal_gate(config: MethodConfig, _budget: Budget) -> MethodConfig:
     """Offsets of low visibility are judged after as many draws as the others."""
     return compensated(config, gate="literal")
-
-
-def with_cap(thresholds: float) -> Change:
-    """The cache g grows to so many thresholds of growth at most."""
-    return lambda config, _: compensated(config, cap=thresholds * config.block.growth.threshold)
 
 
 def partitioned_by(strategy: PartitionStrategy) -> Change:

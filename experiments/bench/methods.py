@@ -32,7 +32,6 @@ from experiments.bench.changes import (
     with_assignment,
     with_beta_g,
     with_block,
-    with_cap,
     with_compensation_of_sums,
     with_gamma,
     with_lambda_vis,
@@ -263,7 +262,6 @@ _CHOICES = [
         best_seen(with_block(ring="ramp", decoder="frozen")), differs="to be read against `ramp`",
     ),
     Method("literal-gate", "literal gate", with_literal_gate),
-    Method("cap", "g capped at 4 thresholds", with_cap(4)),
 ]  # fmt: skip
 _WHOLE = "whole photographs"
 _AS_PRINTED = f"{_WHOLE}; all other settings of compensation are the paper's"

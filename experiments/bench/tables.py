@@ -53,7 +53,7 @@ CHOICES = (
     "full", "frozen-decoder", "even-sampling", "by-votes", "printed-rates", "damped-rates", "half-size", "last-model",
     "whole-photographs", "no-anchor-generation", "printed-compensation", "compensation-of-sums", "share-0.45",
     "literal-assignment", "leave-one-out", "frustum", "no-context", "free-ring", "free-best-seen", "ramp",
-    "ramp-best-seen", "literal-gate", "cap", "dense-adam", "printed", "printed-damped",
+    "ramp-best-seen", "literal-gate", "dense-adam", "printed", "printed-damped",
 )  # fmt: skip
 
 #: Every table by name.

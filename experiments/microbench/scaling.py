@@ -156,12 +156,11 @@ def _assignment(case: Case, folder: Path) -> Work:
 
 
 def _start(case: Case, folder: Path) -> Work:
-    from vdgs.model.ground import solid_cells_of_all
     from vdgs.model.sizes import largest_log_scales
 
     positions = torch.from_numpy(made_up.places(case.anchors, made_up.extent_of(case.photographs)))
     cameras = made_up.flight(case.photographs)
-    return lambda: (largest_log_scales(positions, cameras), solid_cells_of_all(positions, cameras))
+    return lambda: largest_log_scales(positions, cameras)
 
 
 def _save(case: Case, folder: Path) -> Work:

@@ -42,7 +42,6 @@ from vdgs.storage.checkpoints import save_state
 from vdgs.training import Stage, Surroundings, start_state, to_saved
 from vdgs.training.optimiser import rates_at
 from vdgs.training.step import draw_view, move_anchors
-from vdgs.training.target import Target
 
 PHASES = ("cull", "decode", "around", "rasterise", "loss", "solid", "backward", "move", "statistics")
 
@@ -106,9 +105,7 @@ def one_step(
         return torch.autograd.grad(photometric.loss, view.image)[0]
 
     image_gradient = timed("loss", loss)
-    whole = Target(target, None, torch.ones(target.shape[:2], dtype=torch.bool, device=device), camera)
-    _, alpha_gradient = timed("solid", lambda: whole.transparency(view.alpha, 0.02))
-    gradients = timed("backward", lambda: view.backward(image_gradient, alpha_gradient, 0.01))
+    gradients = timed("backward", lambda: view.backward(image_gradient, 0.01))
 
     def move() -> None:
         states = state.optimiser.anchor_states(state.anchors, rates, TrainConfig().early)

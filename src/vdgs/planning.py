@@ -20,7 +20,7 @@ from vdgs.captures.reconstruction import read_reconstruction
 from vdgs.errors import VdgsError
 from vdgs.executors.placement import Work, exceeds, on_this_machine
 from vdgs.kernels import threads as threads_available
-from vdgs.memory.estimate import GROWTH, decoded_bytes, estimate, in_gb, largest_picture, need_of_block
+from vdgs.memory.estimate import GROWTH, decoded_bytes, estimate, largest_picture, need_of_block
 from vdgs.memory.process import available_bytes
 from vdgs.partition.cut import choose_block_count
 from vdgs.runs.beginning import reads_otherwise, run_settings
@@ -37,6 +37,7 @@ from vdgs.sfm.request import of_photographs, sfm_request
 from vdgs.stages.coarse import open_stage, start
 from vdgs.storage.files import read_json
 from vdgs.training import TrainingState, train
+from vdgs.units import data_size, rough_duration
 from vdgs.watching.images import image_budget
 from vdgs.watching.interrupts import stop_if_asked
 from vdgs.watching.memory_notes import need_of
@@ -181,18 +182,18 @@ def _say(plan: Plan, method: MethodConfig, standing: RunStanding | None, console
         return "; done already" if whole else ""
 
     blocks = f"{plan.blocks} block{'' if plan.blocks == 1 else 's'}"
-    chosen = " by estimate: --blocks auto counts again when anchors have grown" if method.partition.blocks == "auto" \
-        and method.partition.blocking else ""  # fmt: skip
+    auto = method.partition.blocks == "auto"
+    chosen = " by estimate: --blocks auto counts again when anchors have grown" if auto else ""
     per_block = _times(plan.blocks_seconds)
     stereo = f" (and at most {plan.dense_points:,} where stereo finds ground)" if plan.dense_points else ""
     names = [stage.name for stage in standing.blocks] if standing is not None else []
     lines = [
         f"coarse model: {plan.anchors:,} anchors at the start{stereo}, {plan.coarse_iterations:,} iterations, at most "
-        f"{in_gb(plan.coarse_bytes)}, {_times(plan.coarse_seconds)}{done('coarse')}",
+        f"{data_size(plan.coarse_bytes)}, {_times(plan.coarse_seconds)}{done('coarse')}",
         f"{blocks}{chosen}: about {plan.block_iterations:,} iterations each, {plan.jobs} at once, at most "
-        f"{in_gb(plan.block_bytes)} each and {in_gb(plan.photographs_bytes)} for photographs, "
+        f"{data_size(plan.block_bytes)} each and {data_size(plan.photographs_bytes)} for photographs, "
         f"{per_block}{done(*names)}",
-        f"memory that is free: {in_gb(plan.free_bytes)}",
+        f"memory that is free: {data_size(plan.free_bytes)}",
         "Times are of training alone, from steps timed now on this machine; the larger one is with "
         f"{GROWTH:g} times as many anchors{', and with those of stereo' if plan.dense_points else ''}. Nothing was "
         "written.",
@@ -206,12 +207,5 @@ def _say(plan: Plan, method: MethodConfig, standing: RunStanding | None, console
 
 
 def _times(seconds: Sequence[float]) -> str:
-    low, high = (_duration(each) for each in seconds)
+    low, high = (rough_duration(each) for each in seconds)
     return f"{low} to {high}" if low != high else f"about {low}"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{max(1, round(seconds))} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 120 else f"{minutes / 60:.1f} h"

@@ -20,6 +20,7 @@ from typing import Any
 
 from vdgs.doctor.check import Check
 from vdgs.memory.groups import group_limits
+from vdgs.units import data_size
 
 #: What each extra adds, for people; an extra that is not listed is reported without a sentence.
 EXTRAS = {
@@ -122,8 +123,8 @@ def _memory() -> list[Check]:
     free = min([memory.available, *(group.free for group in groups)])
     if total < memory.total:
         by = "by a control group (container, SLURM job, systemd unit)"
-        return [Check("memory", "ok", f"{_gb(free)} free, limited to {_gb(total)} {by}")]
-    return [Check("memory", "ok", f"{_gb(free)} free of {_gb(total)}")]
+        return [Check("memory", "ok", f"{data_size(free)} free, limited to {data_size(total)} {by}")]
+    return [Check("memory", "ok", f"{data_size(free)} free of {data_size(total)}")]
 
 
 def _torch() -> list[Check]:
@@ -133,7 +134,7 @@ def _torch() -> list[Check]:
     if torch.cuda.is_available():
         for index in range(torch.cuda.device_count()):
             device = torch.cuda.get_device_properties(index)
-            checks.append(Check(f"GPU {index}", "ok", f"{device.name}, {_gb(device.total_memory)}"))
+            checks.append(Check(f"GPU {index}", "ok", f"{device.name}, {data_size(device.total_memory)}"))
     elif shutil.which("nvidia-smi"):
         advice = "pip install --force-reinstall torch (the default build has CUDA); nvidia-smi tests the driver."
         checks.append(Check("GPU", "note", "there is an NVIDIA driver, but this torch cannot use it", advice))
@@ -202,7 +203,7 @@ def _film() -> list[Check]:
 
 def _disk() -> list[Check]:
     usage = shutil.disk_usage(Path.cwd())
-    value = f"{_gb(usage.free)} free of {_gb(usage.total)} in {Path.cwd()}"
+    value = f"{data_size(usage.free)} free of {data_size(usage.total)} in {Path.cwd()}"
     if usage.free < LITTLE_DISK_BYTES:
         return [Check("disk", "note", value, "Free some space: a run with its blocks may take several GB.")]
     return [Check("disk", "ok", value)]
@@ -258,10 +259,6 @@ def _attempt(look: Callable[[], str]) -> str | None:
         return look()
     except Exception:  # a missing figure is shown as missing
         return None
-
-
-def _gb(size_bytes: int) -> str:
-    return f"{size_bytes / 1e9:.1f} GB"
 
 
 LOOKS: tuple[Callable[[], list[Check]], ...] = (

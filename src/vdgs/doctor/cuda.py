@@ -8,6 +8,7 @@ from vdgs.kernels.cuda.driver import CudaDriver, cuda_driver
 from vdgs.kernels.cuda.nvrtc import CudaUnavailable, Nvrtc, nvrtc
 from vdgs.kernels.devices import choose
 from vdgs.kernels.operations import OPERATIONS, taken
+from vdgs.units import data_size
 
 
 def looks() -> list[Check]:
@@ -25,7 +26,7 @@ def _cards() -> list[Check]:
     return [
         Check(
             f"CUDA card {card.index}", "ok",
-            f"{card.name}, {card.memory_bytes / 1e9:.1f} GB, compute capability {card.capability[0]}."
+            f"{card.name}, {data_size(card.memory_bytes)}, compute capability {card.capability[0]}."
             f"{card.capability[1]}; driver for CUDA {major}.{minor}",
         )
         for card in cards

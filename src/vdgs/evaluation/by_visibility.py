@@ -147,9 +147,8 @@ def view_bins(
 
 
 def bounds_of(lower: float, upper: float) -> str:
-    """The least and the greatest V of a bin for people: `3 to 5`, or `4`. Earlier versions measured fractions too."""
-    ends = [f"{end:,.0f}" if end == round(end) else f"{end:.3g}" for end in (lower, upper)]
-    return " to ".join(dict.fromkeys(ends))
+    """The least and the greatest V of a bin for people: `3 to 5`, or `4`."""
+    return " to ".join(dict.fromkeys(f"{end:,.0f}" for end in (lower, upper)))
 
 
 def mean_or_none(values: Sequence[float | None]) -> float | None:

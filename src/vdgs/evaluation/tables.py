@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from vdgs.evaluation.by_visibility import bounds_of
+from vdgs.units import data_size
 
 #: key in metrics.json, what people call it, format
 FIGURES = (
@@ -105,5 +106,5 @@ def _model_line(result: Mapping[str, Any]) -> str:
     if result["train_seconds"] is not None:
         parts.append(f"trained in {result['train_seconds']:,.0f} s")
     if result["peak_memory_bytes"] is not None:
-        parts.append(f"peak memory {result['peak_memory_bytes'] / 1e9:.2f} GB")
+        parts.append(f"peak memory {data_size(result['peak_memory_bytes'])}")
     return " · ".join(parts)

@@ -10,8 +10,8 @@ from vdgs.executors.executor import Executor
 from vdgs.executors.fitness import Question
 from vdgs.executors.local import LocalExecutor
 from vdgs.executors.placement import Share, Work, by_queue, exceeds, on_cluster, on_this_machine
-from vdgs.memory.estimate import in_gb
 from vdgs.settings.executors import ExecutorOptions
+from vdgs.units import data_size
 
 #: Seconds to wait for what still holds a piece of work: NFS lets go of what a lost node held after a minute and a half.
 PATIENCE_SECONDS = 300.0
@@ -74,10 +74,10 @@ def refuse_unreachable(asked: ExecutorOptions) -> None:
 def _local(work: Work, machine: Machine) -> Chosen:
     share = on_this_machine(work, machine.cores, machine.free_bytes)
     photographs = min(work.photographs_bytes, round(1e9 * share.image_gb))
-    beside = f" and {in_gb(photographs)} for photographs" if photographs else ""
+    beside = f" and {data_size(photographs)} for photographs" if photographs else ""
     line = (
         f"{share.at_once} at once with {share.needs.processors} thread(s) each; by estimate a {work.kind.one} takes "
-        f"at most {in_gb(work.piece_bytes)}{beside}, of {in_gb(machine.free_bytes)} free"
+        f"at most {data_size(work.piece_bytes)}{beside}, of {data_size(machine.free_bytes)} free"
     )
     note = (
         f"[yellow]warning[/] {share.at_once} at once may run out of memory. What helps: "
@@ -104,8 +104,8 @@ def _ray(asked: ExecutorOptions, work: Work, question: Question) -> Chosen:
         notes.append(f"[yellow]note[/] no node has {_needs(share)} now: {work.kind.many} wait until one joins that has")
     if needs.memory_bytes and needs.memory_bytes < work.piece_bytes:
         notes.append(
-            f"[yellow]warning[/] by estimate a {work.kind.one} takes at most {in_gb(work.piece_bytes)}, more than any "
-            "node has." + (f" What helps: {', '.join(work.kind.smaller)}" if work.kind.smaller else "")
+            f"[yellow]warning[/] by estimate a {work.kind.one} takes at most {data_size(work.piece_bytes)}, more than "
+            "any node has." + (f" What helps: {', '.join(work.kind.smaller)}" if work.kind.smaller else "")
         )
     processors = sorted({answer["processor"] for answer in answers})
     if len(processors) > 1:
@@ -136,7 +136,7 @@ def _needs(share: Share) -> str:
     needs = share.needs
     parts = [f"{needs.processors} processor{'s' if needs.processors > 1 else ''}"]
     if needs.memory_bytes:
-        parts.append(in_gb(needs.memory_bytes))
+        parts.append(data_size(needs.memory_bytes))
     if needs.gpus:
         parts.append(f"{needs.gpus:g} GPU")
     return ", ".join(parts)

@@ -18,8 +18,8 @@ from vdgs.errors import VdgsError
 from vdgs.executors.engine import DONE, EXPLAINED, STOPPED, Attempt, End, Engine
 from vdgs.executors.executor import EndState, Listener, Outcome, Task
 from vdgs.executors.output import explanation, last_lines
-from vdgs.memory.estimate import in_gb
 from vdgs.runs.stage_folder import StageFolder
+from vdgs.units import data_size
 from vdgs.watching.interrupts import stop_requests
 
 #: Seconds that tasks get to save when this process fails itself, and between two looks at them meanwhile.
@@ -252,9 +252,9 @@ class _Crew:
         needs = work.task.needs
         more = min(round(MORE_MEMORY * needs.memory_bytes), max(most, needs.memory_bytes))
         if more <= needs.memory_bytes:
-            return f"no node has more than the {in_gb(needs.memory_bytes)} that it asked for"
+            return f"no node has more than the {data_size(needs.memory_bytes)} that it asked for"
         work.task = replace(work.task, needs=replace(needs, memory_bytes=more))
-        return f"it asks for {in_gb(more)} now"
+        return f"it asks for {data_size(more)} now"
 
     def _end(self, work: _Work, state: EndState, why: str = "") -> None:
         seconds = time.monotonic() - work.began if work.attempts and work.began else 0.0

@@ -15,8 +15,9 @@ from vdgs.executors.executor import Executor, Needs, Outcome, Task
 from vdgs.executors.kinds import BLOCKS, Kind
 from vdgs.executors.lines import Lines
 from vdgs.executors.progress import PieceProgress, read_figures
-from vdgs.executors.table import STYLES, Board, duration
+from vdgs.executors.table import STYLES, Board
 from vdgs.runs.stage_folder import StageFolder
+from vdgs.units import clock
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ class _Watcher(Lines):
             self.say(f"{task.name}: failed", STYLES[outcome.state])
             self.say("\n".join(f"  {line}" for line in outcome.last_lines or outcome.why.splitlines()), "")
         elif outcome.attempts:
-            took = f"{duration(outcome.seconds)}{_attempt(outcome.attempts)}"
+            took = f"{clock(outcome.seconds)}{_attempt(outcome.attempts)}"
             self._board.note(f"{task.name}: {outcome.state} after {took}")
         if outcome.attempts and outcome.state != "done":
             _note_end(piece.folder, outcome)

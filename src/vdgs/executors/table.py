@@ -13,6 +13,7 @@ from rich.table import Table
 
 from vdgs.executors.kinds import BLOCKS, Kind
 from vdgs.executors.progress import PieceProgress, State, seconds_left_overall
+from vdgs.units import ABSENT, clock, data_size
 
 #: Seconds between two summary lines where there is no terminal to redraw.
 PLAIN_SECONDS = 15.0
@@ -92,14 +93,8 @@ def progress_line(rows: list[PieceProgress], at_once: int, kind: Kind = BLOCKS) 
         if row.state == "running"
     ]
     left = seconds_left_overall(rows, at_once)
-    parts = [f"{kind.many}: {_states(rows)}", *running] + ([f"about {duration(left)} left"] if left is not None else [])
+    parts = [f"{kind.many}: {_states(rows)}", *running] + ([f"about {clock(left)} left"] if left is not None else [])
     return " · ".join(parts)
-
-
-def duration(seconds: float) -> str:
-    """h:mm:ss."""
-    whole = round(seconds)
-    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
 def _chosen(rows: list[PieceProgress], most: int) -> list[PieceProgress]:
@@ -118,7 +113,7 @@ def _states(rows: Sequence[PieceProgress]) -> str:
 def _iteration(row: PieceProgress) -> str:
     figures = row.figures
     if figures.iteration is None:
-        return "starting" if row.state == "running" else "–"
+        return "starting" if row.state == "running" else ABSENT
     return f"{figures.iteration:,}" + (f"/{figures.iterations:,}" if figures.iterations is not None else "")
 
 
@@ -132,8 +127,8 @@ def _cells(row: PieceProgress) -> list[str]:
         _shown(figures.anchors, "{:,}"),
         _shown(row.speed if running else None, "{:.1f}"),
         _shown(row.seconds_left if running else None),
-        _gigabytes(figures.memory_bytes),
-        str(row.attempts) if row.attempts else "–",
+        data_size(figures.memory_bytes, decimals=1),
+        str(row.attempts) if row.attempts else ABSENT,
     ]
 
 
@@ -151,7 +146,7 @@ def _totals(rows: list[PieceProgress], at_once: int) -> list[str]:
         _shown(sum(anchors) if anchors else None, "{:,}"),
         _shown(sum(speeds) if speeds else None, "{:.1f}"),
         _shown(seconds_left_overall(rows, at_once)),
-        _gigabytes(sum(memory) if memory else None),
+        data_size(sum(memory) if memory else None, decimals=1),
         "",
     ]
 
@@ -163,14 +158,10 @@ def _percent(rows: list[PieceProgress]) -> str:
         iteration, iterations = row.figures.iteration, row.figures.iterations
         share = min((iteration or 0) / iterations, 1.0) if iterations else 0.0
         shares.append(1.0 if row.state == "done" else share)
-    return f"{100 * sum(shares) / len(shares):.0f} %" if shares else "–"
+    return f"{100 * sum(shares) / len(shares):.0f} %" if shares else ABSENT
 
 
 def _shown(value: float | None, form: str | None = None) -> str:
     if value is None:
-        return "–"
-    return form.format(value) if form else duration(value)
-
-
-def _gigabytes(count: int | None) -> str:
-    return "–" if count is None else f"{count / 1e9:.1f} GB"
+        return ABSENT
+    return form.format(value) if form else clock(value)

@@ -30,6 +30,7 @@ from vdgs.runs.opening import OpenedModel, open_capture, open_model
 from vdgs.settings.ranges import refuse
 from vdgs.settings.requests import BYTES_PER_PIXEL, LARGEST_SIDE_PX, RenderRequest
 from vdgs.storage.files import write_array
+from vdgs.units import data_size
 from vdgs.watching.interrupts import stop_if_asked
 
 #: Pace of a film of separate views.
@@ -188,7 +189,7 @@ def _refuse_large(asked: RenderRequest, cameras: list[Camera]) -> None:
     need, free = largest.width * largest.height * BYTES_PER_PIXEL, available_bytes()
     if need > free:
         raise VdgsError(
-            f"{where}a picture of {size} takes about {need / 1e9:.1f} GB to draw, and {free / 1e9:.1f} GB are free. "
+            f"{where}a picture of {size} takes about {data_size(need)} to draw, and {data_size(free)} are free. "
             "Give a smaller --width."
         )
 

@@ -133,7 +133,7 @@ class Operations(Protocol):
     def morton_order(self, positions: Tensor) -> Tensor: ...
 
 
-#: The names of the operations.
+#: The names of the operations: each implementation's `__init__` imports them under these.
 OPERATIONS = tuple(sorted(name for name in vars(Operations) if not name.startswith("_")))
 
 #: By which implementation (a folder of `vdgs.kernels`) each operation is done on an NVIDIA card: torch's own arithmetic

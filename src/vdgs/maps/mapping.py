@@ -39,6 +39,7 @@ from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import find_model, open_capture, open_run
 from vdgs.settings.requests import MapRequest
 from vdgs.storage.files import jsonable, read_record, write_json
+from vdgs.units import data_size
 from vdgs.watching.interrupts import stop_if_asked
 
 #: What a map takes on the disk while it is written, in parts of its uncompressed size: tiles, overviews, the result.
@@ -148,13 +149,13 @@ def _announce(plan: Plan, console: Console, in_pieces: bool = False) -> None:
     across, along = grid.width * grid.gsd, grid.height * grid.gsd
     console.print(
         f"map: {grid.width} x {grid.height} pixels of {grid.gsd:g} {placement.unit}, {across:.1f} x {along:.1f} "
-        f"{placement.unit}, {placement.name}; heights {placement.heights}; at most {_size(needed)} on the disk",
+        f"{placement.unit}, {placement.name}; heights {placement.heights}; at most {data_size(needed)} on the disk",
         highlight=False,
     )
     if needed > free:
         raise VdgsError(
-            f"{folder}: the map may take {_size(needed)} while it is written, and {_size(free)} are free. Give a "
-            f"larger --gsd than {grid.gsd:g}, a smaller --bbox, or an --output on another disk."
+            f"{folder}: the map may take {data_size(needed)} while it is written, and {data_size(free)} are free. Give "
+            f"a larger --gsd than {grid.gsd:g}, a smaller --bbox, or an --output on another disk."
         )
 
 
@@ -208,7 +209,3 @@ def _facts(plan: Plan) -> dict[str, Any]:
         "training_cameras": len(capture.train_views),
         "notes": list(placement.notes),
     }  # fmt: skip
-
-
-def _size(count: int) -> str:
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"

@@ -11,6 +11,7 @@ from typing import Literal
 
 from vdgs.cameras import Camera
 from vdgs.settings.method import CompensationConfig, MethodConfig, Resolutions, block_limit
+from vdgs.units import data_size
 
 Kind = Literal["coarse", "block"]
 
@@ -93,7 +94,7 @@ class Advice:
     saves: int
 
     def __str__(self) -> str:
-        return f"{self.setting} saves about {in_gb(self.saves)}"
+        return f"{self.setting} saves about {data_size(self.saves)}"
 
 
 def most_growth(config: CompensationConfig) -> float:
@@ -202,14 +203,9 @@ def _fewer_anchors(need: Need, kind: Kind, to_save: int) -> Advice:
 
 def describe(found: Estimate, room: int) -> str:
     """One line: what is needed, what for, and what there is."""
-    grown = f", {in_gb(found.grown_anchors)} once they have grown" if found.grown_anchors > found.anchors else ""
+    grown = f", {data_size(found.grown_anchors)} once they have grown" if found.grown_anchors > found.anchors else ""
     return (
-        f"memory by estimate: {in_gb(found.start)} at the start, {in_gb(found.total)} at most (photographs "
-        f"{in_gb(found.images)}, one picture {in_gb(found.picture)}, anchors {in_gb(found.anchors)}{grown}); "
-        f"this process may take {in_gb(room)}"
+        f"memory by estimate: {data_size(found.start)} at the start, {data_size(found.total)} at most (photographs "
+        f"{data_size(found.images)}, one picture {data_size(found.picture)}, anchors "
+        f"{data_size(found.anchors)}{grown}); this process may take {data_size(room)}"
     )
-
-
-def in_gb(size: int) -> str:
-    """Bytes for people."""
-    return f"{size / 1e9:.2f} GB" if size < 10e9 else f"{size / 1e9:.0f} GB"

@@ -36,9 +36,9 @@ def cut_scene(
     "auto" (`choose_block_count`).
     """
     ground = _checked(positions, visibility)
-    if config.blocking and config.blocks == "auto":
+    if config.blocks == "auto":
         raise ValueError("the number of blocks is still 'auto': choose_block_count first")
-    count = int(config.blocks) if config.blocking else 1
+    count = config.blocks
     if count < 1:
         raise VdgsError(f"--blocks {count}: a scene is cut into at least 1 block")
     if count == 1:
@@ -93,8 +93,6 @@ def choose_block_count(n_anchors: int, n_cameras: int, image_pixels: int, method
     allows. Few, because blocks cost steps: of one total, a place gets fewer the more there are (reports/findings.md).
     """
     config = method.partition
-    if not config.blocking:
-        return 1
     if config.blocks != "auto":
         return config.blocks
     most = max(1, min(n_cameras // CAMERAS_PER_BLOCK, n_anchors))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from vdgs.report.page import Html, details, paragraph, preformatted, section, table
 from vdgs.report.reading import Record, Shown, Source
 from vdgs.report.training import block_names
-from vdgs.report.words import duration, memory
+from vdgs.units import data_size, duration
 
 #: Characters of config.yaml that are shown.
 LONGEST_SETTINGS = 60_000
@@ -20,7 +20,7 @@ def costs_section(shown: Shown) -> Html:
     if counted:
         seconds = [record.number("seconds") or 0.0 for record in counted]
         peaks = [record.number("peak_memory_bytes") or 0.0 for record in counted]
-        rows.append(["sum, highest", duration(sum(seconds)), memory(max(peaks)), ""])
+        rows.append(["sum, highest", duration(sum(seconds)), data_size(max(peaks)), ""])
     parts = [
         table(["stage", "time", "peak memory", "state"], rows, CAPTION),
         Html("") if rows else paragraph("No stage has run yet.", "absent"),
@@ -29,7 +29,7 @@ def costs_section(shown: Shown) -> Html:
 
 
 def _cost(record: Record) -> tuple[str, str]:
-    return duration(record.number("seconds")), memory(record.number("peak_memory_bytes"))
+    return duration(record.number("seconds")), data_size(record.number("peak_memory_bytes"))
 
 
 def _standing_name(row: str) -> str:

@@ -9,7 +9,8 @@ from vdgs.evaluation.saving import file_stems
 from vdgs.report.charts import draw_gains, draw_pairs
 from vdgs.report.page import Html, details, figure, gallery, paragraph, section, table
 from vdgs.report.reading import Record, Shown, Source
-from vdgs.report.words import ABSENT, count, decibels, figure_of, gain, memory, share, similarity
+from vdgs.report.words import decibels, figure_of, gain, share, similarity
+from vdgs.units import ABSENT, count
 
 COARSE, MERGED = "coarse/evaluation", "evaluation"
 #: Rows of the table of test views, and pictures of seams, at most.
@@ -79,7 +80,7 @@ def result_table(coarse: Record, merged: Record) -> Html:
     ]  # fmt: skip
     for key, label, words in (
         ("n_anchors", "anchors", count),
-        ("model_bytes", "size of the model", memory),
+        ("model_bytes", "size of the model", data_size),
         ("fps", "images drawn a second", lambda value: figure_of(value, "{:.1f}")),
         ("test_views", "test views", count),
     ):

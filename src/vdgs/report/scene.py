@@ -8,7 +8,8 @@ from urllib.parse import quote
 
 from vdgs.report.page import Html, figure, heading, link, paragraph, section, table
 from vdgs.report.reading import Record, Shown, Source
-from vdgs.report.words import ABSENT, count, figure_of, share
+from vdgs.report.words import figure_of, share
+from vdgs.units import ABSENT, count
 
 
 def page_link(shown: Shown) -> Html:

@@ -6,8 +6,9 @@ from vdgs.partition.figures.words import block_colour
 from vdgs.report.charts import MERGED, Curve, draw_curves
 from vdgs.report.page import Html, figure, gallery, heading, joined, paragraph, section, table
 from vdgs.report.reading import Record, Shown
-from vdgs.report.words import count, decibels, figure_of, share
+from vdgs.report.words import decibels, figure_of, share
 from vdgs.runs.folder import RunFolder
+from vdgs.units import count
 
 #: Log lines over which the loss is smoothed: it is that of a single photograph.
 SMOOTH = 9

@@ -16,7 +16,6 @@ import yaml
 
 from vdgs import __version__
 from vdgs.errors import RunError
-from vdgs.runs.keys import SINCE
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import differences, from_dict, to_dict
 from vdgs.settings.ranges import option, outside
@@ -88,9 +87,11 @@ def _settings(path: Path, text: str) -> dict[str, Any]:
     if not isinstance(capture, dict) or not isinstance(capture.get("path"), str):
         raise RunError(f"{path}: is damaged: `capture` must be a group of settings with a path")
     try:
-        return {"capture": SINCE["capture"] | capture} | to_dict(_method(settings))
+        return {"capture": capture} | to_dict(_method(settings))
     except (ValueError, TypeError) as error:
-        raise RunError(f"{path}: {error}. Write it as it was, or start a new --output.") from error
+        raise RunError(
+            f"{path}: {error}. Write it as it was, or start a new --output: runs of another version do not go on."
+        ) from error
 
 
 def _method(settings: dict[str, Any]) -> MethodConfig:

@@ -77,7 +77,7 @@ def keep_flight(run: RunFolder, capture: Capture) -> None:
 
 def kept_flight(run: RunFolder, facts: dict[str, Any]) -> Flight | None:
     """The flight that the run keeps, if it is that of the capture described by `facts` (`capture_facts`, as a model
-    holds them); None for a run of a version that kept none. RunError if the file is damaged."""
+    holds them); None where the file is gone or is of another capture. RunError if it is damaged."""
     if not run.cameras_file.exists():
         return None
     record = read_json(run.cameras_file)

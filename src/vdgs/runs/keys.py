@@ -20,36 +20,6 @@ DEPENDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "blocks": (("block",), ("assignment",)),
     "merge": (("merge",), ("blocks",)),
 }
-
-
-#: Settings that came after runs had been made without them, with the value that leaves those runs as they are: where a
-#: setting has it, keys do not mention it, so that a newer version takes older runs for finished, as they are. Nor do
-#: they mention a group in which nothing else is left.
-SINCE: dict[str, dict[str, Any]] = {
-    "capture": {"format": "auto"},
-    "training": {
-        "sampling": "even",
-        "average": 0.0,
-        "early": 1.0,
-        "adam": "visible",
-        "anchors": {"bound_sizes": True, "stereo": False},
-        "compensation": {"added_to": "mean"},
-        "rates": {"exposure": [0.001, 1e-4]},
-        "exposure": False,
-        "exposure_spread": 0.0,
-        "seldom": {"quantile": 0.5, "drop": 0.0, "depth_weight": 0.0, "smooth_weight": 0.0},
-    },
-    "assignment": {"best_block": True},
-    "block": {
-        "sampling": "even",
-        "decoder": "frozen",
-        "average": 0.0,
-        "crop": "off",
-        "max_anchors_total": 0,
-        "early": 1.0,
-        "compensation": {"added_to": "mean"},
-    },
-}
 #: Settings that do nothing without another.
 NEEDS: dict[tuple[str, ...], str] = {("training", "exposure_spread"): "exposure"}
 
@@ -79,17 +49,6 @@ def stage_keys(settings: dict[str, Any], coarse_model: str | None = None) -> Sta
 
 
 def counted(section: str, settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings of a section that keys are made of: a setting that came later, or that needs another, counts only
-    where it changes a run."""
+    """The settings of a section that keys are made of: one that needs another counts only beside it."""
     idle = {("capture", "path"), *(each for each, needed in NEEDS.items() if not settings.get(needed))}
-    own = {name: value for name, value in settings.items() if (section, name) not in idle}
-    return _changed(own, SINCE.get(section, {}))
-
-
-def _changed(settings: dict[str, Any], since: dict[str, Any]) -> dict[str, Any]:
-    """Settings without those that have the value in `since`, and groups in it without theirs."""
-    left = {
-        name: _changed(value, since[name]) if isinstance(value, dict) and name in since else value
-        for name, value in settings.items()
-    }
-    return {name: value for name, value in left.items() if name not in since or value not in (since[name], {})}
+    return {name: value for name, value in settings.items() if (section, name) not in idle}

@@ -145,7 +145,7 @@ class _Survey:
         coarse = self._trained("coarse", run.coarse, self._key("coarse"), OTHER_SETTINGS, run.path)
         yield coarse
         yield self._visibility()
-        yield self._measured("coarse evaluation", run.coarse.path / "evaluation", [coarse])
+        yield self._measured("coarse evaluation", run.coarse.path / "evaluation", coarse)
         yield from self._cut()
         blocks = [
             self._trained(f"block {int(folder.path.name)}", folder, self._key("blocks"), OTHER_CUT, folder.path)
@@ -154,7 +154,7 @@ class _Survey:
         yield from blocks
         merged = self._merged(blocks)
         yield merged
-        yield self._measured("evaluation", run.evaluation, [merged, coarse])
+        yield self._measured("evaluation", run.evaluation, merged)
 
     def _key(self, stage: str) -> str | None:
         return None if self.keys is None else str(getattr(self.keys, stage))
@@ -250,15 +250,14 @@ class _Survey:
         why = f"the coarse model stands in for {', '.join(stands_in)}" if stands_in else ""
         return Standing("merge", "done", found.folder, why, found.status, found.made)
 
-    def _measured(self, name: str, folder: Path, models: list[Standing]) -> Standing:
-        """Figures of a model: they are worth what the model is. A run once kept those of its coarse model where those
-        of the merged one are now; such folders are compared with both."""
+    def _measured(self, name: str, folder: Path, model: Standing) -> Standing:
+        """Figures of a model: they are worth what the model is."""
         there = (folder / "metrics.json").exists()
         record = read_record(folder / "status.json")
         made = json.dumps([record.get(each) for each in ("model", "lpips_weights", "bins")])
         found = record.get("model")
-        known = [model.made for model in models if model.state == "done" and model.made]
-        return self._judged(name, folder, there, found, found if found in known else None, made, OTHER_MODEL)
+        known = model.made if model.state == "done" else ""
+        return self._judged(name, folder, there, found, known or None, made, OTHER_MODEL)
 
 
 def _number(name: str) -> int | None:

@@ -19,13 +19,13 @@ NOT_VOUCHED = "not the model that status.json beside it speaks of"
 def foreign(stage: StageFolder, key: str, block: int | None = None) -> str:
     """What the model of a finished stage is instead of its own; empty where it may be that.
 
-    By the header and the size of the file alone, which cost nothing. Files of earlier versions do not say their key.
+    By the header and the size of the file alone, which cost nothing.
     """
     try:
         with safe_open(stage.model, framework="pt") as file:
             header = dict(file.metadata() or {})
         told = json.loads(header.get(FORMAT) or header[FORMAT_OF_PARTS])["facts"]
-        of_block, made_with = told.get("block"), told.get("key", key)
+        of_block, made_with = told.get("block"), told["key"]
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError):
         return "not a model that can be read"
     if of_block != block:

@@ -124,9 +124,6 @@ class CompensationConfig:
     gate: Literal["scaled", "literal"] = "scaled"
     """Above how many draws an offset of low visibility is judged: `scaled` takes T_low times the gate of the others, at
     least 2 (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
-    cap: Annotated[float, Range(0, MANY)] = 0.0
-    """Greatest value of g; 0 for none. Without it, and with beta_g = 2, a mean gradient that is fed steadily grows to
-    21 times its size."""
 
 
 @dataclass(frozen=True)
@@ -137,36 +134,12 @@ class LossConfig:
     """Loss = (1 - w) L1 + w (1 - SSIM) + volume."""
     volume_weight: Annotated[float, Range(0, LARGE)] = 0.01
     """Weight of the mean product of the three scales of the Gaussians that are drawn."""
-    alpha_weight: Annotated[float, Range(0, LARGE)] = 0.0
-    """Weight of the root of 1 - alpha, averaged over a picture's pixels: those below the horizon and those that show
-    known ground; the sky is left alone. A stronger means than backgrounds of random colour, which suffice as a rule."""
     background: Literal["mean", "black"] = "mean"
     """Colour behind the scene: the mean of the training photographs (choice: what no photograph shows is then drawn
     in a colour of the place), or black."""
     background_noise: Annotated[float, SHARE] = 1.0
     """So much of the background's colour is drawn anew for every step of training, from the whole RGB cube: ground that
     were left transparent could not borrow a colour from it (choice; the paper is silent on its background)."""
-
-
-@dataclass(frozen=True)
-class SeldomConfig:
-    """What steers training where few cameras look; all of it is off unless it is asked for (choice). A place that V
-    training cameras hold is seldom seen by 1 - V / V*, at least 0."""
-
-    quantile: Annotated[float, SHARE] = 0.5
-    """V* is this quantile of V over the places where anchors start: what is seen more often is left alone."""
-    drop: Annotated[float, Range(0, 1, below=True)] = 0.0
-    """Up to this share of the Gaussians is left out of each step at random, by how seldom their anchor is seen."""
-    depth_weight: Annotated[float, Range(0, LARGE)] = 0.0
-    """Weight of how far the drawn depth of sparse points is from theirs, relative to it, by how seldom they are
-    seen."""
-    smooth_weight: Annotated[float, Range(0, LARGE)] = 0.0
-    """Weight of the bends of the drawn depth (planes have none), by how seldom a pixel's place is seen."""
-
-    @property
-    def asked(self) -> bool:
-        """Whether any of it is on."""
-        return bool(self.drop or self.depth_weight or self.smooth_weight)
 
 
 @dataclass(frozen=True)
@@ -213,8 +186,6 @@ class TrainConfig:
     colours of the sparse points that several show: where photographs have one exposure, fitting some gains nothing and
     may cost (choice). At 0, and in a capture that does not say which photograph shows which point, they are always
     fitted."""
-    seldom: SeldomConfig = field(default_factory=SeldomConfig)
-    """Where few cameras look, here and in blocks."""
     compensation: CompensationConfig = field(default_factory=lambda: CompensationConfig(enabled=False))
     """Compensated growth already in this stage (choice: only blocks have it; the ablation without blocks needs it)."""
 
@@ -227,10 +198,8 @@ class PartitionConfig:
     """`visibility`: by place and visibility (the paper). The others are the partitions of published methods, to compare
     with; each cuts and chooses cameras in its own way, whatever the settings of the assignment say."""
     blocks: Annotated[int | Literal["auto"], Range(1, 10_000)] = 8
-    """K, the number of blocks; `auto` takes as few as --block-memory-gb allows: give more to train them at once on
-    several machines."""
-    blocking: bool = True
-    """Off: one block that holds the whole scene (the paper's "w/o Blocking")."""
+    """K, the number of blocks; 1 is the whole scene (the paper's "w/o Blocking"); `auto` takes as few as
+    --block-memory-gb allows: give more to train them at once on several machines."""
     lambda_vis: Annotated[float, Range(0, 1000)] = 1.0
     """lambda_vis: weight of visibility beside place in the clustering (paper: 0.7 to 1.3); 0 is purely spatial."""
     balanced: bool = False

@@ -104,7 +104,7 @@ class RenderRequest:
     width: Annotated[int, Range(0, LARGEST_SIDE_PX)] = 0
     """Image width; 0 takes that of the training views."""
     capture: Path | None = None
-    """Where the capture lies now. Only runs that do not keep their cameras (of an older version) need it."""
+    """Where the capture lies now; needed only where the run has lost its cameras.json."""
     kind: Literal["image", "depth", "visibility", "alpha"] = "image"
     """What to draw: the picture; the median depth, at which a pixel becomes half opaque (grey where it never does); the
     number of training cameras that see each place, V; or alpha, how opaque the scene is."""

@@ -19,6 +19,7 @@ from vdgs.sfm.control import Control, check_near, read_control
 from vdgs.sfm.look import Look, look_at, seconds
 from vdgs.sfm.positions import Positions, find_positions
 from vdgs.sfm.telling import tell_look
+from vdgs.units import data_size, rough_duration
 
 #: Bytes of disk for a feature, with its descriptor and its matches; and for a pixel of a written photograph.
 FEATURE_BYTES, PIXEL_BYTES = 250, 0.9
@@ -79,7 +80,7 @@ def tell(prepared: Prepared, console: Console) -> None:
         f"features, about {pairs} pairs ({how}), poses and points, {metres}photographs without distortion",
         *_plan_of(prepared.control),
         f"the focal length is {'held' if held else 'fitted'}: {why}",
-        f"about {max(1, round(prepared.seconds / 60))} min on {prepared.threads} threads, if they are idle",
+        f"about {rough_duration(prepared.seconds)} on {prepared.threads} threads, if they are idle",
     ]
     tell_look(prepared.look, prepared.collection, plan, console)
 
@@ -118,7 +119,7 @@ def check_disk(prepared: Prepared) -> None:
     free = shutil.disk_usage(parent).free
     if free < needed:
         raise VdgsError(
-            f"{prepared.request.output}: needs about {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free there. Free "
+            f"{prepared.request.output}: needs about {data_size(needed)}, {data_size(free)} are free there. Free "
             "some space, choose another --output, or write smaller photographs (--max-size 2000)."
         )
 

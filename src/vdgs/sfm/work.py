@@ -20,6 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from vdgs.captures.reconstruction import STEPS
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.storage.files import read_record, write_json
+from vdgs.units import rough_duration
 from vdgs.watching.interrupts import stop_if_asked
 
 Result = TypeVar("Result")
@@ -171,11 +172,7 @@ class _Lines:
             return
         self.told = tenth
         left = seconds / (done - self.first) * (self.total - done)
-        self.console.print(f"{self.title}: {done} of {self.total}, about {_minutes(left)} left", highlight=False)
-
-
-def _minutes(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"
+        self.console.print(f"{self.title}: {done} of {self.total}, about {rough_duration(left)} left", highlight=False)
 
 
 def quiet_colmap() -> None:

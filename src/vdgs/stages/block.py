@@ -13,31 +13,24 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
 from rich.console import Console
-from torch import Tensor
 
 from vdgs import __version__
-from vdgs.captures.capture import Capture
 from vdgs.captures.facts import capture_facts
 from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.ground import solid_cells_of_all
 from vdgs.model.sizes import largest_log_scales
 from vdgs.model.visibility import effective_count
 from vdgs.partition.blocks import Blocks
 from vdgs.partition.regions import drawn_by, holds, ramp, split_anchors
 from vdgs.runs.cut import blocks_of, views_of_block
 from vdgs.runs.folder import RunFolder
-from vdgs.runs.ground import ground_of
 from vdgs.runs.opening import open_run
-from vdgs.runs.seldom import seldom_terms
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
-from vdgs.runs.stereo import points_of_run
-from vdgs.settings.method import TrainConfig, block_limit, block_training
+from vdgs.settings.method import block_limit, block_training
 from vdgs.settings.watching import WatchOptions
 from vdgs.storage.tensors import identity
 from vdgs.training import Stage, Surroundings, start_state
@@ -99,7 +92,6 @@ def _train(
     prepared = time.monotonic() - began
     note_without_growth(config, console, "--block.")
     factors = tuple(sorted({factor for _, factor in config.resolutions}))
-    ground = _ground(run, capture, config).to(device)
     flown = [view.camera for view in capture.train_views]
     with ImageCache(views, image_budget(options), downscales=factors) as images:
         stage = Stage(
@@ -108,8 +100,6 @@ def _train(
             surroundings=Surroundings(surroundings, coarse.decoder),
             may_hold=holds(blocks, index, method.block), mobility=ramp(blocks, index, method.block),
             appearance_of=chosen, shares=shares, crops=crops,
-            ground=solid_cells_of_all(ground, [view.camera for view in views]) if config.loss.alpha_weight else None,
-            **seldom_terms(capture, ground, views, config.seldom),
             largest=(lambda positions: largest_log_scales(positions, flown)) if config.anchors.bound_sizes else None,
         )  # fmt: skip
         state = continue_or_start(folder, stage, lambda: start_state(anchors, coarse.decoder.copy(), stage), console)
@@ -128,13 +118,6 @@ def _train(
         facts | {"iterations": state.iteration, "decoder": method.block.decoder},
     )
     finish(folder, state, model, console, area)
-
-
-def _ground(run: RunFolder, capture: Capture, config: TrainConfig) -> Float[Tensor, "g 3"]:
-    """The places where the coarse stage's anchors started; none where nothing asks for them."""
-    if not config.loss.alpha_weight and not config.seldom.asked:
-        return torch.zeros(0, 3)
-    return ground_of(capture, config.anchors, points_of_run(run, config.anchors))
 
 
 def _views_served(count: int, of: int, shares: Sequence[float] | None) -> str:

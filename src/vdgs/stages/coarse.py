@@ -19,13 +19,11 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.model.exposure import neutral_exposures
-from vdgs.model.ground import solid_cells_of_all
 from vdgs.model.sizes import largest_log_scales
 from vdgs.model.start import initial_anchors
 from vdgs.runs.flight import keep_flight
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import refuse_empty
-from vdgs.runs.seldom import seldom_terms
 from vdgs.runs.status import Status
 from vdgs.runs.stereo import find_points
 from vdgs.settings.method import TrainConfig
@@ -161,7 +159,6 @@ def open_stage(
     cameras = [view.camera for view in capture.train_views]
     # The voxel follows from the capture: recomputed when a run continues.
     anchors, voxel = initial_anchors(capture.points, capture.point_colours, cameras, config.anchors, dense)
-    ground = anchors.positions.to(device)
     background = (0.0, 0.0, 0.0)
     if config.loss.background != "black":
         smallest = max(factor for _, factor in config.resolutions)
@@ -169,8 +166,6 @@ def open_stage(
     stage = Stage(
         config, images, len(cameras), voxel, camera_height(capture), background=background,
         shares=shares_for(config, anchors, cameras), device=torch.device(device),
-        ground=solid_cells_of_all(ground, cameras) if config.loss.alpha_weight else None,
-        **seldom_terms(capture, ground, capture.train_views, config.seldom),
         largest=(lambda positions: largest_log_scales(positions, cameras)) if config.anchors.bound_sizes else None,
     )  # fmt: skip
     return stage, anchors

@@ -243,7 +243,6 @@ def _join(run: RunFolder, found: FoundModel, asked: Measuring, work: PieceWork, 
 def is_measured(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> bool:
     """Whether the figures that are there are those of the model that is there, measured in this way."""
     wanted = _record_of(run, name, lpips_weights, bins)
-    wanted.pop("key")  # the model says it; older figures do not mention it
     record = read_record(evaluation_folder(run, name) / "status.json")
     return {key: record.get(key) for key in wanted} == wanted
 
@@ -259,8 +258,7 @@ def _record_of(run: RunFolder, name: str, lpips_weights: Path | None, bins: int)
 
 
 def _exposed(run: RunFolder) -> str | None:
-    """How views are exposed, if training fitted exposures; None in neutral colours, in which earlier versions measured
-    all."""
+    """How views are exposed, if training fitted exposures; None in neutral colours."""
     return "interpolated and metered" if run.method().training.exposure else None
 
 

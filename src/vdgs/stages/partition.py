@@ -276,7 +276,7 @@ def how_cut(config: PartitionConfig) -> str:
     """How a scene is cut, in a few words: λ_vis says nothing of the partitions of others, nor of one block."""
     if config.strategy != "visibility":
         return STRATEGIES[config.strategy].cites.split(", ")[-2] + " partition"
-    return f"λ_vis = {config.lambda_vis:g}" if config.blocking else "not cut"
+    return f"λ_vis = {config.lambda_vis:g}" if config.blocks != 1 else "not cut"
 
 
 def _draw(

@@ -28,6 +28,7 @@ from vdgs.model.groups import Groups
 from vdgs.stereo.matching import AGREEMENT, StereoView, depth_of
 from vdgs.stereo.partners import held_by, partners
 from vdgs.storage.files import remedy
+from vdgs.units import data_size
 
 #: Photographs are matched at this longest side, and enlarged at most by so much: steps of a sixteenth of a column tell
 #: depth better in larger pictures (choice).
@@ -148,7 +149,7 @@ def _reserve(file: IO[bytes], size: int, folder: Path) -> None:
             file.truncate(size)
     except OSError as error:
         raise VdgsError(
-            f"{folder}: depths of stereo need {size / 1e9:.2g} GB there for a while ({error.strerror}). "
+            f"{folder}: depths of stereo need {data_size(size)} there for a while ({error.strerror}). "
             f"{remedy(error)}, then run the same command again."
         ) from error
 

@@ -22,7 +22,7 @@ def known(record: Any) -> dict[str, Any]:
 
 
 def record_of(kind: type[Record], values: Any) -> Record:
-    """The inverse of `plain` and `known`. Keys that the class does not have are those of a newer version: left out.
+    """The inverse of `plain` and `known`. Keys that the class does not have are left out.
 
     Raises ValueError, naming the field, for a value of another kind or one that is missing.
     """

@@ -101,14 +101,12 @@ def update_cache(
 ) -> None:
     """End of a cycle, in place (eq. 10): g_k <- gamma g_k + beta_g times the cycle's mean gradient for k in L.
 
-    The others only decay, so that what was poorly seen once is not compensated for ever. At most `cap`, where there
-    is one. To be called before the decision, which resets statistics.
+    The others only decay, so that what was poorly seen once is not compensated for ever. To be called before
+    the decision, which resets statistics.
     """
     fed = cycle_gradient(compensation, statistics).mul_(config.beta_g).mul_(low[:, None])
     # Two operations: one fused multiply-add would round differently where vector and remainder code differ.
     compensation.cache.mul_(config.gamma).add_(fed)
-    if config.cap > 0:
-        compensation.cache.clamp_(max=config.cap)
 
 
 def compensate(
@@ -140,8 +138,8 @@ def cycle_facts(
 
     `low_share`: share of the anchors that are of low visibility; `low_share_of_seen`: the same of those that a camera
     of the cycle sees, 0 where ties leave nothing near the wished quantile; `t_low`: the threshold used; `mean_cache`,
-    `max_cache`: g over the offsets of L (null where L is empty), `capped`: how many of them are at the cap;
-    `grown_low`, `grown_other`: new anchors in cells with a parent in L, and the others; `pruned`: anchors removed.
+    `max_cache`: g over the offsets of L (null where L is empty); `grown_low`, `grown_other`: new anchors in cells with
+    a parent in L, and the others; `pruned`: anchors removed.
     """
     low, offsets = int(compensated.low.sum()), compensated.added.shape[1]
     seen = share > 0
@@ -152,7 +150,6 @@ def cycle_facts(
         "t_low": threshold,
         "mean_cache": float(added.sum(dtype=np.float64)) / (low * offsets) if low else None,
         "max_cache": float(added.max()) if low else None,
-        "capped": int((added >= config.cap).sum()) if config.cap > 0 else 0,
         "grown_low": decision.grown_low,
         "grown_other": decision.grown_other,
         "pruned": decision.pruned,

@@ -32,10 +32,8 @@ def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:
     before, added = len(state.anchors), len(decision.added)
     kept = torch.cat([decision.kept, decision.kept.new_ones(added)])
     return_unused()
-    places = decision.added.positions
-    new = {"anchors": decision.added.tensors(), "largest": {"log_scale": stage.largest_at(places)}}
-    if state.seldom is not None and stage.seldom is not None:
-        new["seldom"] = {"share": stage.seldom.share(places)}
+    largest = stage.largest_at(decision.added.positions)
+    new = {"anchors": decision.added.tensors(), "largest": {"log_scale": largest}}
     remap(state, new, added, kept)
     return_unused()
     if state.compensation is not None:

@@ -16,8 +16,8 @@ from torch import Tensor
 from vdgs.cameras import Camera
 from vdgs.errors import TrainingDiverged
 from vdgs.kernels import choose
-from vdgs.kernels.types import DecoderWeights, OrderedSplats, SplatGradients, TrainingSplats
-from vdgs.model.render import decode_rows, decode_rows_to_train, visible_rows
+from vdgs.kernels.types import DecoderWeights, OrderedSplats, SplatGradients
+from vdgs.model.render import decode_rows_to_train, visible_rows
 from vdgs.model.sizes import SPREAD
 from vdgs.training.averaging import Average, counts_in_mean
 from vdgs.training.background import background_at
@@ -30,7 +30,6 @@ from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
 from vdgs.training.state import Stage, StepReport, TrainingState
 from vdgs.training.step import coast_anchors, draw_view, move_anchors
 from vdgs.training.target import box_at, part_of, target_at
-from vdgs.training.thinning import thinned
 
 #: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
 REFERENCE_HEIGHT = 10.0
@@ -57,10 +56,10 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     weights = state.decoder.for_image(appearance_at(stage, view))
     background = background_at(stage, iteration)
     with torch.no_grad():
-        splats = _splats(state, stage, rows, weights, camera)
+        splats = decode_rows_to_train(state.anchors, rows, weights, camera)
         target = target_at(stage, view, downscale, narrow(stage, splats, camera, box))
         around = _surroundings(stage, view, camera, target.camera)
-        drawn = draw_view(splats, target.camera, background, around, stage.draws_depth)
+        drawn = draw_view(splats, target.camera, background, around)
     compared = compare(drawn, target, state.decoder, appearance_at(stage, view), config)
     volume_weight, loss = _volume_weight(stage), compared.loss
     if volume_weight and len(drawn.source):
@@ -69,7 +68,7 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     value, l1, ssim = torch.stack([loss, compared.l1, compared.ssim]).tolist()
     if not math.isfinite(value):
         raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
-    gradients = drawn.backward(compared.image, compared.alpha, volume_weight, compared.depth)
+    gradients = drawn.backward(compared.image, volume_weight)
     psnr = psnr_of(compared.shown, target.image, target.mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
     state.whole = False
     _move(state, stage, rows, gradients, weights, camera)
@@ -96,17 +95,6 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
     _smooth(state, value, psnr)
     state.whole = True
     return report
-
-
-def _splats(
-    state: TrainingState, stage: Stage, rows: Tensor, weights: DecoderWeights, camera: Camera
-) -> TrainingSplats:
-    """What is drawn of the anchors of the given rows: all, or less where few cameras look."""
-    if state.seldom is None:
-        return decode_rows_to_train(state.anchors, rows, weights, camera)
-    config, offsets = stage.config, state.anchors.offsets.shape[1]
-    share, seed = config.seldom.drop * state.seldom[rows], config.seed * 1_000_039 + state.iteration
-    return TrainingSplats.of(thinned(decode_rows(state.anchors, rows, weights, camera), share, offsets, seed))
 
 
 @torch.no_grad()

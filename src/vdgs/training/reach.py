@@ -22,11 +22,10 @@ def narrow(stage: Stage, splats: Splats, camera: Camera, box: Box) -> Box:
     """What is to be drawn of a box of a view, which `camera` shows, so that gradients of a stage's splats in it are the
     same but for rounding. The means of the splats, in pixels of the box, become pixels of that, in place.
 
-    What is asked of depth are means over all points that a view shows, so such views are drawn as a whole; and a card
-    would be waited for.
+    On a card the whole box is drawn: the host would wait for the card's answer.
     """
     around = stage.surroundings
-    if around is None or not len(around.anchors) or stage.draws_depth or stage.device.type != "cpu":
+    if around is None or not len(around.anchors) or stage.device.type != "cpu":
         return box
     part = part_reached(splats, camera)
     if part is None:

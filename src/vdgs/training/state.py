@@ -17,13 +17,11 @@ from vdgs.cameras import Camera
 from vdgs.kernels.types import Statistics
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.seldom import Seldom
 from vdgs.settings.method import TrainConfig
 from vdgs.storage.checkpoints import SavedState
 from vdgs.training.averaging import Average
 from vdgs.training.compensation import Compensation
 from vdgs.training.crops import Crop
-from vdgs.training.depths import KnownDepths
 from vdgs.training.optimiser import Moments, Optimiser
 from vdgs.training.per_anchor import Group
 
@@ -51,8 +49,6 @@ class TrainingState:
     optimiser: Optimiser
     #: Largest log-scale that Gaussians of each anchor may have, [n] (`model.sizes`): anchors never move.
     largest: Tensor
-    #: How seldom each anchor is seen, [n] (`model.seldom`); None where nothing asks for it.
-    seldom: Tensor | None = None
     #: Remembered gradients of compensated growth; None where growth is plain.
     compensation: Compensation | None = None
     #: Mean of the last models, once it has begun (`averaging.counts_in_mean`).
@@ -75,8 +71,6 @@ class TrainingState:
             "first.anchors": moments.first, "second.anchors": moments.second,
             "updates": {"anchors": self.optimiser.updates}, "largest": {"log_scale": self.largest},
         }  # fmt: skip
-        if self.seldom is not None:
-            groups["seldom"] = {"share": self.seldom}
         if self.compensation is not None:
             groups["compensation"] = self.compensation.tensors()
         if self.average is not None:
@@ -95,8 +89,6 @@ class TrainingState:
         self.optimiser.anchors = Moments(groups["first.anchors"], groups["second.anchors"])
         self.optimiser.updates = groups["updates"]["anchors"]
         self.largest = groups["largest"]["log_scale"]
-        if self.seldom is not None:
-            self.seldom = groups["seldom"]["share"]
         if self.compensation is not None:
             self.compensation = Compensation(**groups["compensation"])
         if self.average is not None:
@@ -139,14 +131,6 @@ class Stage:
     frozen_decoder: bool = False
     #: The largest log-scale of Gaussians of anchors at places [p, 3]; None: any.
     largest: Callable[[Tensor], Tensor] | None = None
-    #: Which cells of each view's picture must be opaque (`model.ground`); None: none.
-    ground: Sequence[Tensor] | None = None
-    #: How seldom places are seen (`model.seldom`); None: nothing asks for it.
-    seldom: Seldom | None = None
-    #: The same in cells of each view's picture; None: depth is not asked to be smooth.
-    seldom_cells: Sequence[Tensor] | None = None
-    #: The depth of sparse points in each view, where it has some; None: depth is not asked to agree with them.
-    known_depths: Sequence[KnownDepths | None] | None = None
     #: What is drawn and never moves: ring and context of a block.
     surroundings: Surroundings | None = None
     #: Which places [p, 3] may get new anchors; None: all.
@@ -165,16 +149,6 @@ class Stage:
     def largest_at(self, positions: Tensor) -> Tensor:
         """The largest log-scale [p] of Gaussians of anchors at places [p, 3]."""
         return torch.full_like(positions[:, 0], math.inf) if self.largest is None else self.largest(positions)
-
-    @property
-    def thins(self) -> bool:
-        """Whether steps leave out Gaussians where few cameras look."""
-        return self.seldom is not None and self.config.seldom.drop > 0
-
-    @property
-    def draws_depth(self) -> bool:
-        """Whether anything is asked of depth."""
-        return self.seldom_cells is not None or self.known_depths is not None
 
 
 @dataclass(frozen=True)
@@ -203,9 +177,8 @@ def start_state(anchors: Anchors, decoder: Decoder, stage: Stage) -> TrainingSta
     compensation = Compensation.zeros(n, k, device) if stage.config.compensation.enabled else None
     optimiser = Optimiser.start(anchors, decoder)
     largest = stage.largest_at(anchors.positions)
-    seldom = stage.seldom.share(anchors.positions) if stage.seldom is not None and stage.thins else None
     statistics = Statistics.zeros(n, k, device)
-    return TrainingState(0, anchors, decoder, statistics, optimiser, largest, seldom, compensation)
+    return TrainingState(0, anchors, decoder, statistics, optimiser, largest, compensation)
 
 
 def to_saved(state: TrainingState) -> SavedState:
@@ -232,7 +205,7 @@ def from_saved(saved: SavedState, stage: Stage) -> TrainingState:
 
     state = start_state(Anchors(**group("anchors")), Decoder.from_tensors(group("decoder")), stage)
     state.optimiser.decoder = Moments(group("first.decoder"), group("second.decoder"))
-    if averaged := saved.facts.get("averaged", 0):
+    if averaged := saved.facts["averaged"]:
         state.average = Average(averaged, group("average.anchors"), group("average.decoder"))
     state.put_groups({name: group(name) for name in state.groups()})
     state.iteration = saved.iteration

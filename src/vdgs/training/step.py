@@ -35,10 +35,6 @@ class TrainingView:
     """A picture for training, and what the backward pass needs of the m splats of the anchors that are trained."""
 
     image: Float[Tensor, "h w 3"]
-    #: 1 - the share of the background that shows through.
-    alpha: Float[Tensor, "h w"]
-    #: Expected depth, not divided by alpha; None if it was not asked for.
-    depth: Float[Tensor, "h w"] | None
     source: Sources
     colours: Float[Tensor, "m 3"]
     opacities: Float[Tensor, " m"]
@@ -49,22 +45,15 @@ class TrainingView:
     room: tuple[Tensor, Tensor]
 
     @torch.no_grad()
-    def backward(
-        self,
-        image: Float[Tensor, "h w 3"],
-        alpha: Float[Tensor, "h w"] | None,
-        volume_weight: float,
-        depth: Float[Tensor, "h w"] | None = None,
-    ) -> SplatGradients:
-        """Gradients of a loss: `image` by the picture, `alpha` by its alpha and `depth` by its depth (None: zero),
-        `volume_weight` by the mean volume. Call it once."""
+    def backward(self, image: Float[Tensor, "h w 3"], volume_weight: float) -> SplatGradients:
+        """Gradients of a loss: `image` by the picture, `volume_weight` by the mean volume. Call it once."""
         m = len(self.source)
-        found = self.pullback(image, alpha, depth, over=self.room, count=m)
+        found = self.pullback(image, None, None, over=self.room, count=m)
         # In float32, as autograd divides.
         volume = float(torch.tensor(volume_weight) / m) if m else 0.0
         return SplatGradients(
             found.means_px, found.conics, found.colours, found.opacities, volume, self.source, self.colours,
-            self.opacities, None if depth is None else found.depths,
+            self.opacities,
         )  # fmt: skip
 
 
@@ -74,16 +63,15 @@ def draw_view(
     camera: Camera,
     background: Float[Tensor, "3"],
     around: OrderedSplats | None = None,
-    depth: bool = False,
 ) -> TrainingView:
-    """Draw the splats of trained anchors with those `around` them, on request with depth. The tensors of `splats` are
-    the view's from now on: their memory is used again."""
+    """Draw the splats of trained anchors with those `around` them. The tensors of `splats` are the view's from now on:
+    their memory is used again."""
     m, drawn = len(splats.source), splats if around is None else splats.joined(around)
     kernels = choose(drawn.means_px.device)
-    raster, pullback = kernels.rasterise_vjp(drawn, background, camera.width, camera.height, depth=depth)
+    raster, pullback = kernels.rasterise_vjp(drawn, background, camera.width, camera.height)
     return TrainingView(
-        raster.image, raster.alpha, raster.depth, splats.source, splats.colours, splats.opacities,
-        splats.volume, pullback, (drawn.means_px[:m], drawn.conics[:m]),
+        raster.image, splats.source, splats.colours, splats.opacities, splats.volume,
+        pullback, (drawn.means_px[:m], drawn.conics[:m]),
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import tyro
 
-from vdgs.settings.method import MethodConfig, PartitionConfig
+from vdgs.settings.method import MethodConfig
 from vdgs.settings.presets import PRESETS, PresetName
 from vdgs.settings.ranges import refuse
 
@@ -55,18 +55,6 @@ def recorded_run(arguments: list[str], kind: type, prog: str) -> tuple[RunFolder
         return (named, named.method()) if named else parse(kind, arguments, prog)
     run = RunFolder(parse(kind, arguments, prog).run)
     return run, run.method()
-
-
-def refuse_idle_blocks(arguments: list[str], partition: PartitionConfig) -> None:
-    """Raise VdgsError where a number of blocks is asked for and blocks are not: which of the two is meant?"""
-    asked = any(argument.partition("=")[0] == "--blocks" for argument in arguments)
-    if asked and not partition.blocking and partition.blocks != 1:
-        from vdgs.errors import VdgsError
-
-        off = "--no-blocking makes" if "--no-blocking" in arguments else "the run has --no-blocking, which makes"
-        raise VdgsError(
-            f"--blocks {partition.blocks}: {off} one block of the scene. Leave out one of them, or say --blocking."
-        )
 
 
 def change_settings(run: RunFolder, method: MethodConfig, redo: bool, quiet: bool = False) -> None:

@@ -19,7 +19,6 @@ from vdgs.verbs.shared import (
     open_console,
     parse,
     recorded_run,
-    refuse_idle_blocks,
     use_device,
     use_threads,
 )
@@ -80,7 +79,6 @@ def partition(arguments: list[str]) -> None:
     run, method = recorded_run(arguments, PartitionArguments, "vdgs partition")
     default = PartitionArguments(tyro.MISSING, partition=method.partition, assignment=method.assignment)
     asked = parse(PartitionArguments, arguments, "vdgs partition", default)
-    refuse_idle_blocks(arguments, asked.partition)
     from vdgs.stages.partition import explain_view, partition_run, score_piece
 
     device = use_device(asked.device)

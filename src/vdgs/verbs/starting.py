@@ -21,7 +21,6 @@ from vdgs.verbs.shared import (
     named_preset,
     open_console,
     parse,
-    refuse_idle_blocks,
     use_device,
     use_threads,
 )
@@ -95,7 +94,6 @@ def run(arguments: list[str]) -> None:
         assignment=settings.assignment, block=settings.block, merge=settings.merge,
     )  # fmt: skip
     asked = parse(RunArguments, arguments, "vdgs run", default)
-    refuse_idle_blocks(arguments, asked.partition)
     device = use_device(asked.device)
     use_threads(asked.threads)
     if asked.dry_run:

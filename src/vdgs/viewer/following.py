@@ -140,6 +140,6 @@ def _result_of(saved: SavedState) -> tuple[Anchors, Decoder]:
         start = f"{name}."
         return {key.removeprefix(start): tensor for key, tensor in saved.tensors.items() if key.startswith(start)}
 
-    anchors, averaged = group("anchors"), bool(saved.facts.get("averaged", 0))
+    anchors, averaged = group("anchors"), bool(saved.facts["averaged"])
     anchors |= group("average.anchors") if averaged else {}
     return Anchors(**anchors), Decoder.from_tensors(group("average.decoder" if averaged else "decoder"))

@@ -17,6 +17,7 @@ from vdgs.settings.watching import WatchOptions
 from vdgs.storage.checkpoints import save_state
 from vdgs.storage.tensors import identity
 from vdgs.training import Stage, StepReport, TrainingState, from_saved, to_saved, train
+from vdgs.units import data_size
 from vdgs.watching.memory_notes import after_failure, announce, need_of
 from vdgs.watching.progress import TrainingProgress
 from vdgs.watching.watch import Keeper, Watched, restore_or_start, watch
@@ -91,7 +92,7 @@ def finish(folder: StageFolder, state: TrainingState, model: AnchorModel, consol
     minutes, seconds = divmod(round(state.seconds), 60)
     console.print(
         f"trained {state.iteration} iterations in {minutes} min {seconds} s: {len(state.anchors):,} anchors, "
-        f"PSNR while training {state.psnr:.2f} dB, peak memory {state.peak_memory_bytes / 1e9:.1f} GB\n"
+        f"PSNR while training {state.psnr:.2f} dB, peak memory {data_size(state.peak_memory_bytes)}\n"
         f"model: {folder.model}",
         highlight=False,
     )

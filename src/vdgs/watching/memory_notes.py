@@ -16,13 +16,13 @@ from vdgs.memory.estimate import (
     decoded_bytes,
     describe,
     estimate,
-    in_gb,
     largest_picture,
     most_growth,
 )
 from vdgs.memory.process import available_bytes
 from vdgs.model.render import visible_rows
 from vdgs.training import Stage, TrainingState
+from vdgs.units import data_size
 
 #: Views in which the anchors are counted, evenly chosen.
 VIEWS_COUNTED = 16
@@ -60,7 +60,7 @@ def announce(need: Need, kind: Kind, console: Console) -> None:
     if found.total > room:
         helpful = advice(need, kind, found.total - room)
         console.print(
-            f"[yellow]warning[/] it may run out of memory: {in_gb(found.total - room)} are missing by estimate. "
+            f"[yellow]warning[/] it may run out of memory: {data_size(found.total - room)} are missing by estimate. "
             + what_helps(helpful, kind),
             highlight=False,
         )
@@ -76,7 +76,7 @@ def after_failure(need: Need, state: TrainingState, stage: Stage) -> str:
     # Growth cannot be undone where it led, so a limit is one for training that begins anew.
     before = replace(now, anchors=min(need.anchors, len(state.anchors)))
     whole = estimate(now).total
-    return f"It took about {in_gb(whole)}. " + what_helps(advice(before, kind, round(SAVE_SHARE * whole)), kind)
+    return f"It took about {data_size(whole)}. " + what_helps(advice(before, kind, round(SAVE_SHARE * whole)), kind)
 
 
 def what_helps(found: list[Advice], kind: Kind) -> str:

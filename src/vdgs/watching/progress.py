@@ -16,6 +16,7 @@ from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.method import TrainConfig
 from vdgs.training import StepReport, TrainingState, downscale_at
+from vdgs.units import clock
 
 #: Iterations between two lines of log.jsonl.
 LOG_INTERVAL = 50
@@ -58,7 +59,7 @@ class TrainingProgress:
             self._bar.update(self._task, completed=state.iteration, description=self._line(state))
         if not self._console.is_terminal and now - self._last_line > PLAIN_SECONDS:
             self._last_line = now
-            self._console.print(self._line(state) + f"  {self._time_left(state)} left", highlight=False)
+            self._console.print(self._line(state) + f"  {clock(self._seconds_left(state))} left", highlight=False)
         if state.iteration % LOG_INTERVAL == 0 or report.grown is not None:
             self._write(state, report)
 
@@ -87,10 +88,6 @@ class TrainingProgress:
 
     def _seconds_left(self, state: TrainingState) -> float:
         return (self._config.iterations - state.iteration) / max(self.speed(), 1e-3)
-
-    def _time_left(self, state: TrainingState) -> str:
-        seconds = int(self._seconds_left(state))
-        return f"{seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 
     def _write(self, state: TrainingState, report: StepReport) -> None:
         record = {

@@ -3,53 +3,25 @@
 `vdgs.kernels.operations.ON_A_CARD` says which operation is which.
 """
 
-from vdgs.kernels.composed.rasteriser import rasterise, rasterise_vjp
-from vdgs.kernels.cuda import (
-    add_view_statistics,
-    cull,
-    decode,
-    decode_backward_adam,
-    decode_to_train,
-    photometric_loss,
-    shares,
-)
-from vdgs.kernels.reference import (
-    adam_rows,
-    cell_centres,
-    cell_keys,
-    contains,
-    count_visibility,
-    fit_harmonics,
-    group_cells,
-    group_max,
-    harmonic_colours,
-    mark_visible,
-    mean_ellipsoids,
-    morton_order,
-    project,
-)
-
-__all__ = [
-    "adam_rows",
-    "add_view_statistics",
-    "cell_centres",
-    "cell_keys",
-    "contains",
-    "count_visibility",
-    "cull",
-    "decode",
-    "decode_backward_adam",
-    "decode_to_train",
-    "fit_harmonics",
-    "group_cells",
-    "group_max",
-    "harmonic_colours",
-    "mark_visible",
-    "mean_ellipsoids",
-    "morton_order",
-    "photometric_loss",
-    "project",
-    "rasterise",
-    "rasterise_vjp",
-    "shares",
-]
+from vdgs.kernels.composed.rasteriser import rasterise as rasterise
+from vdgs.kernels.composed.rasteriser import rasterise_vjp as rasterise_vjp
+from vdgs.kernels.cuda import add_view_statistics as add_view_statistics
+from vdgs.kernels.cuda import cull as cull
+from vdgs.kernels.cuda import decode as decode
+from vdgs.kernels.cuda import decode_backward_adam as decode_backward_adam
+from vdgs.kernels.cuda import decode_to_train as decode_to_train
+from vdgs.kernels.cuda import photometric_loss as photometric_loss
+from vdgs.kernels.cuda import shares as shares
+from vdgs.kernels.reference import adam_rows as adam_rows
+from vdgs.kernels.reference import cell_centres as cell_centres
+from vdgs.kernels.reference import cell_keys as cell_keys
+from vdgs.kernels.reference import contains as contains
+from vdgs.kernels.reference import count_visibility as count_visibility
+from vdgs.kernels.reference import fit_harmonics as fit_harmonics
+from vdgs.kernels.reference import group_cells as group_cells
+from vdgs.kernels.reference import group_max as group_max
+from vdgs.kernels.reference import harmonic_colours as harmonic_colours
+from vdgs.kernels.reference import mark_visible as mark_visible
+from vdgs.kernels.reference import mean_ellipsoids as mean_ellipsoids
+from vdgs.kernels.reference import morton_order as morton_order
+from vdgs.kernels.reference import project as project

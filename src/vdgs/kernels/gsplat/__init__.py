@@ -4,6 +4,5 @@ Many cards have run it, and none the own kernels so far: where it is installed, 
 of training (`vdgs.kernels.composed`). It follows gsplat 1.5.3 (docs/cuda.md).
 """
 
-from vdgs.kernels.gsplat.rasterise import rasterise, rasterise_vjp
-
-__all__ = ["rasterise", "rasterise_vjp"]
+from vdgs.kernels.gsplat.rasterise import rasterise as rasterise
+from vdgs.kernels.gsplat.rasterise import rasterise_vjp as rasterise_vjp

@@ -1,0 +1,47 @@
+"""Times, sizes and counts as people read them; a dash where there is no figure."""
+
+from __future__ import annotations
+
+ABSENT = "–"
+
+
+def count(value: float | None) -> str:
+    """12,345."""
+    return ABSENT if value is None else f"{value:,.0f}"
+
+
+def data_size(n_bytes: float | None, decimals: int = 2) -> str:
+    """638 MB, 1.50 GB, 24.0 GB; so many decimals below 10 GB."""
+    if n_bytes is None:
+        return ABSENT
+    if n_bytes < 1e9:
+        return f"{n_bytes / 1e6:,.0f} MB"
+    return f"{n_bytes / 1e9:.{decimals}f} GB" if n_bytes < 1e10 else f"{n_bytes / 1e9:,.1f} GB"
+
+
+def duration(seconds: float | None) -> str:
+    """2.3 s, 45 s, 3 min 20 s, 2 h 01 min: a time that was measured."""
+    if seconds is None or not 0 <= seconds < 1e9:
+        return ABSENT
+    if seconds < 10:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def rough_duration(seconds: float) -> str:
+    """45 s, 12 min, 3.5 h: a time that was estimated."""
+    if seconds < 90:
+        return f"{max(1, round(seconds))} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes / 60:.1f} h"
+
+
+def clock(seconds: float) -> str:
+    """1:01:11, of the same width while it counts down."""
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
