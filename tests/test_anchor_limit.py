@@ -75,13 +75,13 @@ def place(tmp_path_factory) -> Path:
 def merged(capture: Path, output: Path, max_anchors: int) -> tuple[RunFolder, int, int]:
     """A run, and how many anchors its coarse model and its merged scene have."""
     console = Console(file=io.StringIO())
-    run, opened = begin_run(capture, output, CaptureOptions(), eager(max_anchors))
-    train_coarse(run, opened, WatchOptions(), console)
-    measure_visibility(run, console)
-    partition_run(run, console)
+    context = begin_run(capture, output, CaptureOptions(), eager(max_anchors))
+    train_coarse(context, WatchOptions(), console)
+    measure_visibility(context, console)
+    partition_run(context, console)
     for index in range(len(run.partition_record().blocks)):
-        train_block(output, index, WatchOptions(), console)
-    merge_run(output, False, console)
+        train_block(context, index, WatchOptions(), console)
+    merge_run(context, False, console)
     return run, run.coarse.status().anchors, run.merged.status().anchors
 
 

@@ -7,9 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import tyro
 from rich.console import Console
 
 from cli_support import PATIENCE_SECONDS, entry_point, vdgs
+from cluster_support import copy_run
 from vdgs import verbs
 from vdgs.cli import HELP, VERBS, main
 from vdgs.verbs.shared import as_typed, open_console
@@ -127,3 +129,38 @@ def test_the_command_that_is_kept_works_in_every_folder(tmp_path, monkeypatch):
     kept = as_typed("run", typed, (Path("my place"), Path("run")))
     assert shlex.split(kept) == ["vdgs", "run", f"{tmp_path}/my place", "--output", f"{tmp_path}/run", "--blocks", "2"]
     assert f"--output={tmp_path}/run" in as_typed("run", ["my place", "--output=run"], (Path("my place"), Path("run")))
+
+
+def test_the_arguments_are_parsed_once(uncut, monkeypatch, tmp_path, capsys):
+    parsed, parse = [], tyro.cli
+
+    def count(kind: type, **options: object) -> object:
+        parsed.append(kind.__name__)
+        return parse(kind, **options)
+
+    monkeypatch.setattr(tyro, "cli", count)
+    for arguments in (
+        ("coarse", tmp_path / "nowhere", "--output", tmp_path / "run", "--preset=laptop"),
+        ("train", uncut),
+        ("merge", uncut, "--rule", "owner"),
+        ("partition", "--capture", uncut, tmp_path),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main([str(each) for each in arguments])
+        assert ended.value.code == 1
+    assert parsed == ["CoarseArguments", "TrainArguments", "MergeArguments", "PartitionArguments"]
+    assert f"{tmp_path}: is not a run folder" in capsys.readouterr().err
+
+
+def test_another_run_than_the_one_asked_for_is_named(uncut, tmp_path, capsys):
+    other = copy_run(uncut, tmp_path / "other")
+    with pytest.raises(SystemExit):
+        main(["train", "--capture", str(other), str(uncut)])
+    assert f"{other}: is a run, and so is {uncut}" in capsys.readouterr().err
+
+
+def test_a_run_decides_the_defaults_of_its_help(uncut, capsys):
+    for arguments, sampling in (([str(uncut)], "roots"), ([], "even")):
+        with pytest.raises(SystemExit):
+            main(["train", *arguments, "--help"])
+        assert f"(default: {sampling})" in capsys.readouterr().out

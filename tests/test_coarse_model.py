@@ -18,6 +18,7 @@ from vdgs.errors import RunError
 from vdgs.runs.beginning import begin_run
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
+from vdgs.runs.run_context import RunContext
 from vdgs.runs.standing import standing_of
 from vdgs.runs.status import Status
 from vdgs.runs.visibility import keep_visibility
@@ -40,11 +41,12 @@ METHOD = MethodConfig(
 
 
 def begin(folder: Path, method: MethodConfig, redo: bool | None = None) -> tuple[RunFolder, Capture]:
-    return begin_run(folder / "place", folder / "run", UP, method, redo=redo)
+    context = begin_run(folder / "place", folder / "run", UP, method, redo=redo)
+    return context.run, context.capture
 
 
 def train(run: RunFolder, capture: Capture) -> None:
-    train_coarse(run, capture, WatchOptions(), QUIET)
+    train_coarse(RunContext(run, capture), WatchOptions(), QUIET)
 
 
 def finished(run: RunFolder, capture: Capture, model: object) -> None:
@@ -81,7 +83,7 @@ def test_a_model_without_anchors_of_an_earlier_version_is_refused_too(tmp_path):
     with pytest.raises(RunError, match="no anchors"):
         train(run, capture)
     with pytest.raises(RunError, match="no anchors"):
-        measure_visibility(run, QUIET)
+        measure_visibility(RunContext(run), QUIET)
 
 
 def test_visibility_that_is_counted_on_a_card_is_handed_on_in_main_memory(tmp_path):

@@ -63,7 +63,8 @@ def place(tmp_path: Path) -> Path:
 @pytest.fixture
 def run(place: Path, tmp_path: Path) -> RunFolder:
     """A run with a finished coarse model and a block, as far as its files say so."""
-    run, capture = begin_run(place, tmp_path / "run", CaptureOptions(), METHOD, redo=False)
+    context = begin_run(place, tmp_path / "run", CaptureOptions(), METHOD, redo=False)
+    run, capture = context.run, context.capture
     write_json(run.capture_file, capture_facts(capture))
     for stage in (run.coarse, run.block(0)):
         stage.discard_unless(run.keys().coarse if stage == run.coarse else run.keys().blocks)
@@ -125,7 +126,8 @@ def test_a_block_is_trained_beside_who_drives_the_run(run, capsys):
 
 def test_who_takes_a_run_up_drives_it(place, tmp_path):
     method = PRESETS["laptop"]
-    with driven_run(place, tmp_path / "run", CaptureOptions(), method, redo=False) as (run, _):
+    with driven_run(place, tmp_path / "run", CaptureOptions(), method, redo=False) as context:
+        run = context.run
         assert run.is_driven()
         with pytest.raises(RunError, match=AT_WORK):
             begin_run(place, run.path, CaptureOptions(), method, redo=True)

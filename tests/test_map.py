@@ -31,6 +31,7 @@ from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
 from vdgs.model.render import render
 from vdgs.placing.placement import Placement
+from vdgs.runs.run_context import RunContext
 from vdgs.settings.requests import MapRequest
 
 rasterio = pytest.importorskip("rasterio")
@@ -88,9 +89,9 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         folder = SimpleNamespace(path=tmp_path / "run")
         status = SimpleNamespace(model="1-2")
         opened = SimpleNamespace(folder=folder, capture=capture, model=model, name="coarse", status=status)
-        monkeypatch.setattr(mapping, "open_run", lambda *_: opened)
+        monkeypatch.setattr(RunContext, "open_model", lambda *_: opened)
         request = MapRequest(tmp_path / "run", device="cpu", **asked)
-        return mapping.map_run(request, Console(file=sys.stderr, soft_wrap=True))
+        return mapping.map_run(RunContext.from_path(request.run), request, Console(file=sys.stderr, soft_wrap=True))
 
     run.path = tmp_path / "run"
     return run
@@ -320,15 +321,16 @@ def test_photographs_of_any_folder_are_no_place_for_maps(house, make, tmp_path):
 
 @pytest.mark.parametrize("facts", [None, "{}", '{"software": "GIS 3", "layers": 2}'])
 def test_maps_of_others_are_not_written_over(house, make, tmp_path, monkeypatch, facts):
-    monkeypatch.setattr(mapping, "open_run", lambda *_: pytest.fail("opened"))
+    monkeypatch.setattr(RunContext, "open_model", lambda *_: pytest.fail("opened"))
+    context = RunContext.from_path(tmp_path / "run")
     (tmp_path / "dsm.tif").write_bytes(b"a month in the field")
     if facts is not None:
         (tmp_path / "map.json").write_text(facts)
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
     with pytest.raises(VdgsError, match=r"holds dsm\.tif.*Nothing was drawn"):
-        mapping.map_run(MapRequest(tmp_path / "run", output=tmp_path), Console(quiet=True))
+        mapping.map_run(context, MapRequest(tmp_path / "run", output=tmp_path), Console(quiet=True))
     with pytest.raises(VdgsError, match="is a file"):
-        mapping.map_run(MapRequest(tmp_path / "run", output=tmp_path / "dsm.tif"), Console(quiet=True))
+        mapping.map_run(context, MapRequest(tmp_path / "run", output=tmp_path / "dsm.tif"), Console(quiet=True))
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 

@@ -33,8 +33,7 @@ def trained(tmp_path_factory) -> Path:
     """A folder with a capture, `place`, and a coarse model of it, `run`."""
     folder = tmp_path_factory.mktemp("moved")
     write_colmap(folder / "place", tiny_scene())
-    run, capture = begin_run(folder / "place", folder / "run", UP, METHOD)
-    train_coarse(run, capture, WatchOptions(), QUIET)
+    train_coarse(begin_run(folder / "place", folder / "run", UP, METHOD), WatchOptions(), QUIET)
     return folder
 
 
@@ -63,16 +62,17 @@ def test_another_option_is_named_and_not_the_capture(trained, options, line):
 
 
 def test_redo_takes_another_option(folder):
-    run, capture = begin_run(folder / "place", folder / "run", replace(UP, downscale=2.0), METHOD, redo=True)
+    context = begin_run(folder / "place", folder / "run", replace(UP, downscale=2.0), METHOD, redo=True)
+    run = context.run
     assert not run.coarse.holds_work()
-    train_coarse(run, capture, WatchOptions(), QUIET)
+    train_coarse(context, WatchOptions(), QUIET)
     assert open_run(run.path).capture.views[0].camera.width == 32
     begin_run(folder / "place", folder / "run", replace(UP, downscale=2.0), METHOD, redo=False)
 
 
 @pytest.mark.parametrize("redo", [None, False])
 def test_a_capture_that_moved_is_taken_where_it_is_given(folder, redo):
-    run, _ = begin_run(folder / "place", folder / "run", UP, METHOD, redo=redo)
+    run = begin_run(folder / "place", folder / "run", UP, METHOD, redo=redo).run
     assert open_run(run.path).capture.root == folder / "place"
     assert run.coarse.is_done(run.keys().coarse)
 
@@ -126,8 +126,9 @@ def test_nothing_is_drawn_among_the_photographs_though_they_are_not_read(trained
     shutil.copytree(trained / "place", tmp_path / "place")
     (tmp_path / "place" / "images").rename(tmp_path / "place" / "photos")
     options = replace(UP, images="photos")
-    run, capture = begin_run(tmp_path / "place", tmp_path / "run", options, METHOD)
-    train_coarse(run, capture, WatchOptions(), QUIET)
+    context = begin_run(tmp_path / "place", tmp_path / "run", options, METHOD)
+    run, capture = context.run, context.capture
+    train_coarse(context, WatchOptions(), QUIET)
     flight = kept_flight(run, open_model(run).model.facts["capture"])
     assert flight is not None
     assert flight.inputs == flight_of(capture).inputs

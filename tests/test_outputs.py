@@ -19,6 +19,7 @@ from vdgs.errors import VdgsError
 from vdgs.inspection.inspect import inspect_capture
 from vdgs.maps.mapping import map_run
 from vdgs.runs.beginning import begin_run
+from vdgs.runs.run_context import RunContext
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.presets import PRESETS
 from vdgs.settings.requests import MapRequest
@@ -119,7 +120,8 @@ def bench(_: Path, output: Path) -> None:
 
 def map_scene(root: Path, output: Path) -> None:
     pytest.importorskip("rasterio")
-    map_run(MapRequest(root.parent / "run", output=output), Console(quiet=True))
+    asked = MapRequest(root.parent / "run", output=output)
+    map_run(RunContext.from_path(asked.run), asked, Console(quiet=True))
 
 
 @pytest.mark.parametrize("verb", [begin, inspect, synth, bench, map_scene])

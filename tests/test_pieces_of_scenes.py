@@ -19,7 +19,7 @@ from vdgs.export.refit import Lacking
 from vdgs.export.saved import load_added, load_lacking, load_shown, save_added, save_lacking, save_shown
 from vdgs.maps.pieces import load_tile, save_tile
 from vdgs.maps.tiles import Tile
-from vdgs.runs.folder import RunFolder
+from vdgs.runs.run_context import RunContext
 from vdgs.settings.executors import ExecutorOptions
 from vdgs.settings.requests import RunRequest
 
@@ -85,10 +85,10 @@ def test_a_tile_that_is_damaged_is_named(tmp_path):
 def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "can_map", lambda: True)
     wishes = []
-    monkeypatch.setattr(pipeline, "map_run", lambda asked, console, wish: wishes.append(wish))
+    monkeypatch.setattr(pipeline, "map_run", lambda context, asked, console, wish: wishes.append(wish))
     for executor in ("local", "slurm"):
         asked = RunRequest(tmp_path, tmp_path, jobs=3, where=ExecutorOptions(executor))
-        pipeline._map(RunFolder(tmp_path), asked, Console(quiet=True))
+        pipeline._map(RunContext.from_path(tmp_path), asked, Console(quiet=True))
     assert [(wish.sends, wish.jobs, wish.where.executor) for wish in wishes] == [
         (False, 0, "local"),
         (True, 3, "slurm"),
@@ -99,7 +99,7 @@ def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path,
 
     monkeypatch.setattr(pipeline, "map_run", stopped)
     with pytest.raises(Stopped):
-        pipeline._map(RunFolder(tmp_path), asked, Console(quiet=True))
+        pipeline._map(RunContext.from_path(tmp_path), asked, Console(quiet=True))
 
 
 def small_parts() -> None:

@@ -233,7 +233,8 @@ def test_a_run_whose_blocks_are_at_work_is_taken_up_again_but_not_changed(tmp_pa
     place, method = tmp_path / "capture", PRESETS["laptop"]
     other = replace(method, partition=replace(method.partition, lambda_vis=0.7))
     write_colmap(place, tiny_scene())
-    run, capture = begin_run(place, tmp_path / "run", CaptureOptions(), method, redo=False)
+    context = begin_run(place, tmp_path / "run", CaptureOptions(), method, redo=False)
+    run, capture = context.run, context.capture
     write_json(run.capture_file, capture_facts(capture))
     with run.locked(shared=True):
         begin_run(place, run.path, CaptureOptions(), method, redo=False)

@@ -280,7 +280,8 @@ def test_a_run_of_photographs_makes_them_a_capture_first_and_reports_how(made, f
     request = with_capture(replace(asked(flight, run), sfm=SfmOptions()), console())
     assert request.capture == run / "capture"
     assert with_capture(request, console()) == request  # a capture is taken as it is
-    folder, capture = begin_run(request.capture, request.output, request.options, request.method(), redo=False)
+    context = begin_run(request.capture, request.output, request.options, request.method(), redo=False)
+    folder, capture = context.run, context.capture
     assert capture.ground.metric
     page = write_report(folder).read_text()
     assert "From photographs to cameras" in page

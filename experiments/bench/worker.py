@@ -13,12 +13,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vdgs.errors import Stopped, VdgsError
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import from_dict
 from vdgs.storage.files import read_json, write_json
+
+if TYPE_CHECKING:
+    from vdgs.runs.run_context import RunContext
 
 #: In the run folder: state, key, why, seconds of each stage.
 RECORD = "bench.json"
@@ -58,8 +61,7 @@ class _Working:
     """What the stages work with."""
 
     job: Job
-    run: Any
-    capture: Any
+    context: RunContext
     console: Any
 
 
@@ -69,47 +71,48 @@ def _coarse(at: _Working) -> None:
 
     if at.job.coarse_from is not None:
         take_coarse(at.job.coarse_from, at.job.output)
-    train_coarse(at.run, at.capture, WatchOptions(), at.console)
+    train_coarse(at.context, WatchOptions(), at.console)
 
 
 def _partition(at: _Working) -> None:
     from vdgs.stages.partition import partition_run
     from vdgs.stages.visibility import measure_visibility
 
-    measure_visibility(at.run, at.console)
-    partition_run(at.run, at.console)
+    measure_visibility(at.context, at.console)
+    partition_run(at.context, at.console)
 
 
 def _blocks(at: _Working) -> None:
     from vdgs.settings.watching import WatchOptions
     from vdgs.stages.train import train_blocks
 
-    train_blocks(at.run.path, WatchOptions(), at.job.block_jobs, at.console)
+    train_blocks(at.context, WatchOptions(), at.job.block_jobs, at.console)
 
 
 def _merge(at: _Working) -> None:
     from vdgs.stages.merge import merge_run
 
-    merge_run(at.run.path, False, at.console)
+    merge_run(at.context, False, at.console)
 
 
 def _evaluate(at: _Working) -> None:
     from vdgs.stages.evaluate import Measuring, evaluate_stage
 
-    evaluate_stage(Measuring(at.run.path, "best", at.job.lpips_weights, at.job.bins), at.console)
+    evaluate_stage(at.context, Measuring(at.context.run.path, "best", at.job.lpips_weights, at.job.bins), at.console)
 
 
 def _gaussians(at: _Working) -> None:
     from experiments.bench.explicit import train_explicit
 
-    train_explicit(at.run, at.capture, at.job.lpips_weights, at.console)
+    train_explicit(at.context.run, at.context.capture, at.job.lpips_weights, at.console)
 
 
 def _renders(at: _Working) -> None:
     from experiments.bench.renders import measure_renders
 
     assert at.job.renders is not None
-    measure_renders(at.capture, at.job.renders, at.run.evaluation, at.job.lpips_weights, at.console)
+    output = at.context.run.evaluation
+    measure_renders(at.context.capture, at.job.renders, output, at.job.lpips_weights, at.console)
 
 
 #: What a method may name as its stages. Each does nothing, or the same again, where it is done.
@@ -152,11 +155,11 @@ def work(job: Job) -> None:
     from rich.console import Console
 
     from experiments.bench.origin import origin
-    from vdgs.kernels import set_threads
+    from vdgs.kernels import configure_threads
 
-    set_threads(job.threads)
-    with _opened(job) as (run, capture):
-        working = _Working(job, run, capture, Console(soft_wrap=True))
+    configure_threads(job.threads)
+    with _opened(job) as context:
+        working = _Working(job, context, Console(soft_wrap=True))
         record = _record(job)
         write_json(job.output / RECORD, record)  # what an interrupted run leaves is not what it was before
         for name in job.stages:
@@ -168,21 +171,21 @@ def work(job: Job) -> None:
 
 
 @contextmanager
-def _opened(job: Job) -> Iterator[tuple[Any, Any]]:
-    """The run folder, driven, and the capture. Where renders are measured the folder is no run: nothing is trained
-    there."""
+def _opened(job: Job) -> Iterator[RunContext]:
+    """The run, driven, with its capture. Where renders are measured the folder is no run: nothing is trained there."""
     from vdgs.captures.loading import load_capture
     from vdgs.runs.beginning import driven_run
     from vdgs.runs.folder import RunFolder
     from vdgs.runs.opening import options_from
+    from vdgs.runs.run_context import RunContext
 
     options = options_from(job.options, job.output)
     if job.renders is not None:
-        yield RunFolder(job.output), load_capture(job.capture, options)
+        yield RunContext(RunFolder(job.output), load_capture(job.capture, options))
         return
     method = from_dict(MethodConfig, job.method)
-    with driven_run(job.capture, job.output, options, method, redo=job.redo) as begun:
-        yield begun
+    with driven_run(job.capture, job.output, options, method, redo=job.redo) as context:
+        yield context
 
 
 def _record(job: Job) -> dict[str, Any]:
@@ -199,6 +202,9 @@ def _plain(value: Any) -> Any:
 
 def main(arguments: list[str]) -> int:
     """Exit codes as those of the command line: 0 done, 1 explained, 130 stopped."""
+    from vdgs.kernels import configure_threads
+
+    configure_threads()  # before anything imports torch
     from vdgs.executors.parent import stop_when_parent_dies
     from vdgs.watching.interrupts import stop_requests
 
@@ -215,5 +221,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     sys.exit(main(sys.argv[1:]))

@@ -75,6 +75,9 @@ def _like(word: str) -> str:
 
 
 def _run(verb: str, arguments: list[str]) -> int:
+    from vdgs.kernels import configure_threads
+
+    configure_threads()  # before anything imports torch
     from vdgs import verbs
     from vdgs.errors import Interrupted, Stopped, VdgsError
     from vdgs.watching.interrupts import stop_requests

@@ -9,7 +9,6 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.markup import escape
 
-from vdgs.captures.capture import Capture
 from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.lpips import refuse_missing
 from vdgs.evaluation.of_run import evaluation_folder
@@ -20,6 +19,7 @@ from vdgs.report import write_report
 from vdgs.report.terminal import next_step, whole_standing
 from vdgs.runs.beginning import driven_run
 from vdgs.runs.folder import RunFolder
+from vdgs.runs.run_context import RunContext
 from vdgs.settings.checks import validate
 from vdgs.settings.ranges import refuse
 from vdgs.settings.requests import MapRequest, RunRequest
@@ -46,12 +46,10 @@ def run_all(asked: RunRequest, console: Console, command: str | None = None) -> 
     refuse(asked)
     refuse_missing(asked.lpips_weights)
     asked = with_capture(asked, console)
-    with driven_run(asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo, command=command) as (
-        run,
-        capture,
-    ):
-        _stages(run, capture, asked, console)
-    console.print(escape(f"next: {next_step(whole_standing(run))}"), highlight=False)
+    begun = driven_run(asked.capture, asked.output, asked.options, asked.method(), redo=asked.redo, command=command)
+    with begun as context:
+        _stages(context, asked, console)
+    console.print(escape(f"next: {next_step(whole_standing(context.run))}"), highlight=False)
 
 
 def with_capture(asked: RunRequest, console: Console) -> RunRequest:
@@ -70,41 +68,43 @@ def with_capture(asked: RunRequest, console: Console) -> RunRequest:
     return replace(asked, capture=request.output, photographs=(), options=replace(asked.options, gps=None))
 
 
-def _stages(run: RunFolder, capture: Capture, asked: RunRequest, console: Console) -> None:
+def _stages(context: RunContext, asked: RunRequest, console: Console) -> None:
     _title(console, "coarse model")
-    train_coarse(run, capture, asked.watching, console, asked.device)
+    train_coarse(context, asked.watching, console, asked.device)
     stop_if_asked()
-    measure_visibility(run, console)
-    _measure(run, "coarse", asked, console)
+    measure_visibility(context, console)
+    _measure(context, "coarse", asked, console)
     _title(console, "blocks")
-    partition_run(run, console, asked.device, _wish(asked))
+    partition_run(context, console, asked.device, _wish(asked))
     _title(console, "block training")
     try:
-        train_blocks(run.path, asked.watching, asked.jobs, console, asked.device, asked.where)
+        train_blocks(context, asked.watching, asked.jobs, console, asked.device, asked.where)
     except RunError as error:
         if not asked.incomplete:
             raise
         console.print(f"[yellow]note[/] {error}", highlight=False)
     _title(console, "merge and evaluation")
-    merge_run(run.path, asked.incomplete, console)
-    _measure(run, "merged", asked, console)
-    _verdict(run, console)
+    merge_run(context, asked.incomplete, console)
+    _measure(context, "merged", asked, console)
+    context.release_models("coarse")
+    _verdict(context.run, console)
     if asked.maps:
-        _map(run, asked, console)
+        _map(context, asked, console)
     stop_if_asked()
-    console.print(f"report: {write_report(run)}", highlight=False)
+    console.print(f"report: {write_report(context.run)}", highlight=False)
 
 
-def _map(run: RunFolder, asked: RunRequest, console: Console) -> None:
+def _map(context: RunContext, asked: RunRequest, console: Console) -> None:
     """Orthophoto, surface model and visibility. What hinders a map does not spoil a run: it is said."""
     _title(console, "maps")
+    run = context.run
     if not can_map():
         console.print("[yellow]note[/] no maps: they need pip install 'vdgs\\[geo]'", highlight=False)
     elif is_mapped(run):
         console.print(f"{run.path / 'maps'}: already drawn; nothing to do", highlight=False)
     else:
         try:
-            map_run(MapRequest(run.path, device=asked.device), console, _wish(asked))
+            map_run(context, MapRequest(run.path, device=asked.device), console, _wish(asked))
         except Stopped:
             raise
         except VdgsError as error:
@@ -117,14 +117,15 @@ def _title(console: Console, name: str) -> None:
     console.rule(f"[bold]{name}", align="left", style="dim")
 
 
-def _measure(run: RunFolder, which: Literal["coarse", "merged"], asked: RunRequest, console: Console) -> None:
+def _measure(context: RunContext, which: Literal["coarse", "merged"], asked: RunRequest, console: Console) -> None:
     """Evaluate a model unless that was done already, for this very model and in the same way."""
     stop_if_asked()
+    run = context.run
     if is_measured(run, which, asked.lpips_weights, asked.bins):
         console.print(f"{evaluation_folder(run, which)}: already measured; nothing to do", highlight=False)
         return
     measuring = Measuring(run.path, which, asked.lpips_weights, asked.bins, device=asked.device)
-    evaluate_stage(measuring, console, _wish(asked))
+    evaluate_stage(context, measuring, console, _wish(asked))
 
 
 def _wish(asked: RunRequest) -> Wish:

@@ -22,15 +22,14 @@ from vdgs.runs.vouching import load_vouched
 HELD_BYTES = 2_000_000_000
 
 
-def block_inputs(opened: TrainedRun, photographs: ReferenceViews) -> BlockInputs:
+def block_inputs(opened: TrainedRun, coarse: TrainedRun, photographs: ReferenceViews) -> BlockInputs:
     """Where the pictures of a run's blocks come from; the merged model is the one that was opened."""
     run = opened.folder
-    coarse = AnchorModel.load(run.coarse.model).to(opened.device)
     return BlockInputs(
         photographs,
-        render_coarse=lambda camera: render(coarse, camera, depth=True),
+        render_coarse=lambda camera: render(coarse.model, camera, depth=True),
         render_merged=lambda camera: render(opened.model, camera, depth=True),
-        render_block=BlocksAlone(run, coarse).render,
+        render_block=BlocksAlone(run, coarse.model).render,
         blocks=blocks_of(run),
         exposure=exposures_of(opened.model, opened.capture),
     )

@@ -45,13 +45,18 @@ Views = Literal["test", "training"]
 
 
 def evaluate_run(
-    run: TrainedRun, lpips_weights: Path | None, bins: int, console: Console, views: Views = "test"
+    run: TrainedRun,
+    coarse: TrainedRun,
+    lpips_weights: Path | None,
+    bins: int,
+    console: Console,
+    views: Views = "test",
 ) -> None:
-    """Measure a model of a run and print a table. Writes `evaluation_folder`."""
+    """Measure a model of a run, opened beside its coarse one, and print a table. Writes `evaluation_folder`."""
     refuse_bins(bins)
     output = evaluation_folder(run.folder, run.name, views)
     lpips, note = load_lpips(lpips_weights)
-    model, chosen = measured_model(run, views), views_of(run.capture, views)
+    model, chosen = measured_model(run, coarse, views), views_of(run.capture, views)
     with cached_photographs(chosen) as photographs:
         evaluate(
             photographs, model, output, lpips=lpips, lpips_note=note, console=console, settings=settings_of(bins, views)
@@ -73,8 +78,8 @@ def views_of(capture: Capture, views: Views) -> list[View]:
     return list(capture.test_views if views == "test" else capture.train_views)
 
 
-def measured_model(run: TrainedRun, views: Views) -> MeasuredModel:
-    """The opened model as the evaluation sees it."""
+def measured_model(run: TrainedRun, coarse: TrainedRun, views: Views) -> MeasuredModel:
+    """The opened model as the evaluation sees it, beside the coarse model of its run."""
     facts = ModelFacts(
         model=run.name,
         n_anchors=len(run.model.anchors),
@@ -84,7 +89,6 @@ def measured_model(run: TrainedRun, views: Views) -> MeasuredModel:
         model_identity=run.status.model,
         key=run.key,
     )
-    coarse = coarse_of(run)
     return MeasuredModel(
         lambda camera: render(run.model, camera),
         visibility_map(coarse),

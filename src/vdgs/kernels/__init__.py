@@ -95,6 +95,18 @@ def default_threads() -> int:
     return cores.default_threads()
 
 
+def configure_threads(count: int | None = None) -> None:
+    """Set up the threads of this process and, by its environment, of those that it starts.
+
+    Call it before torch is imported: torch's OpenMP threads must block, not spin, beside the kernels' own pool, and
+    OMP_WAIT_POLICY is read once, when torch is loaded. A value that is set already stays. Without a count nothing heavy
+    is imported; with one, kernels and torch use so many threads, with 0 as many as `default_threads` says.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if count is not None:
+        set_threads(count or default_threads())
+
+
 def set_threads(count: int) -> None:
     """Let the operations use up to `count` threads of the CPU, the calling one included; torch's own as well.
 

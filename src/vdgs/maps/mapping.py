@@ -36,7 +36,8 @@ from vdgs.maps.plan import Plan, folder_of
 from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Tile
 from vdgs.placing.placement import Placement
 from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import find_model, open_capture, open_run
+from vdgs.runs.opening import find_model
+from vdgs.runs.run_context import RunContext
 from vdgs.settings.requests import MapRequest
 from vdgs.storage.files import jsonable, read_record, write_json
 from vdgs.units import data_size
@@ -46,7 +47,7 @@ from vdgs.watching.interrupts import stop_if_asked
 _DISK_SHARE = 2.4
 
 
-def map_run(asked: MapRequest, console: Console, wish: Wish | None = None) -> Path:
+def map_run(context: RunContext, asked: MapRequest, console: Console, wish: Wish | None = None) -> Path:
     """Write the maps of a run, on a device that is chosen already; returns their folder.
 
     Tiles are drawn in this process, or in pieces where a `wish` sends them: the files are the same. Raises VdgsError,
@@ -58,9 +59,9 @@ def map_run(asked: MapRequest, console: Console, wish: Wish | None = None) -> Pa
     refuse_foreign(folder_of(asked, asked.run))
     began = time.monotonic()
     if wish is not None and wish.sends:
-        facts, folder = _map_in_pieces(asked, wish, console)
+        facts, folder = _map_in_pieces(context, asked, wish, console)
     else:
-        facts, folder = _map_here(asked, console)
+        facts, folder = _map_here(context, asked, console)
     console.print(
         f"maps: {folder} ({facts['mapped_share']:.0%} of the pixels, {time.monotonic() - began:.0f} s)",
         highlight=False,
@@ -68,9 +69,9 @@ def map_run(asked: MapRequest, console: Console, wish: Wish | None = None) -> Pa
     return folder
 
 
-def _map_here(asked: MapRequest, console: Console) -> tuple[dict[str, Any], Path]:
+def _map_here(context: RunContext, asked: MapRequest, console: Console) -> tuple[dict[str, Any], Path]:
     """Draw in this process; what came out, and where."""
-    run = open_run(asked.run, asked.model, asked.device)
+    run = context.open_model(asked.model, asked.device)
     plan = Plan.of(asked, run.folder.path, run.name, run.status.model, run.capture)
     _announce(plan, console)
     clear(plan.folder)
@@ -78,11 +79,12 @@ def _map_here(asked: MapRequest, console: Console) -> tuple[dict[str, Any], Path
         return _write(plan, (surveyor.tile(part) for _, _, part in plan.grid.tiles()), console), plan.folder
 
 
-def _map_in_pieces(asked: MapRequest, wish: Wish, console: Console) -> tuple[dict[str, Any], Path]:
+def _map_in_pieces(context: RunContext, asked: MapRequest, wish: Wish, console: Console) -> tuple[dict[str, Any], Path]:
     """Let pieces of the tiles be drawn elsewhere, and gather them one at a time. No model is in the memory of this
     process."""
+    context.release_models()
     run = RunFolder(Path(os.path.abspath(asked.run)))  # as in `stages.train`: other machines may mount it so
-    found, capture = find_model(run, asked.model), open_capture(run)
+    found, capture = find_model(run, asked.model), context.capture
     plan = Plan.of(asked, run.path, found.name, found.stage.status().model, capture)
     _announce(plan, console, in_pieces=True)
     with drawn_elsewhere(plan, asked, run, found, wish, console) as tiles:

@@ -18,6 +18,7 @@ from vdgs.errors import VdgsError
 from vdgs.inspection.soundness import refuse_unsound
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.keys import counted
+from vdgs.runs.run_context import RunContext
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.checks import validate
 from vdgs.settings.method import MethodConfig, with_iterations
@@ -33,7 +34,7 @@ def begin_run(
     *,
     redo: bool | None = None,
     command: str | None = None,
-) -> tuple[RunFolder, Capture]:
+) -> RunContext:
     """Open the capture and a new run of it, or the run that is there if it was started with the same settings.
 
     `redo` None compares the settings of the coarse stage only and refuses others; True or False is about changing
@@ -54,13 +55,15 @@ def driven_run(
     *,
     redo: bool | None = None,
     command: str | None = None,
-) -> Iterator[tuple[RunFolder, Capture]]:
+) -> Iterator[RunContext]:
     """As `begin_run`, for who takes the run from stage to stage: it is driven (`RunFolder.driven`) from before anything
     of it is written or removed to the end of the `with`."""
     problems = validate(method)
     if problems:
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
     refuse_in_a_capture(output)
+    # Whole paths, as config.yaml holds them: stages hand the capture on, also to other machines.
+    capture_path, capture_options = capture_path.resolve(), _with_whole_paths(capture_options)
     capture = load_capture(capture_path, capture_options)
     refuse_among_inputs(output, capture)
     method = replace(method, training=with_iterations(method.training, len(capture.train_views)))
@@ -70,7 +73,7 @@ def driven_run(
     run.refuse_strangers()
     with run.driven():
         _take_up(run, capture, capture_path, run_settings(capture_path, capture_options, method), redo, command)
-        yield run, capture
+        yield RunContext(run, capture)
 
 
 def _take_up(
@@ -115,7 +118,11 @@ def _keep_reconstruction(root: Path, run: Path) -> None:
 
 def run_settings(capture_path: Path, capture_options: CaptureOptions, method: MethodConfig) -> dict[str, Any]:
     """What config.yaml holds: everything that the result depends on."""
-    plain = to_dict(capture_options)
-    absolute = {name: str(value.resolve()) for name, value in vars(capture_options).items() if isinstance(value, Path)}
-    capture = {"path": str(capture_path.resolve())} | plain | absolute
+    capture = {"path": str(capture_path.resolve())} | to_dict(_with_whole_paths(capture_options))
     return {"capture": capture} | to_dict(method)
+
+
+def _with_whole_paths(options: CaptureOptions) -> CaptureOptions:
+    """Options whose files are named from the root of the disk: they mean the same in every folder."""
+    whole: dict[str, Any] = {name: path.resolve() for name, path in vars(options).items() if isinstance(path, Path)}
+    return replace(options, **whole)

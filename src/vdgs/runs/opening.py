@@ -65,7 +65,11 @@ def open_run(path: Path, which: ModelName = "best", device: torch.device | str =
     """
     folder = RunFolder(path)
     capture = open_capture(folder)
-    opened = open_model(folder, which, device)
+    return with_capture(open_model(folder, which, device), capture)
+
+
+def with_capture(opened: OpenedModel, capture: Capture) -> TrainedRun:
+    """An opened model and the capture of its run. Raises RunError where it was made from another one."""
     refuse_another_capture(opened.model_path, opened.model.facts.get("capture", {}), capture)
     return TrainedRun(**vars(opened), capture=capture)
 
@@ -73,8 +77,7 @@ def open_run(path: Path, which: ModelName = "best", device: torch.device | str =
 def open_model(folder: RunFolder, which: ModelName = "best", device: torch.device | str = "cpu") -> OpenedModel:
     """Open a model of a run on a device, without the capture. Raises RunError if it is not trained."""
     found = find_model(folder, which)
-    model = load_vouched(found.stage, found.key).to(torch.device(device))
-    return OpenedModel(folder, model, found.stage.model, found.name, found.stage.status(), found.key, found.caution)
+    return found.opened(folder, load_vouched(found.stage, found.key).to(torch.device(device)))
 
 
 def refuse_empty(folder: RunFolder, anchors: int | None) -> None:
@@ -102,6 +105,10 @@ class FoundModel:
     def line(self) -> str:
         """Which model it is, in a few words."""
         return _model_line(self.name, self.stage.status().anchors or 0, self.stage.model)
+
+    def opened(self, folder: RunFolder, model: AnchorModel) -> OpenedModel:
+        """The same with the model that was read of it."""
+        return OpenedModel(folder, model, self.stage.model, self.name, self.stage.status(), self.key, self.caution)
 
 
 def _model_line(name: str, anchors: int, file: Path) -> str:
@@ -158,14 +165,15 @@ def open_capture(folder: RunFolder, at: Path | None = None) -> Capture:
     return load_capture(at or written, options_from(settings, folder.config_file))
 
 
-def remember_capture(folder: RunFolder, at: Path) -> None:
-    """Let a run find its capture where it lies now. Raises RunError for another capture than the run's, and where
-    another process works on the run or drives it."""
-    capture = open_capture(folder, at)
+def remember_capture(folder: RunFolder, at: Path) -> Capture:
+    """Let a run find its capture where it lies now; returns it. Raises RunError for another capture than the run's, and
+    where another process works on the run or drives it."""
+    capture = open_capture(folder, at.resolve())
     with folder.driven(), folder.locked():
         if folder.capture_file.exists():
             refuse_another_capture(folder.capture_file, read_json(folder.capture_file), capture)
         folder.move_capture(at)
+    return capture
 
 
 def options_from(settings: dict[str, Any], source: Path) -> CaptureOptions:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 from rich.console import Console
@@ -26,8 +25,7 @@ from vdgs.model.visibility import effective_count
 from vdgs.partition.blocks import Blocks
 from vdgs.partition.regions import drawn_by, holds, ramp, split_anchors
 from vdgs.runs.cut import blocks_of, views_of_block
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import open_run
+from vdgs.runs.run_context import RunContext
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.method import block_limit, block_training
@@ -40,31 +38,32 @@ from vdgs.watching.anchors import continue_or_start, finish, note_without_growth
 from vdgs.watching.images import image_budget
 
 
-def train_block(path: Path, index: int, options: WatchOptions, console: Console, device: str = "cpu") -> None:
+def train_block(context: RunContext, index: int, options: WatchOptions, console: Console, device: str = "cpu") -> None:
     """Train, or continue, one block of a run on a device; nothing if it is finished.
 
     Works beside other blocks of the run, in this or in other processes. Raises RunError if the run is not cut into
     blocks or has no such block, and what training raises (see `train_watched`).
     """
     options.check()
-    run = RunFolder(path)
+    run = context.run
     with run.locked(shared=True):
         blocks = blocks_of(run)
         if not 0 <= index < len(blocks):
-            raise RunError(f"{path}: has blocks 0 to {len(blocks) - 1}; there is no block {index}")
+            raise RunError(f"{run.path}: has blocks 0 to {len(blocks) - 1}; there is no block {index}")
         folder, key = run.block(index), run.keys().blocks
         with folder.locked():
             if folder.is_done(key):
                 console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
                 return
             folder.discard_unless(key)
-            _train(run, index, blocks, options, console, torch.device(device))
+            _train(context, index, blocks, options, console, torch.device(device))
 
 
 def _train(
-    run: RunFolder, index: int, blocks: Blocks, options: WatchOptions, console: Console, device: torch.device
+    context: RunContext, index: int, blocks: Blocks, options: WatchOptions, console: Console, device: torch.device
 ) -> None:
-    opened, folder, method = open_run(run.path, "coarse", device), run.block(index), run.method()
+    run, opened = context.run, context.open_model("coarse", device)
+    folder, method = run.block(index), run.method()
     capture, coarse = opened.capture, opened.model
     chosen = views_of_block(run, capture, index)
     views = [capture.train_views[i] for i in chosen]

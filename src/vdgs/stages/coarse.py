@@ -24,6 +24,7 @@ from vdgs.model.start import initial_anchors
 from vdgs.runs.flight import keep_flight
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import refuse_empty
+from vdgs.runs.run_context import RunContext
 from vdgs.runs.status import Status
 from vdgs.runs.stereo import find_points
 from vdgs.settings.method import TrainConfig
@@ -38,21 +39,21 @@ from vdgs.watching.images import image_budget
 from vdgs.watching.interrupts import stop_if_asked
 
 
-def train_coarse(
-    run: RunFolder, capture: Capture, options: WatchOptions, console: Console, device: str = "cpu"
-) -> None:
+def train_coarse(context: RunContext, options: WatchOptions, console: Console, device: str = "cpu") -> None:
     """Train, or continue, the coarse model of a run on a device; nothing if it is finished.
 
     Raises CaptureError for a capture that cannot become a scene or damaged photographs, Stopped after Ctrl-C or SIGTERM
     (state saved), TrainingDiverged (last good state kept), RunError where training leaves no anchors.
     """
     options.check()
+    run = context.run
     folder, key = run.coarse, run.keys().coarse
     if folder.is_done(key):  # its blocks may be at work
         refuse_empty(run, folder.status().anchors)
         console.print(f"{folder.model}: already trained; nothing to do", highlight=False)
         return
     with run.locked():
+        capture = context.capture
         refuse_unworkable(capture, console)
         config = run.method().training
         note_without_growth(config, console)

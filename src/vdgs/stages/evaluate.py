@@ -44,7 +44,8 @@ from vdgs.memory.estimate import drawing_bytes
 from vdgs.memory.process import forget_peak, peak_memory_bytes
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import FoundModel, find_model, open_capture, open_run
+from vdgs.runs.opening import FoundModel, find_model
+from vdgs.runs.run_context import RunContext
 from vdgs.settings.requests import ModelName
 from vdgs.storage.files import read_json, read_record, write_bytes, write_json
 from vdgs.storage.records import plain, record_of
@@ -69,7 +70,7 @@ class Measuring:
     device: str = "cpu"
 
 
-def evaluate_stage(asked: Measuring, console: Console, wish: Wish | None = None) -> None:
+def evaluate_stage(context: RunContext, asked: Measuring, console: Console, wish: Wish | None = None) -> None:
     """Measure a model of a run; of the merged one, on test views, also block by block and at the seams.
 
     In this process, or in pieces where a `wish` sends them: the figures are the same, but for times.
@@ -84,25 +85,27 @@ def evaluate_stage(asked: Measuring, console: Console, wish: Wish | None = None)
         console.print(f"[yellow]warning[/] {found.caution}", highlight=False)
     began = time.monotonic()
     if wish is not None and wish.sends:
-        peak = _measure_in_pieces(run, found, asked, wish, console)
+        peak = _measure_in_pieces(context, run, found, asked, wish, console)
     else:
-        peak = _measure_here(run, found, asked, console)
+        peak = _measure_here(context, found, asked, console)
     record = _record_of(run, found.name, asked.lpips_weights, asked.bins)
     write_json(output / "status.json", record | {"seconds": time.monotonic() - began, "peak_memory_bytes": peak})
 
 
-def _measure_here(run: RunFolder, found: FoundModel, asked: Measuring, console: Console) -> int:
+def _measure_here(context: RunContext, found: FoundModel, asked: Measuring, console: Console) -> int:
     """Measure in this process; the most memory that it took (bytes)."""
+    run = context.run
     output = evaluation_folder(run, found.name, asked.views)
     with alone(output):
-        opened = open_run(asked.path, asked.which, asked.device)
+        opened = context.open_model(asked.which, asked.device)
+        coarse = context.open_model("coarse", asked.device)
         _announce(found, len(views_of(opened.capture, asked.views)), asked.views, console)
         _forget(output)
         forget_peak()
-        evaluate_run(opened, asked.lpips_weights, asked.bins, console, asked.views)
+        evaluate_run(opened, coarse, asked.lpips_weights, asked.bins, console, asked.views)
         if _has_seams(run, found.name, asked.views):
             with cached_photographs(opened.capture.test_views) as photographs:
-                console.print(block_table(evaluate_blocks(block_inputs(opened, photographs), output)))
+                console.print(block_table(evaluate_blocks(block_inputs(opened, coarse, photographs), output)))
     return peak_memory_bytes()
 
 
@@ -115,10 +118,13 @@ def _has_seams(run: RunFolder, name: str, views: Views) -> bool:
     return views == "test" and name == "merged" and len(blocks_of(run)) > 1
 
 
-def _measure_in_pieces(run: RunFolder, found: FoundModel, asked: Measuring, wish: Wish, console: Console) -> int:
+def _measure_in_pieces(
+    context: RunContext, run: RunFolder, found: FoundModel, asked: Measuring, wish: Wish, console: Console
+) -> int:
     """Let pieces of the views be measured elsewhere, and join them; the most memory that one took (bytes). No model is
     in the memory of this process."""
-    output, capture = evaluation_folder(run, found.name, asked.views), open_capture(run)
+    context.release_models()
+    output, capture = evaluation_folder(run, found.name, asked.views), context.capture
     views = views_of(capture, asked.views)
     refuse_without_views(views, output)
     work = _work(run, found, asked, len(views))
@@ -173,11 +179,11 @@ def _piece_bytes(run: RunFolder, found: FoundModel, asked: Measuring, capture: C
     return drawing_bytes(files, min(held, files), pixels, asked.lpips_weights is not None)
 
 
-def evaluate_piece(asked: Measuring, index: int, console: Console) -> None:
+def evaluate_piece(context: RunContext, asked: Measuring, index: int, console: Console) -> None:
     """Measure one piece of the views, continue it, or do nothing if it is done. What its views come to stays beside its
     status until all pieces are joined; pictures go where they belong."""
     run = RunFolder(Path(os.path.abspath(asked.path)))
-    opened = open_run(run.path, asked.which, asked.device)
+    opened, coarse = (context.open_model(which, asked.device) for which in (asked.which, "coarse"))
     views = views_of(opened.capture, asked.views)
     work = _work(run, find_model(run, asked.which), asked, len(views))
     folder, span = work.piece(index), work.span(index)
@@ -187,9 +193,9 @@ def evaluate_piece(asked: Measuring, index: int, console: Console) -> None:
     done = sum(work.file(item).exists() for item in span)
     with at_work(folder, done, len(span)) as tell, cached_photographs(views) as photographs:
         lpips, note = load_lpips(asked.lpips_weights)
-        model = measured_model(opened, asked.views)
+        model = measured_model(opened, coarse, asked.views)
         inputs = ViewInputs(photographs, model, lpips, settings_of(asked.bins, asked.views), work.output)
-        seams = block_inputs(opened, photographs) if _has_seams(run, opened.name, asked.views) else None
+        seams = block_inputs(opened, coarse, photographs) if _has_seams(run, opened.name, asked.views) else None
         write_json(folder.path / "facts.json", {"model": plain(model.facts), "lpips_note": note})
         console.print(f"measuring the {opened.line} on views {span.start} to {span.stop - 1}", highlight=False)
         pictures = _SeamPictures(work, span) if seams is not None else None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 from rich.console import Console
 
@@ -14,19 +13,19 @@ from vdgs.memory.process import forget_peak, peak_memory_bytes
 from vdgs.partition.merging import merge
 from vdgs.runs.cut import blocks_of, views_of_blocks
 from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import open_run
+from vdgs.runs.run_context import RunContext
 from vdgs.runs.standing import standing_of
 from vdgs.runs.status import Status
 from vdgs.runs.vouching import load_vouched
 from vdgs.storage.tensors import identity
 
 
-def merge_run(path: Path, incomplete: bool, console: Console) -> None:
+def merge_run(context: RunContext, incomplete: bool, console: Console) -> None:
     """Merge the blocks of a run into RUN/merged; nothing if they are merged already.
 
     Raises RunError if a block is missing or failed, unless `incomplete`: the coarse anchors then stand in for it.
     """
-    run = RunFolder(path)
+    run = context.run
     with run.locked():
         key, keys = run.keys().merge, run.keys()
         blocks = blocks_of(run)
@@ -39,7 +38,7 @@ def merge_run(path: Path, incomplete: bool, console: Console) -> None:
             _refuse(run, done)
         forget_peak()
         began = time.monotonic()
-        opened = open_run(path, "coarse")
+        opened = context.open_model("coarse")
         capture, coarse = opened.capture, opened.model
         views = capture.train_views
         cameras = [[views[i].camera for i in of_block] for of_block in views_of_blocks(run, capture)]

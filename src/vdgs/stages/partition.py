@@ -40,7 +40,8 @@ from vdgs.partition.records import AssignedBlock, PartitionRecord
 from vdgs.partition.strategies import STRATEGIES
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.locks import hold
-from vdgs.runs.opening import TrainedRun, open_run
+from vdgs.runs.opening import TrainedRun
+from vdgs.runs.run_context import RunContext
 from vdgs.runs.visibility import keep_visibility
 from vdgs.settings.method import AssignmentConfig, MethodConfig, PartitionConfig
 from vdgs.storage.files import read_json, write_json
@@ -66,19 +67,20 @@ class _Scene:
     cameras: list[Camera]
 
     @staticmethod
-    def of(run: RunFolder, device: str) -> _Scene:
-        opened = open_run(run.path, "coarse", device)
+    def of(context: RunContext, device: str) -> _Scene:
+        opened = context.open_model("coarse", device)
         cameras = [view.camera for view in opened.capture.train_views]
         positions = opened.model.anchors.positions.cpu().numpy()
         return _Scene(opened, positions, keep_visibility(opened).numpy(), cameras)
 
 
-def partition_run(run: RunFolder, console: Console, device: str = "cpu", wish: Wish | None = None) -> None:
+def partition_run(context: RunContext, console: Console, device: str = "cpu", wish: Wish | None = None) -> None:
     """Cut the scene of a run and assign its cameras, drawing on a device; what is there for the same settings is kept.
 
     Cameras are scored in this process, or in pieces where a `wish` sends them: the scores are the same. Raises RunError
     without a coarse model, and what `Errand.run` raises.
     """
+    run = context.run
     keys, before = run.keys(), _record_before(run)
     kept = _kept_blocks(run) if before.key == keys.partition else None
     if kept is not None and before.assignment_key == keys.assignment and _scores_are_whole(run):
@@ -86,7 +88,7 @@ def partition_run(run: RunFolder, console: Console, device: str = "cpu", wish: W
         return
     with run.locked():
         forget_peak()
-        began, method, scene = time.monotonic(), run.method(), _Scene.of(run, device)
+        began, method, scene = time.monotonic(), run.method(), _Scene.of(context, device)
         work, config = _work(run, len(scene.cameras)), _assignment(method)
         begun = _begun_cut(work)
         if begun is not None:
@@ -233,10 +235,10 @@ def _command(run: RunFolder, index: int, share: Share, device: str) -> list[str]
     ]  # fmt: skip
 
 
-def score_piece(run: RunFolder, index: int, console: Console, device: str = "cpu") -> None:
+def score_piece(context: RunContext, index: int, console: Console, device: str = "cpu") -> None:
     """Score one piece of the cameras for the blocks that a command has cut, continue it, or do nothing if it is done.
     Its scores stay beside its status until all pieces are joined. RunError where no command has cut them."""
-    opened = open_run(run.path, "coarse", device)
+    run, opened = context.run, context.open_model("coarse", device)
     cameras = [view.camera for view in opened.capture.train_views]
     work = _work(run, len(cameras))
     span, cut = work.span(index), _begun_cut(work)

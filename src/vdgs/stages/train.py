@@ -21,7 +21,7 @@ from vdgs.executors.placement import Share
 from vdgs.memory.estimate import decoded_bytes, estimate, largest_picture, need_of_block
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import open_capture
+from vdgs.runs.run_context import RunContext
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.executors import ExecutorOptions
@@ -29,7 +29,7 @@ from vdgs.settings.watching import WatchOptions
 
 
 def train_blocks(
-    path: Path,
+    context: RunContext,
     options: WatchOptions,
     jobs: int,
     console: Console,
@@ -45,16 +45,18 @@ def train_blocks(
     options.check()
     if jobs < 0:
         raise VdgsError(f"--jobs is {jobs}; it must be at least 1, or 0 for what cores and memory allow")
-    run = RunFolder(Path(os.path.abspath(path)))  # not resolved: other machines may mount what links point to elsewhere
+    # Not resolved: other machines may mount what links point to elsewhere.
+    run = RunFolder(Path(os.path.abspath(context.run.path)))
     began = time.monotonic()
     with run.locked(shared=True):
         blocks, key = blocks_of(run), run.keys().blocks
         _remove_beyond(run, len(blocks), console)
         left = [index for index in range(len(blocks)) if not run.block(index).is_done(key)]
         if not left:
-            console.print(f"{path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
+            console.print(f"{context.run.path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
             return
-        views = open_capture(run).train_views
+        context.release_models()  # the memory is for the blocks
+        views = context.capture.train_views
         cameras, files = [view.camera for view in views], [run.config_file, run.coarse.model, *photographs_of(views)]
         errand = Errand(
             BLOCKS, run.path / "blocks", len(blocks), left, run.block,

@@ -11,23 +11,24 @@ from rich.console import Console
 
 from vdgs.model.visibility import imbalance
 from vdgs.partition.figures import maps as figures
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import open_run, refuse_empty
+from vdgs.runs.opening import refuse_empty
+from vdgs.runs.run_context import RunContext
 from vdgs.runs.visibility import keep_visibility
 from vdgs.storage.files import read_record, write_json
 
 
-def measure_visibility(run: RunFolder, console: Console) -> None:
+def measure_visibility(context: RunContext, console: Console) -> None:
     """V_i of every anchor: its distribution and a map from above. Skipped where it is there for this coarse model.
 
     RunError without a coarse model, or for one without anchors.
     """
+    run = context.run
     file, key = run.visibility / "visibility.json", run.keys().visibility
     if read_record(file).get("key") == key:
         console.print(f"{file}: already there; nothing to do", highlight=False)
         return
     with run.locked():
-        opened = open_run(run.path, "coarse")
+        opened = context.open_model("coarse")
         refuse_empty(run, len(opened.model.anchors))
         visibility = keep_visibility(opened).numpy()
         cameras = [view.camera for view in opened.capture.train_views]

@@ -32,22 +32,32 @@ class SavedState:
 
 def save_state(folder: Path, state: SavedState) -> None:
     """Write a state and remove all but the newest two. Raises VdgsError if the disk refuses."""
-    path = folder / f"{state.iteration:08d}.safetensors"
+    path = state_file(folder, state.iteration)
     write_atomically(path, lambda temporary: write_tensors(temporary, state.tensors))
     # Of what the disk has, not of what was meant: read again, from the system's cache.
     size, crc = size_and_checksum(path)
     sidecar = {"iteration": state.iteration, "bytes": size, "crc32": crc, "facts": dict(state.facts)}
     write_json(path.with_suffix(".json"), sidecar)
-    for old in sorted(folder.glob("*.json"))[:-KEPT]:
+    for old in sidecars(folder)[:-KEPT]:
         old.unlink()
         old.with_suffix(".safetensors").unlink(missing_ok=True)
     remove_leftovers(folder)
 
 
+def state_file(folder: Path, iteration: int) -> Path:
+    """The tensors of the state that is saved after an iteration."""
+    return folder / f"{iteration:08d}.safetensors"
+
+
+def sidecars(folder: Path) -> list[Path]:
+    """The files that make states count, oldest first."""
+    return sorted(folder.glob("*.json"))
+
+
 def load_newest(folder: Path) -> tuple[SavedState | None, list[str]]:
     """The newest state that is whole, and one sentence for each newer one that is not."""
     complaints: list[str] = []
-    for sidecar in sorted(folder.glob("*.json"), reverse=True):
+    for sidecar in reversed(sidecars(folder)):
         try:
             return _read(sidecar), complaints
         except (OSError, ValueError, KeyError, TypeError) as error:

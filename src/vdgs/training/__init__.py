@@ -10,11 +10,13 @@ from vdgs.training.state import (
     TrainingImages,
     TrainingState,
     from_saved,
+    result_from_saved,
     start_state,
     to_saved,
 )
 
 __all__ = [
     "PSNR_INTERVAL", "Stage", "StepReport", "Surroundings", "TrainingImages", "TrainingState", "downscale_at",
-    "from_saved", "mean_colour", "start_state", "to_saved", "train", "train_step", "view_at", "views_in_cycle",
+    "from_saved", "mean_colour", "result_from_saved", "start_state", "to_saved", "train", "train_step", "view_at",
+    "views_in_cycle",
 ]  # fmt: skip

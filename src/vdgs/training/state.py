@@ -196,12 +196,24 @@ def to_saved(state: TrainingState) -> SavedState:
     return SavedState(state.iteration, facts, tensors)
 
 
+def result_from_saved(saved: SavedState) -> tuple[Anchors, Decoder]:
+    """As `TrainingState.result`, of a state that was saved."""
+    anchors, averaged = _group(saved, "anchors"), bool(saved.facts.get("averaged", 0))
+    anchors |= _group(saved, "average.anchors") if averaged else {}
+    return Anchors(**anchors), Decoder.from_tensors(_group(saved, "average.decoder" if averaged else "decoder"))
+
+
+def _group(saved: SavedState, name: str) -> dict[str, Tensor]:
+    """The tensors of one group of a state that was saved, by their own names."""
+    start = f"{name}."
+    return {key.removeprefix(start): tensor for key, tensor in saved.tensors.items() if key.startswith(start)}
+
+
 def from_saved(saved: SavedState, stage: Stage) -> TrainingState:
     """The inverse of `to_saved`, bit for bit, on the stage's device. Raises KeyError if a tensor is missing."""
 
     def group(name: str) -> dict[str, Tensor]:
-        start = f"{name}."
-        return {k.removeprefix(start): v.to(stage.device) for k, v in saved.tensors.items() if k.startswith(start)}
+        return {key: tensor.to(stage.device) for key, tensor in _group(saved, name).items()}
 
     state = start_state(Anchors(**group("anchors")), Decoder.from_tensors(group("decoder")), stage)
     state.optimiser.decoder = Moments(group("first.decoder"), group("second.decoder"))

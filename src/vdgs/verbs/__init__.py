@@ -5,8 +5,6 @@ Nothing heavy is imported before the options are parsed, so that help and usage 
 
 from __future__ import annotations
 
-import os
-
 from vdgs.verbs.captures import inspect, synth
 from vdgs.verbs.experiments import bench
 from vdgs.verbs.exporting import export
@@ -22,6 +20,3 @@ __all__ = [
     "bench", "coarse", "doctor", "eval", "export", "inspect", "map", "merge", "partition", "render", "report", "run",
     "sfm", "status", "synth", "train", "view", "visibility",
 ]  # fmt: skip
-
-# torch's OpenMP threads must block, not spin, beside the kernels' own pool; read once, when torch is imported.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

@@ -8,10 +8,11 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from vdgs.kernels import configure_threads
 from vdgs.settings.executors import ExecutorOptions
 from vdgs.settings.ranges import WORKERS, Range
 from vdgs.settings.requests import ExportRequest
-from vdgs.verbs.shared import open_console, parse, use_device, use_threads
+from vdgs.verbs.shared import open_console, parse, use_device
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class ExportArguments(ExportRequest):
 def export(arguments: list[str]) -> None:
     asked = parse(ExportArguments, arguments, "vdgs export")
     device, console = use_device(asked.device), open_console(asked.quiet)
-    use_threads(asked.threads)
+    configure_threads(asked.threads)
     if asked.piece is not None:
         from vdgs.executors.parent import stop_when_parent_dies
         from vdgs.export.piece import bake_piece

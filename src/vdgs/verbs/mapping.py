@@ -8,10 +8,11 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from vdgs.kernels import configure_threads
 from vdgs.settings.executors import ExecutorOptions
 from vdgs.settings.ranges import WORKERS, Range
 from vdgs.settings.requests import MapRequest
-from vdgs.verbs.shared import open_console, parse, use_device, use_threads
+from vdgs.verbs.shared import open_console, parse, use_device
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class MapArguments(MapRequest):
 def map(arguments: list[str]) -> None:
     asked = parse(MapArguments, arguments, "vdgs map")
     device = use_device(asked.device)
-    use_threads(asked.threads)
+    configure_threads(asked.threads)
     if asked.piece is not None:
         from vdgs.executors.parent import stop_when_parent_dies
         from vdgs.maps.pieces import map_piece
@@ -46,6 +47,8 @@ def map(arguments: list[str]) -> None:
         return
     from vdgs.executors.errand import Wish
     from vdgs.maps.mapping import map_run
+    from vdgs.runs.run_context import RunContext
 
     asked.where.check()
-    map_run(replace(asked, device=device), open_console(asked.quiet), Wish(asked.where, asked.jobs, device=device))
+    wish = Wish(asked.where, asked.jobs, device=device)
+    map_run(RunContext.from_path(asked.run), replace(asked, device=device), open_console(asked.quiet), wish)

@@ -8,10 +8,11 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from vdgs.kernels import configure_threads
 from vdgs.settings.executors import ExecutorOptions
 from vdgs.settings.ranges import WORKERS, Range
 from vdgs.settings.requests import BINS, ModelName, RenderRequest
-from vdgs.verbs.shared import find_capture, open_console, parse, use_device, use_threads
+from vdgs.verbs.shared import open_console, parse, use_device
 
 
 @dataclass(frozen=True)
@@ -77,23 +78,23 @@ class EvalArguments:
 
 def eval(arguments: list[str]) -> None:
     asked = parse(EvalArguments, arguments, "vdgs eval")
-    from vdgs.runs.folder import RunFolder
+    from vdgs.runs.run_context import RunContext
     from vdgs.stages.evaluate import Measuring, evaluate_piece, evaluate_stage
 
     device, console = use_device(asked.device), open_console(asked.quiet)
     measuring = Measuring(asked.run, asked.model, asked.lpips_weights, asked.bins, asked.views, device)
-    use_threads(asked.threads)
+    configure_threads(asked.threads)
     if asked.piece is not None:
         from vdgs.executors.parent import stop_when_parent_dies
 
         stop_when_parent_dies()
-        evaluate_piece(measuring, asked.piece, console)
+        evaluate_piece(RunContext.from_path(asked.run), measuring, asked.piece, console)
     else:
         from vdgs.executors.errand import Wish
 
-        find_capture(RunFolder(asked.run), asked.capture)
         asked.where.check()
-        evaluate_stage(measuring, console, Wish(asked.where, asked.jobs, device=device))
+        context = RunContext.from_path(asked.run, asked.capture)
+        evaluate_stage(context, measuring, console, Wish(asked.where, asked.jobs, device=device))
 
 
 @dataclass(frozen=True)
@@ -129,5 +130,5 @@ def render(arguments: list[str]) -> None:
     from vdgs.films.film import render_run
 
     device = use_device(asked.device)
-    use_threads(asked.threads)
+    configure_threads(asked.threads)
     render_run(replace(asked, device=device), open_console(asked.quiet))

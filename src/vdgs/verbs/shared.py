@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -34,27 +35,45 @@ def parse(kind: type[Parsed], arguments: list[str], prog: str, default: Parsed |
     return asked
 
 
-def named_preset(arguments: list[str]) -> PresetName:
-    """The preset named on the command line: it decides the defaults of all other options."""
-    for place, argument in enumerate(arguments):
-        value = argument.partition("=")[2] if argument.startswith("--preset=") else None
-        if argument == "--preset" and place + 1 < len(arguments):
-            value = arguments[place + 1]
-        if value in PRESETS:
-            return value  # type: ignore[return-value]
-    return "paper"
+# The values of a preset, or those that a run recorded, are the defaults of all other options, and --help shows them:
+# tyro must be given them before it parses and cannot look up one argument first. The two functions below look up that
+# one and nothing else.
 
 
-def recorded_run(arguments: list[str], kind: type, prog: str) -> tuple[RunFolder, MethodConfig]:
-    """The run that the arguments name and its settings: they are the defaults of the options, and of their help where
-    the run is named."""
+def preset_defaults(arguments: list[str]) -> tuple[PresetName, MethodConfig]:
+    """The preset that the arguments name, and its settings; `paper` without one, or where tyro is to refuse it."""
+    named = "paper"
+    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        option, joined, value = argument.partition("=")
+        if option == "--preset":
+            named = value if joined else following
+    name: PresetName = named if named in PRESETS else "paper"  # type: ignore[assignment]
+    return name, PRESETS[name]
+
+
+def parse_for_run(
+    kind: type[Parsed], arguments: list[str], prog: str, defaults: Callable[[MethodConfig], Parsed]
+) -> tuple[Parsed, RunFolder, MethodConfig]:
+    """The arguments of a verb, the run that they name and its settings, which are the `defaults`.
+
+    Raises what `parse` raises, RunError where the run is none, VdgsError where another option names a run.
+    """
+    named = next((Path(each) for each in arguments if (Path(each) / "config.yaml").is_file()), None)
+    if named is None:
+        method = MethodConfig()
+    else:
+        from vdgs.runs.folder import RunFolder
+
+        method = RunFolder(named).method()
+    asked = parse(kind, arguments, prog, defaults(method))
+    from vdgs.errors import VdgsError
     from vdgs.runs.folder import RunFolder
 
-    if "-h" in arguments or "--help" in arguments:
-        named = next((RunFolder(Path(a)) for a in arguments if (Path(a) / "config.yaml").is_file()), None)
-        return (named, named.method()) if named else parse(kind, arguments, prog)
-    run = RunFolder(parse(kind, arguments, prog).run)
-    return run, run.method()
+    run = RunFolder(asked.run)  # type: ignore[attr-defined]
+    own = run.method()
+    if named != run.path:
+        raise VdgsError(f"{named}: is a run, and so is {run.path}. Name one run; --capture takes a capture's folder.")
+    return asked, run, own
 
 
 def change_settings(run: RunFolder, method: MethodConfig, redo: bool, quiet: bool = False) -> None:
@@ -71,20 +90,6 @@ def change_settings(run: RunFolder, method: MethodConfig, redo: bool, quiet: boo
         with run.driven(), run.locked():
             for line in run.change_settings(wanted, redo):
                 open_console(quiet).print(f"[yellow]changed[/] {line}", highlight=False)
-
-
-def find_capture(run: RunFolder, at: Path | None) -> None:
-    """Let the run find its capture where --capture says that it lies now, if it says so."""
-    if at is not None:
-        from vdgs.runs.opening import remember_capture
-
-        remember_capture(run, at)
-
-
-def use_threads(count: int) -> None:
-    from vdgs.kernels import set_threads, threads
-
-    set_threads(count if count > 0 else threads())
 
 
 def use_device(asked: str) -> str:

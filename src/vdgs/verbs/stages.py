@@ -9,18 +9,17 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
+from vdgs.kernels import configure_threads
 from vdgs.settings.executors import ExecutorOptions
-from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, PartitionConfig
+from vdgs.settings.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig
 from vdgs.settings.ranges import WORKERS, Range
 from vdgs.settings.watching import WatchOptions
 from vdgs.verbs.shared import (
     change_settings,
-    find_capture,
     open_console,
     parse,
-    recorded_run,
+    parse_for_run,
     use_device,
-    use_threads,
 )
 
 
@@ -38,12 +37,10 @@ class VisibilityArguments:
 
 def visibility(arguments: list[str]) -> None:
     asked = parse(VisibilityArguments, arguments, "vdgs visibility")
-    from vdgs.runs.folder import RunFolder
+    from vdgs.runs.run_context import RunContext
     from vdgs.stages.visibility import measure_visibility
 
-    run = RunFolder(asked.run)
-    find_capture(run, asked.capture)
-    measure_visibility(run, open_console(asked.quiet))
+    measure_visibility(RunContext.from_path(asked.run, asked.capture), open_console(asked.quiet))
 
 
 @dataclass(frozen=True)
@@ -76,27 +73,29 @@ class PartitionArguments:
 
 
 def partition(arguments: list[str]) -> None:
-    run, method = recorded_run(arguments, PartitionArguments, "vdgs partition")
-    default = PartitionArguments(tyro.MISSING, partition=method.partition, assignment=method.assignment)
-    asked = parse(PartitionArguments, arguments, "vdgs partition", default)
+    def defaults(method: MethodConfig) -> PartitionArguments:
+        return PartitionArguments(tyro.MISSING, partition=method.partition, assignment=method.assignment)
+
+    asked, run, method = parse_for_run(PartitionArguments, arguments, "vdgs partition", defaults)
+    from vdgs.runs.run_context import RunContext
     from vdgs.stages.partition import explain_view, partition_run, score_piece
 
     device = use_device(asked.device)
-    use_threads(asked.threads)
+    configure_threads(asked.threads)
     if asked.piece is not None:
         from vdgs.executors.parent import stop_when_parent_dies
 
         stop_when_parent_dies()
-        score_piece(run, asked.piece, open_console(asked.quiet), device)
+        score_piece(RunContext(run), asked.piece, open_console(asked.quiet), device)
         return
     from vdgs.executors.errand import Wish
 
     asked.where.check()
-    find_capture(run, asked.capture)
+    context = RunContext.from_path(asked.run, asked.capture)
     change_settings(
         run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.redo, asked.quiet
     )
-    partition_run(run, open_console(asked.quiet), device, Wish(asked.where, asked.jobs, device=device))
+    partition_run(context, open_console(asked.quiet), device, Wish(asked.where, asked.jobs, device=device))
     if asked.why is not None:
         explain_view(run, asked.why, open_console(asked.quiet))
 
@@ -127,23 +126,26 @@ class TrainArguments:
 
 
 def train(arguments: list[str]) -> None:
-    run, method = recorded_run(arguments, TrainArguments, "vdgs train")
-    default = TrainArguments(tyro.MISSING, settings=method.block)
-    asked = parse(TrainArguments, arguments, "vdgs train", default)
+    def defaults(method: MethodConfig) -> TrainArguments:
+        return TrainArguments(tyro.MISSING, settings=method.block)
+
+    asked, run, method = parse_for_run(TrainArguments, arguments, "vdgs train", defaults)
     device = use_device(asked.device)
-    find_capture(run, asked.capture)
+    from vdgs.runs.run_context import RunContext
+
+    context = RunContext.from_path(asked.run, asked.capture)
     change_settings(run, replace(method, block=asked.settings), asked.redo, asked.quiet)
     if asked.block is not None:
         from vdgs.executors.parent import stop_when_parent_dies
         from vdgs.stages.block import train_block
 
         stop_when_parent_dies()
-        use_threads(asked.threads)
-        train_block(asked.run, asked.block, asked.watching, open_console(asked.quiet), device)
+        configure_threads(asked.threads)
+        train_block(context, asked.block, asked.watching, open_console(asked.quiet), device)
     else:
         from vdgs.stages.train import train_blocks
 
-        train_blocks(asked.run, asked.watching, asked.jobs, open_console(asked.quiet), device, asked.where)
+        train_blocks(context, asked.watching, asked.jobs, open_console(asked.quiet), device, asked.where)
 
 
 @dataclass(frozen=True)
@@ -162,11 +164,13 @@ class MergeArguments:
 
 
 def merge(arguments: list[str]) -> None:
-    run, method = recorded_run(arguments, MergeArguments, "vdgs merge")
-    default = MergeArguments(tyro.MISSING, merge=method.merge)
-    asked = parse(MergeArguments, arguments, "vdgs merge", default)
+    def defaults(method: MethodConfig) -> MergeArguments:
+        return MergeArguments(tyro.MISSING, merge=method.merge)
+
+    asked, run, method = parse_for_run(MergeArguments, arguments, "vdgs merge", defaults)
+    from vdgs.runs.run_context import RunContext
     from vdgs.stages.merge import merge_run
 
-    find_capture(run, asked.capture)
+    context = RunContext.from_path(asked.run, asked.capture)
     change_settings(run, replace(method, merge=asked.merge), redo=False, quiet=asked.quiet)
-    merge_run(asked.run, asked.incomplete, open_console(asked.quiet))
+    merge_run(context, asked.incomplete, open_console(asked.quiet))

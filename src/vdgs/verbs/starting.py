@@ -9,20 +9,20 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg
 
+from vdgs.kernels import configure_threads
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.executors import ExecutorOptions
 from vdgs.settings.method import PartitionConfig, TrainConfig
-from vdgs.settings.presets import PRESETS, PresetName
+from vdgs.settings.presets import PresetName
 from vdgs.settings.ranges import WORKERS
 from vdgs.settings.requests import RunRequest
 from vdgs.settings.watching import WatchOptions
 from vdgs.verbs.shared import (
     as_typed,
-    named_preset,
     open_console,
     parse,
+    preset_defaults,
     use_device,
-    use_threads,
 )
 
 
@@ -50,18 +50,18 @@ class CoarseArguments:
 
 
 def coarse(arguments: list[str]) -> None:
-    preset = named_preset(arguments)
-    default = CoarseArguments(tyro.MISSING, tyro.MISSING, preset, training=PRESETS[preset].training)
+    preset, settings = preset_defaults(arguments)
+    default = CoarseArguments(tyro.MISSING, tyro.MISSING, preset, training=settings.training)
     asked = parse(CoarseArguments, arguments, "vdgs coarse", default)
     from vdgs.runs.beginning import begin_run
     from vdgs.stages.coarse import train_coarse
 
     device = use_device(asked.device)
-    use_threads(asked.threads)
-    method = replace(PRESETS[preset], training=asked.training)
+    configure_threads(asked.threads)
+    method = replace(settings, training=asked.training)
     command = as_typed("coarse", arguments, (asked.capture, asked.output))
-    run, capture = begin_run(asked.capture, asked.output, asked.options, method, command=command)
-    train_coarse(run, capture, asked.watching, open_console(asked.quiet), device)
+    context = begin_run(asked.capture, asked.output, asked.options, method, command=command)
+    train_coarse(context, asked.watching, open_console(asked.quiet), device)
 
 
 @dataclass(frozen=True)
@@ -87,15 +87,14 @@ class RunArguments(RunRequest):
 
 
 def run(arguments: list[str]) -> None:
-    preset = named_preset(arguments)
-    settings = PRESETS[preset]
+    preset, settings = preset_defaults(arguments)
     default = RunArguments(
         tyro.MISSING, tyro.MISSING, preset, training=settings.training, partition=settings.partition,
         assignment=settings.assignment, block=settings.block, merge=settings.merge,
     )  # fmt: skip
     asked = parse(RunArguments, arguments, "vdgs run", default)
     device = use_device(asked.device)
-    use_threads(asked.threads)
+    configure_threads(asked.threads)
     if asked.dry_run:
         from vdgs.planning import plan_run
 

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
+from vdgs.kernels import configure_threads
 from vdgs.settings.requests import ViewRequest
-from vdgs.verbs.shared import open_console, parse, use_device, use_threads
+from vdgs.verbs.shared import open_console, parse, use_device
 
 
 @dataclass(frozen=True)
@@ -28,5 +29,5 @@ def view(arguments: list[str]) -> None:
     from vdgs.viewer.serving import view_run
 
     device = use_device(asked.device)
-    use_threads(asked.threads)
+    configure_threads(asked.threads)
     view_run(replace(asked, device=device), open_console())

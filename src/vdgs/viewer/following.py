@@ -7,12 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from vdgs.errors import RunError, VdgsError
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.anchors import Anchors
-from vdgs.model.decoder import Decoder
 from vdgs.partition.merging import merge
 from vdgs.runs.cut import blocks_of, views_of_blocks
 from vdgs.runs.folder import RunFolder
@@ -21,7 +18,8 @@ from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.standing import standing_of
 from vdgs.runs.vouching import load_vouched
 from vdgs.settings.requests import ModelName
-from vdgs.storage.checkpoints import SavedState, load_newest
+from vdgs.storage.checkpoints import sidecars
+from vdgs.watching.anchors import model_from_checkpoint
 
 #: What a model is called that no stage has finished yet.
 UNFINISHED = "training"
@@ -58,21 +56,23 @@ def standing_lines(run: RunFolder) -> str:
 
 def newest(run: RunFolder) -> tuple[tuple[str, int], ...]:
     """What tells the present models and checkpoints of a run from later ones: files, and when they were written."""
-    files = [*run.path.glob("*/model.safetensors"), *run.path.glob("blocks/*/model.safetensors")]
-    files += [*run.path.glob("coarse/checkpoints/*.json"), *run.path.glob("blocks/*/checkpoints/*.json")]
+    trained = [run.coarse, *run.block_folders()]
+    files = [folder.model for folder in (*trained, run.merged)]
+    files += [file for folder in trained for file in sidecars(folder.checkpoints)]
     files += [run.partition / "blocks.geojson", run.merged.status_file, run.coarse.status_file]
     found = []
     for file in files:
         try:
             found.append((file.relative_to(run.path).as_posix(), file.stat().st_mtime_ns))
-        except OSError:  # replaced while we look
+        except OSError:  # not there, or replaced while we look
             continue
     return tuple(sorted(found))
 
 
 def _unfinished_coarse(run: RunFolder, device: str) -> TrainedRun:
     """The coarse model as its training saved it last."""
-    saved = _saved(run.coarse, run.keys().coarse)
+    key = run.keys().coarse
+    saved = model_from_checkpoint(run.coarse, key)
     if saved is None:
         raise RunError(
             f"{run.path}: has no model and no checkpoint yet. Wait for the first one, or look how far it is: "
@@ -81,11 +81,9 @@ def _unfinished_coarse(run: RunFolder, device: str) -> TrainedRun:
     capture = open_capture(run)
     colours = capture.point_colours.mean(axis=0) / 255 if len(capture.points) else np.zeros(3)
     background = (float(colours[0]), float(colours[1]), float(colours[2]))
-    anchors, decoder = _result_of(saved)
-    model = AnchorModel(anchors, decoder, 1.0, background, {}).to(torch.device(device))
+    model = AnchorModel(saved.anchors, saved.decoder, 1.0, background, {}).to(torch.device(device))
     why = f"this is the coarse model after {saved.iteration:,} iterations; its background is not known yet"
-    file, key = _file_of(run.coarse, saved), run.keys().coarse
-    return TrainedRun(run, model, file, UNFINISHED, run.coarse.status(), key, why, capture)
+    return TrainedRun(run, model, saved.file, UNFINISHED, run.coarse.status(), key, why, capture)
 
 
 def _with_blocks(coarse: TrainedRun) -> TrainedRun | None:
@@ -114,32 +112,10 @@ def _block_so_far(coarse: TrainedRun, folder: StageFolder, key: str, index: int,
     try:
         if folder.is_done(key):
             return load_vouched(folder, key, index)
-        saved = _saved(folder, key)
+        saved = model_from_checkpoint(folder, key)
     except VdgsError:
         return None
     if saved is None:
         return None
-    anchors, decoder = _result_of(saved)
     facts = {"decoder": "own"} if own else {}
-    return AnchorModel(anchors, decoder, coarse.model.voxel, coarse.model.background, facts)
-
-
-def _saved(folder: StageFolder, key: str) -> SavedState | None:
-    """The last state of a stage that works for these settings."""
-    return load_newest(folder.checkpoints)[0] if folder.key() == key else None
-
-
-def _file_of(folder: StageFolder, saved: SavedState) -> Path:
-    return folder.checkpoints / f"{saved.iteration:08d}.safetensors"
-
-
-def _result_of(saved: SavedState) -> tuple[Anchors, Decoder]:
-    """What a state has arrived at: the mean of its last models where it has begun to take one (`TrainingState`)."""
-
-    def group(name: str) -> dict[str, Tensor]:
-        start = f"{name}."
-        return {key.removeprefix(start): tensor for key, tensor in saved.tensors.items() if key.startswith(start)}
-
-    anchors, averaged = group("anchors"), bool(saved.facts["averaged"])
-    anchors |= group("average.anchors") if averaged else {}
-    return Anchors(**anchors), Decoder.from_tensors(group("average.decoder" if averaged else "decoder"))
+    return AnchorModel(saved.anchors, saved.decoder, coarse.model.voxel, coarse.model.background, facts)

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchors import Anchors
+from vdgs.model.decoder import Decoder
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.method import TrainConfig
 from vdgs.settings.watching import WatchOptions
-from vdgs.storage.checkpoints import save_state
+from vdgs.storage.checkpoints import load_newest, save_state, state_file
 from vdgs.storage.tensors import identity
-from vdgs.training import Stage, StepReport, TrainingState, from_saved, to_saved, train
+from vdgs.training import Stage, StepReport, TrainingState, from_saved, result_from_saved, to_saved, train
 from vdgs.units import data_size
 from vdgs.watching.memory_notes import after_failure, announce, need_of
 from vdgs.watching.progress import TrainingProgress
@@ -29,6 +33,25 @@ AFTER_DIVERGENCE = {
     "block": "Lower --block.offset-rate, --block.scale-rate and --block.feature-rate or raise "
     "--block.growth.threshold (with --redo).",
 }
+
+
+@dataclass(frozen=True)
+class CheckpointModel:
+    """What the newest whole checkpoint of a stage has arrived at."""
+
+    anchors: Anchors
+    decoder: Decoder
+    iteration: int
+    file: Path
+
+
+def model_from_checkpoint(folder: StageFolder, key: str) -> CheckpointModel | None:
+    """The model of the newest whole checkpoint of a stage; None without one, or if it is of other settings than
+    `key`."""
+    saved = load_newest(folder.checkpoints)[0] if folder.key() == key else None
+    if saved is None:
+        return None
+    return CheckpointModel(*result_from_saved(saved), saved.iteration, state_file(folder.checkpoints, saved.iteration))
 
 
 def continue_or_start(

@@ -1,0 +1,75 @@
+"""A run that a command works on, and what the command has read of it: stages hand it on instead of reading it again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from vdgs.captures.capture import Capture
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import FoundModel, TrainedRun, find_model, open_capture, remember_capture, with_capture
+from vdgs.runs.vouching import load_vouched
+from vdgs.settings.requests import ModelName
+
+
+@dataclass(frozen=True)
+class _CachedModel:
+    """A model in memory, and the very file that it was read from."""
+
+    identity: tuple[object, ...]
+    model: AnchorModel
+
+
+class RunContext:
+    """A run folder with its capture, read once, and its models, each read once until it is released.
+
+    Photographs stay on the disk. The state of stages is read from the disk at every call: other processes may have
+    trained blocks meanwhile, and a model whose file or key has changed is read again.
+    """
+
+    def __init__(self, run: RunFolder, capture: Capture | None = None) -> None:
+        self.run = run
+        self._capture = capture
+        self._models: dict[str, _CachedModel] = {}
+
+    @staticmethod
+    def from_path(path: Path, capture: Path | None = None) -> RunContext:
+        """The run in a folder. `capture` is where the capture lies if it was moved: the run remembers it.
+
+        Raises what `remember_capture` raises.
+        """
+        run = RunFolder(path)
+        return RunContext(run, None if capture is None else remember_capture(run, capture))
+
+    @property
+    def capture(self) -> Capture:
+        """The capture, read as the run was started. Raises CaptureError if it is gone or changed its form."""
+        if self._capture is None:
+            self._capture = open_capture(self.run)
+        return self._capture
+
+    def open_model(self, which: ModelName = "best", device: torch.device | str = "cpu") -> TrainedRun:
+        """A model of the run on a device, with the capture; nobody may change its tensors.
+
+        Raises RunError if it is not trained or was made from another capture, CaptureError as `capture` does.
+        """
+        capture, found = self.capture, find_model(self.run, which)
+        return with_capture(found.opened(self.run, self._model(found, torch.device(device))), capture)
+
+    def release_models(self, *names: str) -> None:
+        """Forget models ("coarse", "merged"), without names all: before work that needs the memory."""
+        for name in names or tuple(self._models):
+            self._models.pop(name, None)
+
+    def _model(self, found: FoundModel, device: torch.device) -> AnchorModel:
+        """The model of a finished stage. Moved to another device, it leaves the one where it was."""
+        cached, file = self._models.pop(found.name, None), found.stage.model.stat()
+        identity = (found.key, found.stage.status().model, file.st_ino, file.st_size, file.st_mtime_ns)
+        model = cached.model if cached is not None and cached.identity == identity else None
+        del cached  # before another file is read: two models may not fit into the memory
+        model = (load_vouched(found.stage, found.key) if model is None else model).to(device)
+        self._models[found.name] = _CachedModel(identity, model)
+        return model
