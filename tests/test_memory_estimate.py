@@ -246,5 +246,6 @@ def test_training_that_runs_out_of_memory_saves_says_what_helps_and_continues(tm
     assert models[0] == models[1]
     # The estimate of the whole run and what it took then.
     peak = json.loads((tmp_path / "unbroken/coarse/status.json").read_text())["peak_memory_bytes"]
-    estimated = float(unbroken.stdout.split("at the start, ")[1].split(" GB at most")[0]) * 1e9
+    number, unit = unbroken.stdout.split("at the start, ")[1].split(" at most")[0].split()
+    estimated = float(number) * {"MB": 1e6, "GB": 1e9}[unit]
     assert 0.6 < estimated / peak < 1.6

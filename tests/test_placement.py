@@ -50,7 +50,8 @@ def test_the_default_is_the_utm_zone_as_pyproj_has_it(origin):
 def test_a_local_similarity_turns_by_the_meridian_convergence_and_scales_by_the_map():
     placement = Placement.of(frame())
     centre = np.array([350.0, -200.0, 10.0])
-    scale, rotation, _ = placement.similarity_at(centre)
+    found = placement.similarity_at(centre)
+    scale, rotation = found.scale, found.rotation
     latitude, longitude, height = geodetic_from_enu(centre[None], BERN)[0]
     factors = pyproj.Proj(placement.crs).get_factors(longitude, latitude)
     turned = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))

@@ -81,7 +81,7 @@ def write(path: Path, content: object) -> None:
 def metrics(psnr: float, model: str) -> dict[str, object]:
     bins = [
         {"lower": low, "upper": high, "pixels": 1234, "psnr": psnr + shift, "ssim": 0.8, "psnr_cc": psnr + 1}
-        for low, high, shift in ((None, None, -9.0), (0.5, 3.25, -2.0), (3.25, 9.0, 2.0))
+        for low, high, shift in ((None, None, -9.0), (1.0, 3.0, -2.0), (4.0, 9.0, 2.0))
     ]
     return {"model": model, "psnr": psnr, "ssim": 0.87654, "psnr_cc": psnr + 0.5, "ssim_cc": 0.88, "lpips_vgg": None,
             "by_visibility": bins, "n_anchors": 5000, "model_bytes": 2_000_000, "fps": 30.0, "test_views": 3,
@@ -198,7 +198,7 @@ def test_the_report_of_a_whole_run_holds_its_figures(whole):
     assert page.row("PSNR (dB) ↑") == ["PSNR (dB) ↑", "27.12", "28.38", "+1.25"]
     assert page.row("PSNR, colour-corrected (dB) ↑")[1:] == ["27.62", "28.88", "+1.25"]
     assert page.row("SSIM ↑")[1:] == ["0.8765", "0.8765", "+0.0000"]
-    assert page.row("0.5 to 3.25")[1:5] == ["1,234", "25.12", "26.38", "+1.25"]
+    assert page.row("1 to 3")[1:5] == ["1,234", "25.12", "26.38", "+1.25"]
     assert page.row("nothing drawn")[2:4] == ["18.12", "19.38"]
     assert page.row("all") == ["all", "11", "6", "2", "3"]  # cameras: in all, and by reason
     assert page.row("block 0")[1:4] == ["300 / 300", "–", "–"]
@@ -270,7 +270,7 @@ def test_a_coarse_run_is_reported_with_what_it_has(tmp_path):
     assert "The scene is not cut into blocks yet." in text
     assert "No block has a log yet." in text
     assert page.row("PSNR (dB) ↑") == ["PSNR (dB) ↑", "27.12", "–", "–"]
-    assert page.row("0.5 to 3.25")[2:5] == ["25.12", "–", "–"]
+    assert page.row("1 to 3")[2:5] == ["25.12", "–", "–"]
     assert "Best: third.jpg, 29.00 dB" in text
     assert page.source.count('class="note"') == 1  # its config.yaml is not whole
     assert "It cannot be told whether these were made with the settings of the run: coarse, coarse eval" in text

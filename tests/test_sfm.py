@@ -214,7 +214,7 @@ def test_other_things_are_not_written_over_and_a_full_disk_is_told_before(flight
 def test_one_line_of_photographs_is_placed_by_attitudes_or_views(made, flight, attitudes):
     """Positions along a line leave a turn about it open."""
     model = pycolmap.Reconstruction(made / "work" / "models" / "0")
-    move(model, Similarity(0.3, np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([5.0, 6, 7])))
+    move(model, Similarity(0.3, np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([5.0, 6, 7])))
     line = collect([flight.folder]).photographs[:3]
     for image in list(model.images.values()):
         if image.name not in {photo.name for photo in line}:

@@ -1,10 +1,11 @@
-"""Similarities between two sets of matched points, least squares and robust."""
+"""Similarities, and the one between two sets of matched points: least squares and robust."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 #: Points whose second principal spread is below this share of the first lie on one line.
 COLLINEAR = 0.02
@@ -15,14 +16,19 @@ MOST_OFF, LEAST_TRUSTED = 0.25, 0.5
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """target = scale * rotation @ source + translation."""
+    """target = scale * rotation @ source + translation, all float64."""
 
     scale: float
-    rotation: np.ndarray
-    translation: np.ndarray
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
 
-    def apply(self, points: np.ndarray) -> np.ndarray:
+    def apply(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points of the source in the target."""
         return self.scale * points @ self.rotation.T + self.translation
+
+    def apply_inverse(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points of the target in the source."""
+        return (points - self.translation) @ self.rotation / self.scale
 
 
 def is_collinear(points: np.ndarray) -> bool:

@@ -9,21 +9,16 @@ from typing import Literal
 import numpy as np
 
 from vdgs.cameras import Camera
+from vdgs.captures.alignment import Similarity
 from vdgs.captures.sightings import Sightings
 
 Split = Literal["train", "test"]
 
 
 @dataclass(frozen=True, eq=False)
-class GroundFrame:
-    """The similarity that brings the capture's own world into the ground frame (z up).
+class GroundFrame(Similarity):
+    """The similarity that brings the capture's own world into the ground frame (z up)."""
 
-    x_ground = scale * rotation @ x_source + translation, all float64; exactly invertible.
-    """
-
-    scale: float
-    rotation: np.ndarray
-    translation: np.ndarray
     #: True where one unit of the ground frame is one metre.
     metric: bool
     #: How the up axis and the scale were found, for people ("GPS of 18 images", "least variance", ...).
@@ -54,7 +49,7 @@ class GroundFrame:
 
     def to_ground(self, points: np.ndarray) -> np.ndarray:
         """Source points [n, 3] to the ground frame."""
-        return self.scale * points @ self.rotation.T + self.translation
+        return self.apply(points)
 
 
 @dataclass(frozen=True, eq=False)

@@ -78,7 +78,7 @@ def page_of(run: TrainedRun, most_bytes: int) -> Page:
 def _placed(page: Page, frame: Frame) -> Page:
     """A page in local coordinates."""
     ground = np.array([page.position, page.target])
-    position, target = frame.scale * ground @ frame.rotation.T + frame.translation
+    position, target = frame.apply(ground)
     return replace(page, position=_point(position), target=_point(target))
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from vdgs.captures.alignment import Similarity
 from vdgs.captures.capture import GroundFrame
 from vdgs.captures.geodesy import enu_axes, geodetic_from_enu
 from vdgs.export.formats.scene import Facts
@@ -24,12 +25,9 @@ ROUND = 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """local = scale * rotation @ ground + translation, and what a file says of its local coordinates."""
+class Frame(Similarity):
+    """From the ground frame to local coordinates, and what a file says of these."""
 
-    scale: float
-    rotation: Float[np.ndarray, "3 3"]
-    translation: Float[np.ndarray, "3"]
     facts: Facts
 
     @property
@@ -68,10 +66,10 @@ def frame_of(ground: GroundFrame, crs: str | None, centre: Float[np.ndarray, "3"
     unit = "metre" if placement.unit == "m" else placement.unit
     if placement.crs == "enu" and ground.origin_geo is not None:
         geodetic, turn = _place_at(origin, ground.origin_geo)
-        rotation, translation = turn @ similarity.rotation, turn @ (similarity.origin - origin)
+        rotation, translation = turn @ similarity.rotation, turn @ (similarity.translation - origin)
         return Frame(similarity.scale, rotation, translation, Facts(unit=unit, geodetic=geodetic))
     facts = Facts((float(origin[0]), float(origin[1]), float(origin[2])), placement.wkt, unit)
-    return Frame(similarity.scale, similarity.rotation, similarity.origin - origin, facts)
+    return Frame(similarity.scale, similarity.rotation, similarity.translation - origin, facts)
 
 
 def _place_at(

@@ -104,7 +104,7 @@ def rows_for(
 
 
 def _local(frame: Frame, means: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
-    local: np.ndarray = frame.scale * means.astype(np.float64) @ frame.rotation.T + frame.translation
+    local: np.ndarray = frame.apply(means.astype(np.float64))
     return local
 
 

@@ -13,12 +13,12 @@ where the source is the original world: that of the COLMAP model, and that of tr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from vdgs.captures.alignment import Similarity
 from vdgs.captures.formats.json_poses import matrix_of, number, read_json
 from vdgs.captures.formats.source import rigid
 from vdgs.errors import VdgsError
@@ -29,24 +29,16 @@ FILE = "dataparser_transforms.json"
 _LEAST, _MOST = 1e-9, 1e9
 
 
-@dataclass(frozen=True, eq=False)
-class NerfstudioFrame:
-    """x_nerfstudio = scale * (rotation @ x_source + translation), all float64."""
-
-    scale: float
-    rotation: Float[np.ndarray, "3 3"]
-    translation: Float[np.ndarray, "3"]
-
-    def to_source(self, camera_from_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """The pose in the source frame of a camera that stands in nerfstudio's."""
-        turned = camera_from_world[:3, :3]
-        position = -turned.T @ camera_from_world[:3, 3]
-        return rigid_at(turned @ self.rotation, self.rotation.T @ (position / self.scale - self.translation))
+def pose_in_source(camera_from_world: Float[np.ndarray, "4 4"], nerfstudio: Similarity) -> Float[np.ndarray, "4 4"]:
+    """The pose in the source frame of a camera that stands in nerfstudio's."""
+    turned = camera_from_world[:3, :3]
+    position = -turned.T @ camera_from_world[:3, 3]
+    return rigid_at(turned @ nerfstudio.rotation, nerfstudio.apply_inverse(position[None])[0])
 
 
-def frame_beside(path: Path, capture: Path | None) -> NerfstudioFrame:
-    """The frame of a camera path, by the first file that says it: beside the path, one folder up (nerfstudio saves
-    paths in camera_paths/ of its data), or in the folder of the capture.
+def frame_beside(path: Path, capture: Path | None) -> Similarity:
+    """From the source frame to that of a camera path, by the first file that says it: beside the path, one folder up
+    (nerfstudio saves paths in camera_paths/ of its data), or in the folder of the capture.
 
     Raises VdgsError where there is none, and CaptureError for one that is damaged.
     """
@@ -60,7 +52,7 @@ def frame_beside(path: Path, capture: Path | None) -> NerfstudioFrame:
     scale = number(content, "scale", found)
     if scale is None or not _LEAST < scale < _MOST:
         raise VdgsError(f"{found}: scale is {scale}; it must be a positive factor. Copy the file again.")
-    return NerfstudioFrame(scale, motion[:3, :3], motion[:3, 3])
+    return Similarity(scale, motion[:3, :3], scale * motion[:3, 3])
 
 
 def _missing(path: Path, folders: Sequence[Path]) -> str:

@@ -33,7 +33,7 @@ from jaxtyping import Float
 from vdgs.cameras import Camera
 from vdgs.captures.capture import GroundFrame
 from vdgs.errors import VdgsError
-from vdgs.films.nerfstudio import frame_beside
+from vdgs.films.nerfstudio import frame_beside, pose_in_source
 from vdgs.films.paths import FPS, SECONDS, CameraPath, frame_count, interpolate, look_at, rigid_at
 from vdgs.settings import requests
 from vdgs.settings.plain import suggestion
@@ -81,7 +81,7 @@ def load_path(
         raise VdgsError(f"{file}: {error}. `vdgs render --help` says under --path what a camera path holds.") from error
     if frame == "nerfstudio":
         known = frame_beside(file, capture)
-        cameras = [replace(each, camera_from_world=known.to_source(each.camera_from_world)) for each in cameras]
+        cameras = [replace(each, camera_from_world=pose_in_source(each.camera_from_world, known)) for each in cameras]
     if frame != "ground" and ground is not None:
         cameras = [_to_ground(camera, ground) for camera in cameras]
     if interpolated or (seconds is not None and len(cameras) > 1):

@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.cameras import Camera
+from vdgs.captures.alignment import Similarity
 from vdgs.captures.capture import Capture
 from vdgs.captures.heights import reach
 from vdgs.errors import VdgsError
 from vdgs.maps.grid import Grid, ground_height
-from vdgs.placing.placement import LocalSimilarity, Placement
+from vdgs.placing.placement import Placement
 
 #: Cameras by which the ceiling over a place is found, and the share of the sparse points about it that are under it.
 _NEIGHBOURS, _UNDER = 8, 0.995
@@ -84,7 +85,7 @@ class Overhead:
             pose, per_unit, per_unit, grid.width / 2, grid.height / 2, grid.width, grid.height, "orthographic"
         )
 
-    def _similarity(self, grid: Grid) -> tuple[LocalSimilarity, Float[np.ndarray, "3"]]:
+    def _similarity(self, grid: Grid) -> tuple[Similarity, Float[np.ndarray, "3"]]:
         """The similarity about the middle of the grid, and that place on the ground."""
         level = self.placement.places(np.array([[0.0, 0.0, ground_height(self.capture)]]))[0, 2]
         centre = self.placement.to_ground(np.array([[*grid.centre, level]]))[0]

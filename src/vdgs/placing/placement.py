@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from vdgs.captures.alignment import Similarity
 from vdgs.captures.capture import GroundFrame
 from vdgs.captures.geodesy import enu_axes, enu_from_geodetic, geodetic_from_enu
 from vdgs.errors import VdgsError
@@ -26,18 +26,6 @@ Places = Float[np.ndarray, "n 3"]
 CHOICES = "EPSG:n (such as EPSG:25832), enu, source or local"
 #: Half the distance in metres (or units) over which a local similarity is taken from the exact map (choice).
 _STEP = 20.0
-
-
-class LocalSimilarity(NamedTuple):
-    """places(p) ≈ scale * rotation @ p + origin, for points p of the ground frame near the place it was taken at."""
-
-    scale: float
-    rotation: Float[np.ndarray, "3 3"]
-    origin: Float[np.ndarray, "3"]
-
-    def apply(self, points: Places) -> Places:
-        """Ground points [n, 3] to target coordinates [n, 3]."""
-        return self.scale * points @ self.rotation.T + self.origin
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +82,7 @@ class Placement:
         """The inverse of `places`."""
         return self._checked(self._backward(np.asarray(places, np.float64)))
 
-    def similarity_at(self, centre: Float[np.ndarray, "3"]) -> LocalSimilarity:
+    def similarity_at(self, centre: Float[np.ndarray, "3"]) -> Similarity:
         """The similarity from the ground frame to the target that is right about `centre`, a ground point [3].
 
         The rotation holds the meridian convergence and the tilt of the horizon, the scale is that of the horizontal
@@ -109,7 +97,7 @@ class Placement:
         rotation = left @ right
         # The plane's own scale: a projection scales areas of the ground, heights it passes on.
         scale = float(np.sqrt(np.linalg.norm(np.cross(jacobian[:, 0], jacobian[:, 1]))))
-        return LocalSimilarity(scale, rotation, self.places(centre[None])[0] - scale * rotation @ centre)
+        return Similarity(scale, rotation, self.places(centre[None])[0] - scale * rotation @ centre)
 
     def _checked(self, found: Places) -> Places:
         if not np.isfinite(found).all():
@@ -128,15 +116,10 @@ def _local(ground: GroundFrame) -> Placement:
 
 
 def _source(ground: GroundFrame) -> Placement:
-    def forward(points: Places) -> Places:
-        return (points - ground.translation) @ ground.rotation / ground.scale
-
     metres = ground.scale if ground.metric else None
     unit = "m" if metres is not None and abs(metres - 1) < 1e-9 else "units"
-    heights = "the third coordinate of the capture's own world"
-    return Placement(
-        "source", "the capture's own coordinates", unit, metres, None, heights, (), forward, ground.to_ground
-    )
+    name, heights = "the capture's own coordinates", "the third coordinate of the capture's own world"
+    return Placement("source", name, unit, metres, None, heights, (), ground.apply_inverse, ground.to_ground)
 
 
 def _enu(ground: GroundFrame) -> Placement:

@@ -10,7 +10,7 @@ from vdgs.report.charts import draw_gains, draw_pairs
 from vdgs.report.page import Html, details, figure, gallery, paragraph, section, table
 from vdgs.report.reading import Record, Shown, Source
 from vdgs.report.words import decibels, figure_of, gain, share, similarity
-from vdgs.units import ABSENT, count
+from vdgs.units import ABSENT, count, data_size
 
 COARSE, MERGED = "coarse/evaluation", "evaluation"
 #: Rows of the table of test views, and pictures of seams, at most.
