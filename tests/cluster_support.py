@@ -24,7 +24,7 @@ CUT = ("--blocks", "2", "--assignment.min-cameras", "4")
 BLOCKS = ("--save-every", "10", "--block.iterations", "30", "--redo")
 #: Where each block waits once, on its way or when it is continued there.
 MIDDLE = "*/blocks/0?/checkpoints/00000020.json"
-#: Pixels so small that the map of `uncut` has four tiles, two for each piece.
+#: Pixels so small that the map of `uncut` has four tiles, two for each shard.
 FINE = ("--gsd", "0.022")
 
 #: Figures that depend on the machine and on what else it does.
@@ -125,19 +125,10 @@ def parent_of(process: int) -> int:
     return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
 
 
-def block_of(process: int) -> int:
-    """Which block a process trains."""
-    return _number_after("--block", process)
-
-
-def piece_of(process: int) -> int:
-    """Which piece of other work a process does."""
-    return _number_after("--piece", process)
-
-
-def _number_after(option: str, process: int) -> int:
+def shard_of(process: int) -> int:
+    """Which shard, or block, a process does."""
     words = Path(f"/proc/{process}/cmdline").read_bytes().decode().split("\0")
-    return int(words[words.index(option) + 1])
+    return int(words[words.index("vdgs.executors.run_shard") + 2])
 
 
 def make_run(folder: Path) -> Path:

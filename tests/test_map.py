@@ -300,13 +300,13 @@ def test_what_makes_no_map_is_refused_and_leaves_nothing(house, make, tmp_path, 
     assert not (tmp_path / "run" / "maps").exists()
 
 
-def test_a_folder_pieces_beside_the_maps_is_not_ours(house, make, tmp_path):
-    for name in ("pieces/king.png", "pieces/white/queen.png"):
+def test_a_folder_shards_beside_the_maps_is_not_ours(house, make, tmp_path):
+    for name in ("shards/king.png", "shards/white/queen.png"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"theirs")
     make(*house, gsd=0.5, output=tmp_path)
     assert (
-        (tmp_path / "pieces/king.png").read_bytes() == (tmp_path / "pieces/white/queen.png").read_bytes() == b"theirs"
+        (tmp_path / "shards/king.png").read_bytes() == (tmp_path / "shards/white/queen.png").read_bytes() == b"theirs"
     )
 
 

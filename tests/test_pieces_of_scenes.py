@@ -1,4 +1,4 @@
-"""Maps and exports whose work goes out in pieces: whatever is lost on the way, the files are those of one process."""
+"""Maps and exports whose work goes out in shards: whatever is lost on the way, the files are those of one process."""
 
 import os
 import signal
@@ -23,7 +23,7 @@ from vdgs.runs.run_context import RunContext
 from vdgs.settings.executors import ExecutorOptions
 from vdgs.settings.requests import RunRequest
 
-pytestmark = pytest.mark.xdist_group("pieces")  # one worker, which trains once
+pytestmark = pytest.mark.xdist_group("shards")  # one worker, which trains once
 
 
 @pytest.fixture(scope="module")
@@ -38,35 +38,35 @@ def mapped(uncut, tmp_path_factory) -> dict[str, object]:
     return files
 
 
-def test_whatever_is_killed_maps_drawn_in_pieces_are_those_of_one_process(uncut, mapped, tmp_path):
-    """The driver while both pieces are at work, then a piece."""
+def test_whatever_is_killed_maps_drawn_in_shards_are_those_of_one_process(uncut, mapped, tmp_path):
+    """The driver while both shards are at work, then a shard."""
     run = copy_run(uncut, tmp_path / uncut.name)  # whose name is on the sheet
     command = ("map", run, *FINE, "--jobs", "2")
-    with begun(*command, pause_at=("*/pieces/*/00000[13].npz", 1)) as first:
+    with begun(*command, pause_at=("*/shards/*/00000[13].npz", 1)) as first:
         first.wait_until_paused(2)
         first.send_signal(signal.SIGKILL)
         first.finished()
-        wait_until(lambda: not any(alive(piece) for piece in first.paused()))
-    kept = {file: file.stat().st_mtime_ns for file in run.glob("maps/pieces/*/*/*.npz")}
+        wait_until(lambda: not any(alive(shard) for shard in first.paused()))
+    kept = {file: file.stat().st_mtime_ns for file in run.glob("maps/shards/*/*/*.npz")}
     assert {file.stem for file in kept} == {"000000", "000002"}
-    with begun(*command, pause_at=("*/pieces/*/000001.npz", 1)) as second:
+    with begun(*command, pause_at=("*/shards/*/000001.npz", 1)) as second:
         second.wait_until_paused(1)
         second.kill_paused()
-        wait_until(lambda: "piece 00: crashed by SIGKILL" in second.printed())
+        wait_until(lambda: "shard 00: crashed by SIGKILL" in second.printed())
         assert {file: file.stat().st_mtime_ns for file in kept} == kept
         done = second.finished()
     assert done.returncode == 0, done.stderr + done.stdout
     assert evaluated(run / "maps") == mapped
 
 
-def test_detail_from_photographs_is_the_same_in_pieces(uncut, mapped, tmp_path):
+def test_detail_from_photographs_is_the_same_in_shards(uncut, mapped, tmp_path):
     command = ("map", uncut, *FINE, "--sharp", "--output")
-    for name, more, prepare in (("one", (), None), ("pieces", ("--jobs", "2"), do_tasks_here)):
+    for name, more, prepare in (("one", (), None), ("shards", ("--jobs", "2"), do_tasks_here)):
         done = vdgs(*command, tmp_path / name, *more, prepare=prepare)
         assert done.returncode == 0, done.stderr + done.stdout
-    assert "2 of 2 pieces done" in done.stdout
-    one, pieces = evaluated(tmp_path / "one"), evaluated(tmp_path / "pieces")
-    assert pieces == one
+    assert "2 of 2 shards done" in done.stdout
+    one, shards = evaluated(tmp_path / "one"), evaluated(tmp_path / "shards")
+    assert shards == one
     assert one["orthophoto.tif"] != mapped["orthophoto.tif"]
     assert one["dsm.tif"] == mapped["dsm.tif"]
 
@@ -103,68 +103,60 @@ def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path,
 
 
 def small_parts() -> None:
-    """Let so few anchors be fitted at once, and pieces be so small, that a small scene has several for each step."""
-    baking.ANCHORS_AT_ONCE, steps.VIEWS_OF_PIECE, steps.PARTS_OF_PIECE = 64, (8, 100, 8), (2, 50, 8)
+    """Let so few anchors be fitted at once, and shards be so small, that a small scene has several for each step."""
+    baking.ANCHORS_AT_ONCE, steps.VIEWS_OF_SHARD, steps.PARTS_OF_SHARD = 64, (8, 100, 8), (2, 50, 8)
 
 
 def small_parts_here() -> None:
-    """The same, and let it do pieces itself, as the commands that they are: it is killed with them."""
+    """The same, and let it do shards itself, as the commands that they are: it is killed with them."""
     small_parts()
     do_tasks_here()
 
 
 @pytest.fixture(scope="module")
 def exported(uncut, tmp_path_factory) -> bytes:
-    """What one process makes of it, on more threads than a piece has."""
+    """What one process makes of it, on more threads than a shard has."""
     file = tmp_path_factory.mktemp("exported") / "scene.ply"
     done = vdgs("export", uncut, "--to", file, "--rounds", "2", "--no-measure", "--threads", "2", prepare=small_parts)
     assert done.returncode == 0, done.stderr + done.stdout
     return file.read_bytes()
 
 
-def test_whenever_its_driver_is_killed_a_scene_baked_in_pieces_is_that_of_one_process(uncut, exported, tmp_path):
-    """While a second piece surveys; before the first Gaussians, and those with fitted colours, are there whole."""
+def test_whenever_its_driver_is_killed_a_scene_baked_in_shards_is_that_of_one_process(uncut, exported, tmp_path):
+    """While a second shard surveys; before the first Gaussians, and those with fitted colours, are there whole."""
     run, file = copy_run(uncut, tmp_path / "run"), tmp_path / "scene.ply"
     command = ("export", run, "--to", file, "--rounds", "2", "--no-measure", "--jobs", "2")
-    for moment in ("*/pieces/*/01/000010.npy", "*/pieces/*/0.spool", "*/pieces/*/1.spool"):
-        surveyed = {each: each.stat().st_mtime_ns for each in run.glob("baking/pieces/*/0[01]/0000*.npy")}
+    for moment in ("*/shards/*/01/000010.npy", "*/shards/*/0.spool", "*/shards/*/1.spool"):
+        surveyed = {each: each.stat().st_mtime_ns for each in run.glob("baking/shards/*/0[01]/0000*.npy")}
         with begun(*command, prepare=small_parts_here, pause_at=(moment, 1)) as driver:
             driver.wait_until_paused(1)
             assert {each: each.stat().st_mtime_ns for each in surveyed if each.exists()} in (surveyed, {})
             driver.send_signal(signal.SIGKILL)
             driver.finished()
-    (work,) = run.glob("baking/pieces/*")
+    (work,) = run.glob("baking/shards/*")
     assert sorted(each.name for each in work.glob("*.spool")) == ["0.spool"]  # what it was made of is removed
     assert not list(work.glob("0[01]/*.npy"))
     done = vdgs(*command, prepare=small_parts_here)
     assert done.returncode == 0, done.stderr + done.stdout
-    assert "2 of 2 pieces to survey views" not in done.stdout
-    assert done.stdout.count("pieces to fit colours again") == 1
+    assert "2 of 2 shards to survey views" not in done.stdout
+    assert done.stdout.count("shards to fit colours again") == 1
     assert file.read_bytes() == exported
     assert not (run / "baking").exists()
 
 
-def test_what_is_chosen_is_baked_alike_in_pieces_and_moved_on_by_the_driver(uncut, tmp_path):
+def test_what_is_chosen_is_baked_alike_in_shards_and_moved_on_by_the_driver(uncut, tmp_path):
     chosen = ("--max-gaussians", "150", "--sh-degree", "1", "--rounds", "2", "--no-measure")
-    for name, more, prepare in (("one", (), small_parts), ("pieces", ("--jobs", "2"), small_parts_here)):
+    for name, more, prepare in (("one", (), small_parts), ("shards", ("--jobs", "2"), small_parts_here)):
         done = vdgs("export", uncut, "--to", tmp_path / f"{name}.ply", *chosen, *more, prepare=prepare)
         assert done.returncode == 0, done.stderr + done.stdout
-    one, pieces = ((tmp_path / f"{name}.ply").read_bytes() for name in ("one", "pieces"))
-    assert pieces == one
+    one, shards = ((tmp_path / f"{name}.ply").read_bytes() for name in ("one", "shards"))
+    assert shards == one
     more = ("--refine", "0.01", "--jobs", "2")
     done = vdgs("export", uncut, "--to", tmp_path / "refined.ply", *chosen, *more, prepare=small_parts_here)
     assert done.returncode == 0, done.stderr + done.stdout
     refined = (tmp_path / "refined.ply").read_bytes()
     assert len(refined) == len(one)
     assert refined != one
-
-
-def test_a_piece_of_baking_whose_turn_has_not_come_says_so(uncut, tmp_path):
-    run = copy_run(uncut, tmp_path / "run")
-    for piece, said in ((2, "nobody has chosen what is to be baked yet"), (99, "numbered from 0")):
-        done = vdgs("export", run, "--to", tmp_path / "scene.ply", "--piece", piece, prepare=small_parts)
-        assert done.returncode == 1
-        assert said in done.stderr
 
 
 def test_what_views_show_and_lack_is_read_back_to_the_last_bit_and_named_if_damaged(tmp_path):

@@ -16,13 +16,12 @@ from cluster_support import (
     MIDDLE,
     Cluster,
     alive,
-    block_of,
     copy_run,
     evaluated,
     make_run,
     models,
     parent_of,
-    piece_of,
+    shard_of,
     train_here,
 )  # fmt: skip
 from vdgs import cli
@@ -64,7 +63,7 @@ def another_code() -> None:
     fitness.code_identity = lambda: "of this machine"  # type: ignore[assignment]
 
 
-def test_a_run_starts_a_ray_of_its_own_for_each_errand():
+def test_a_run_starts_a_ray_of_its_own_for_each_job():
     """One after the other, in one process, as `vdgs run --executor ray` does without an address."""
     done = python(
         """
@@ -96,7 +95,7 @@ def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, clus
             """The process of each block that waits now, once so many have waited in all."""
             driver.wait_until_paused(count)
             there = [process for process in driver.paused() if Path(f"/proc/{process}/cmdline").exists()]
-            return {block_of(process): process for process in there}
+            return {shard_of(process): process for process in there}
 
         processes = wait_for(2)
         cluster.remove(cluster.node_of(processes[1]))
@@ -142,37 +141,37 @@ def test_a_driver_that_was_killed_finds_its_blocks_again_and_stops_them_when_ask
 
 
 def test_views_are_measured_on_nodes_for_whatever_driver_lives(uncut, cluster, tmp_path):
-    """Two pieces on two nodes. The driver is killed; the next finds them, and the worker that keeps one is killed."""
+    """Two shards on two nodes. The driver is killed; the next finds them, and the worker that keeps one is killed."""
     here, run = (copy_run(uncut, tmp_path / name / "run") for name in ("here", "there"))
     assert vdgs("eval", here).returncode == 0
     command = ("eval", run, "--executor", "ray", "--address", cluster.address)
-    with begun(*command, pause_at=("*/pieces/*/00000[13].npz", 1), environment=cluster.token) as first:
+    with begun(*command, pause_at=("*/shards/*/00000[13].npz", 1), environment=cluster.token) as first:
         first.wait_until_paused(2)
         first.send_signal(signal.SIGKILL)
         first.finished()
-        pieces = {piece_of(process): process for process in first.paused()}
-        assert cluster.node_of(pieces[0]) != cluster.node_of(pieces[1])
+        shards = {shard_of(process): process for process in first.paused()}
+        assert cluster.node_of(shards[0]) != cluster.node_of(shards[1])
         with begun(*command, environment=cluster.token) as second:
             wait_until(lambda: second.printed().count("is still at work") == 2)
-            os.kill(parent_of(pieces[0]), signal.SIGKILL)
-            wait_until(lambda: "piece 00: crashed by the loss of its worker" in second.printed())
+            os.kill(parent_of(shards[0]), signal.SIGKILL)
+            wait_until(lambda: "shard 00: crashed by the loss of its worker" in second.printed())
             first.go_on()
             done = second.finished()
     assert done.returncode == 0, done.stderr + done.stdout
-    assert "2 of 2 pieces done" in done.stdout
+    assert "2 of 2 shards done" in done.stdout
     assert evaluated(run / "coarse/evaluation") == evaluated(here / "coarse/evaluation")
 
 
 def test_tiles_of_several_nodes_are_joined_to_the_maps_of_one_process(uncut, cluster, tmp_path):
-    """Two pieces, two nodes."""
+    """Two shards, two nodes."""
     pytest.importorskip("rasterio")
     here, there = (copy_run(uncut, tmp_path / name / "run") for name in ("here", "there"))
     one = vdgs("map", here, *FINE)
-    pieces = vdgs(
+    shards = vdgs(
         "map", there, *FINE, "--executor", "ray", "--address", cluster.address, environment=cluster.token
     )  # fmt: skip
-    assert one.returncode == pieces.returncode == 0, one.stderr + pieces.stderr + pieces.stdout
-    assert "2 of 2 pieces done" in pieces.stdout
+    assert one.returncode == shards.returncode == 0, one.stderr + shards.stderr + shards.stdout
+    assert "2 of 2 shards done" in shards.stdout
     assert evaluated(there / "maps") == evaluated(here / "maps")
 
 
@@ -197,7 +196,7 @@ def test_nodes_that_join_late_are_avoided_where_they_cannot_work_or_have_no_memo
         wait_until(lambda: any(cluster.has(process, "large") for process in driver.paused()))
         os.kill(slow, signal.SIGSTOP)
         driver.go_on()
-        wait_until((run / f"blocks/{1 - block_of(slow):02d}/model.safetensors").exists)
+        wait_until((run / f"blocks/{1 - shard_of(slow):02d}/model.safetensors").exists)
         os.kill(slow, signal.SIGCONT)
         done = driver.finished()
     assert done.returncode == 0, done.stderr + done.stdout

@@ -13,13 +13,12 @@ from cluster_support import (
     BLOCKS,
     MIDDLE,
     alive,
-    block_of,
     copy_run,
     evaluated,
     make_run,
     models,
     parent_of,
-    piece_of,
+    shard_of,
     train_here,
 )  # fmt: skip
 from slurm_support import is_installed, real, stand_in
@@ -81,7 +80,7 @@ def element_of(process: int) -> str:
 def processes(driver: Command, count: int) -> dict[int, int]:
     """The process of each block that waits now, once so many have waited in all."""
     driver.wait_until_paused(count)
-    return {block_of(process): process for process in driver.paused() if alive(process)}
+    return {shard_of(process): process for process in driver.paused() if alive(process)}
 
 
 def let_go_on_at_once(element: str) -> None:
@@ -137,26 +136,26 @@ def test_a_driver_that_was_killed_finds_its_jobs_again_and_stops_them_when_asked
 
 
 def test_views_are_measured_by_jobs_for_whatever_driver_lives(slurm, uncut, tmp_path):
-    """Two pieces. The driver is killed; the next finds the jobs, one of which is killed, another's time is up."""
+    """Two shards. The driver is killed; the next finds the jobs, one of which is killed, another's time is up."""
     here, run = (copy_run(uncut, tmp_path / name / "run") for name in ("here", "there"))
     assert vdgs("eval", here).returncode == 0
     command = ("eval", run, "--executor", "slurm", *OWN)
-    with begun(*command, pause_at=("*/pieces/*/00000[13].npz", 1), environment=variables()) as first:
+    with begun(*command, pause_at=("*/shards/*/00000[13].npz", 1), environment=variables()) as first:
         first.wait_until_paused(2)
         first.send_signal(signal.SIGKILL)
         first.finished()
         with begun(*command, environment=variables()) as second:
             wait_until(lambda: second.printed().count("is watched again") == 2)
-            waiting = {piece_of(process): process for process in first.paused()}
+            waiting = {shard_of(process): process for process in first.paused()}
             os.kill(waiting[0], signal.SIGKILL)
-            wait_until(lambda: "piece 00: crashed by SIGKILL" in second.printed())
+            wait_until(lambda: "shard 00: crashed by SIGKILL" in second.printed())
             subprocess.run(["scancel", "--batch", "--signal=USR1", element_of(waiting[1])], check=True)
             let_go_on_at_once(element_of(waiting[1]))
             first.go_on()
             done = second.finished()
     assert done.returncode == 0, done.stderr + done.stdout
-    assert "2 of 2 pieces done" in done.stdout
-    assert "piece 01: crashed" not in done.stdout
+    assert "2 of 2 shards done" in done.stdout
+    assert "shard 01: crashed" not in done.stdout
     assert evaluated(run / "coarse/evaluation") == evaluated(here / "coarse/evaluation")
     assert not (run / "slurm").exists()
 

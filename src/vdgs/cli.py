@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -79,47 +78,11 @@ def _run(verb: str, arguments: list[str]) -> int:
 
     configure_threads()  # before anything imports torch
     from vdgs import verbs
-    from vdgs.errors import Interrupted, Stopped, VdgsError
-    from vdgs.watching.interrupts import stop_requests
+    from vdgs.watching.exit_codes import exit_code_of
 
     action: Callable[[list[str]], Any] = getattr(verbs, verb)
-    try:
-        with stop_requests(interrupts=True):
-            return int(action(arguments) or 0)
-    except (KeyboardInterrupt, Interrupted):
-        again = "continues: what is finished is kept" if verb in CONTINUES else "begins it anew"
-        print(f"vdgs {verb}: interrupted. The same command {again}.", file=sys.stderr)
-        return 130
-    except VdgsError as error:
-        print(f"vdgs {verb}: {error}", file=sys.stderr)
-        return 130 if isinstance(error, Stopped) else 1
-    except BrokenPipeError:
-        return 1
-    except OSError as error:  # a disk that is full, a folder that cannot be written: no news from a traceback
-        print(f"vdgs {verb}: {error.filename or 'a file'}: {error.strerror or error}{_remedy(error)}", file=sys.stderr)
-        return 1
-    except (MemoryError, RuntimeError) as error:
-        from vdgs.memory.process import is_out_of_memory
-
-        if not is_out_of_memory(error):
-            raise
-        print(
-            f"vdgs {verb}: out of memory ({str(error).strip().splitlines()[0] if str(error) else 'no room'}). What was "
-            "saved is kept. Smaller photographs (--downscale 2), a smaller --width or fewer --jobs need less.",
-            file=sys.stderr,
-        )
-        return 1
-
-
-def _remedy(error: OSError) -> str:
-    """What to do about a file that the system refuses, where that is plain."""
-    if error.errno in (errno.EACCES, errno.EPERM):
-        return ". See whose it is and who may use it (ls -l, chmod), or choose another."
-    if error.errno in (errno.EROFS, errno.ENOSPC, errno.EDQUOT):
-        from vdgs.storage.files import remedy
-
-        return f". {remedy(error)}."
-    return ""
+    again = "continues: what is finished is kept" if verb in CONTINUES else "begins it anew"
+    return exit_code_of(f"vdgs {verb}", lambda: action(arguments), f"The same command {again}.")
 
 
 if __name__ == "__main__":

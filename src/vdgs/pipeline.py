@@ -13,7 +13,7 @@ from vdgs.errors import RunError, Stopped, VdgsError
 from vdgs.evaluation.lpips import refuse_missing
 from vdgs.evaluation.of_run import evaluation_folder
 from vdgs.executors.choosing import refuse_unreachable
-from vdgs.executors.errand import Wish
+from vdgs.executors.sharded_job import Wish
 from vdgs.maps.mapping import can_map, is_mapped, map_run
 from vdgs.report import write_report
 from vdgs.report.terminal import next_step, whole_standing
@@ -129,7 +129,7 @@ def _measure(context: RunContext, which: Literal["coarse", "merged"], asked: Run
 
 
 def _wish(asked: RunRequest) -> Wish:
-    """Where pieces of stages other than the blocks are done: where blocks are trained, if that is a cluster."""
+    """Where shards of stages other than the blocks are done: where blocks are trained, if that is a cluster."""
     return Wish(asked.where, asked.jobs if asked.where.executor != "local" else 0, device=asked.device)
 
 

@@ -13,13 +13,13 @@ from vdgs.executors.placement import Share, Work, by_queue, exceeds, on_cluster,
 from vdgs.settings.executors import ExecutorOptions
 from vdgs.units import data_size
 
-#: Seconds to wait for what still holds a piece of work: NFS lets go of what a lost node held after a minute and a half.
+#: Seconds to wait for what still holds a shard: NFS lets go of what a lost node held after a minute and a half.
 PATIENCE_SECONDS = 300.0
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """What runs pieces of work, and what each gets."""
+    """What runs shards, and what each gets."""
 
     executor: Executor
     share: Share
@@ -39,7 +39,7 @@ class Machine:
 
 @contextmanager
 def choose(asked: ExecutorOptions, work: Work, machine: Machine, question: Callable[[], Question]) -> Iterator[Chosen]:
-    """Be ready to run pieces of work while the context lasts. `question` says what machines must see; asked of other
+    """Be ready to run shards while the context lasts. `question` says what machines must see; asked of other
     machines only.
 
     Raises VdgsError, before anything starts, for options that do not work, where there is no such cluster, and where a

@@ -1,4 +1,4 @@
-"""What stages send out: how their pieces of work are called, and what of them is worth showing."""
+"""What stages send out: how their shards are called, and what of them is worth showing."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Kind:
-    """The words for the pieces of a stage."""
+    """The words for the shards of a stage."""
 
     one: str
     many: str
@@ -29,3 +29,8 @@ BLOCKS = Kind(
     "block", "blocks", "train", "training", "iteration", "it/s", trains=True,
     smaller=("more --blocks", "--block.growth.max-anchors"),
 )  # fmt: skip
+
+
+def shard_kind(work: str, steps: str) -> Kind:
+    """The words for shards that do something (`measure`) with items (`views`)."""
+    return Kind("shard", "shards", work, "at work", steps, f"{steps}/s")

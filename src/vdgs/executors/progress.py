@@ -1,4 +1,4 @@
-"""How far pieces of work are: what their status files say, how fast they are and how long they will take."""
+"""How far shards are: what their status files say, how fast they are and how long they will take."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _count(value: Any) -> int | None:
 
 
 class PieceProgress:
-    """What is known of a piece while the others run."""
+    """What is known of a shard while the others run."""
 
     def __init__(self, index: int):
         self.index = index
@@ -100,7 +100,7 @@ class PieceProgress:
 
     @property
     def seconds_left(self) -> float | None:
-        """What the piece says itself, else what follows from its speed; None where neither is known."""
+        """What the shard says itself, else what follows from its speed; None where neither is known."""
         if self.figures.seconds_left is not None:
             return self.figures.seconds_left
         iteration, iterations, speed = self.figures.iteration, self.figures.iterations, self.speed
@@ -110,7 +110,7 @@ class PieceProgress:
 
 
 def seconds_left_overall(rows: list[PieceProgress], at_once: int) -> float | None:
-    """Estimated time until all pieces are done; None before anything is known (complexity: one pass).
+    """Estimated time until all shards are done; None before anything is known (complexity: one pass).
 
     Those that wait are taken to be as fast, and where they say nothing as long, as those that ran.
     """

@@ -1,4 +1,4 @@
-"""What a person sees of pieces of work that run side by side: a live table on a terminal, lines elsewhere."""
+"""What a person sees of shards that run side by side: a live table on a terminal, lines elsewhere."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vdgs.units import ABSENT, clock, data_size
 
 #: Seconds between two summary lines where there is no terminal to redraw.
 PLAIN_SECONDS = 15.0
-#: Lines of the table that are not rows of pieces: head, rules, totals, and one to spare for the prompt.
+#: Lines of the table that are not rows of shards: head, rules, totals, and one to spare for the prompt.
 FRAME_LINES = 7
 #: Columns of what trains.
 TRAINING = ("PSNR", "anchors")
@@ -66,7 +66,7 @@ class Board:
 
 
 def progress_table(rows: list[PieceProgress], at_once: int, most: int, kind: Kind = BLOCKS) -> Table:
-    """One row for each piece and one with totals; of more than `most`, those that wait or are done are counted."""
+    """One row for each shard and one with totals; of more than `most`, those that wait or are done are counted."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0), caption_justify="left")  # 80 columns
     columns = (kind.one, "state", kind.steps, *TRAINING, kind.pace, "left", "memory", "tries")
     chosen = [place for place, column in enumerate(columns) if kind.trains or column not in TRAINING]
@@ -86,7 +86,7 @@ def progress_table(rows: list[PieceProgress], at_once: int, most: int, kind: Kin
 
 
 def progress_line(rows: list[PieceProgress], at_once: int, kind: Kind = BLOCKS) -> str:
-    """The table in one line: counts, the pieces that run, the time left."""
+    """The table in one line: counts, the shards that run, the time left."""
     running = [
         f"{row.index:02d}: {_iteration(row)}" + (f" {row.figures.psnr:.2f} dB" if row.figures.psnr is not None else "")
         for row in rows
@@ -152,7 +152,7 @@ def _totals(rows: list[PieceProgress], at_once: int) -> list[str]:
 
 
 def _percent(rows: list[PieceProgress]) -> str:
-    """Share of the work done, a piece that says nothing counting as one that has not begun."""
+    """Share of the work done, a shard that says nothing counting as one that has not begun."""
     shares = []
     for row in rows:
         iteration, iterations = row.figures.iteration, row.figures.iterations

@@ -1,4 +1,4 @@
-"""A scene baked in pieces, elsewhere or by several processes: what a driver does between their steps.
+"""A scene baked in shards, elsewhere or by several processes: what a driver does between their steps.
 
 What views show and lack stays on the disk, and is removed when it is used up; the driver reads a view or a part at a
 time. A driver that is started again goes on where the last one was.
@@ -6,9 +6,7 @@ time. A driver that is started again goes on where the last one was.
 
 from __future__ import annotations
 
-import os
 import shutil
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -20,10 +18,9 @@ from jaxtyping import Float, Int
 from rich.console import Console
 
 from vdgs.errors import RunError
-from vdgs.executors.errand import Errand, Wish
 from vdgs.executors.fitness import Question, photographs_of
-from vdgs.executors.placement import Share
-from vdgs.executors.work import clear, remove
+from vdgs.executors.job_folders import SHARDS, clear
+from vdgs.executors.sharded_job import ShardNeeds, Wish
 from vdgs.export.baking import gaussian_count, part_size
 from vdgs.export.formats.scene import Scene
 from vdgs.export.formats.spool import Spooled, opened, spooled, unflattened
@@ -31,7 +28,6 @@ from vdgs.export.saved import load_added, load_array, load_shown
 from vdgs.export.steps import COMPARE, FIT, FOLDER, MEND, SURVEY, BakingWork, Step
 from vdgs.memory.estimate import drawing_bytes
 from vdgs.model.gaussians import Gaussians
-from vdgs.runs.locks import hold
 from vdgs.runs.opening import TrainedRun
 from vdgs.settings.requests import ExportRequest
 from vdgs.storage.files import write_array, write_atomically
@@ -46,24 +42,22 @@ GAUSSIAN_BYTES = 500
 
 @contextmanager
 def baked_elsewhere(run: TrainedRun, asked: ExportRequest, wish: Wish, console: Console) -> Iterator[BakedElsewhere]:
-    """What lets a scene be baked in pieces. All that they leave is removed at the end, if it is a good one.
+    """What lets a scene be baked in shards. All that they leave is removed at the end, if it is a good one.
 
-    Raises RunError where another process bakes the same, or pieces of an earlier command are at work.
+    Raises RunError where another process bakes the same, or shards of an earlier command are at work.
     """
     work = BakingWork.of(run, asked)
-    clear(work.pieces.output, work.pieces.key)
-    with hold(work.pieces.folder):
+    with work.job.held():
         yield BakedElsewhere(run, asked, work, wish, console)
-        remove(work.pieces)
-    _remove_if_empty(work.pieces.output)
+    _remove_if_empty(work.job.output)
 
 
-def forget_pieces(run: TrainedRun) -> None:
-    """Remove what pieces of an earlier command have left, unless they are at work: they bake for other files."""
+def forget_shards(run: TrainedRun) -> None:
+    """Remove what shards of an earlier command have left, unless they are at work: they bake for other files."""
     output = run.folder.path / FOLDER
     with suppress(RunError):
         clear(output)
-        _remove_if_empty(output / "pieces")
+        _remove_if_empty(output / SHARDS)
         _remove_if_empty(output)
 
 
@@ -73,7 +67,7 @@ def _remove_if_empty(folder: Path) -> None:
 
 
 class BakedElsewhere:
-    """Lets pieces bake the scene of a run, step by step; as `BakedHere`."""
+    """Lets shards bake the scene of a run, step by step; as `BakedHere`."""
 
     def __init__(
         self, run: TrainedRun, asked: ExportRequest, work: BakingWork, wish: Wish, console: Console
@@ -107,19 +101,18 @@ class BakedElsewhere:
             self._gather(number, len(kept))
             self._tidy(number)
         file = work.spool_file(self._last)
-        if self._asked.refine > 0:  # which changes it: what pieces came to stays as it is
+        if self._asked.refine > 0:  # which changes it: what shards came to stays as it is
             file = Path(shutil.copyfile(file, file.with_name("refined.spool")))
         spool = opened(file, self._asked.sh_degree, writable=self._asked.refine > 0)
         yield replace(spool, means=np.array(spool.means))
 
     def _gather(self, number: int, count: int) -> None:
-        """Make the Gaussians of a round of what its pieces came to: a part at a time."""
-        if number == 0:
-            scene = Scene(self._parts(), count, self._asked.sh_degree)
-            write_atomically(self._work.spool_file(0), lambda file: _spool(scene, file))
-            return
+        """Make the Gaussians of a round of what its shards came to: a part at a time."""
 
         def write(file: Path) -> None:
+            if number == 0:
+                spooled(Scene(self._parts(), count, self._asked.sh_degree), file)
+                return
             shutil.copyfile(self._work.spool_file(number - 1), file)
             spool = opened(file, self._asked.sh_degree, writable=True)
             for part in self._work.files(self._work.step(MEND, number)):
@@ -145,22 +138,19 @@ class BakedElsewhere:
             self._work.spool_file(number - 1).unlink(missing_ok=True)
 
     def _send(self, step: Step) -> None:
-        """Let the pieces of a step be done that are not."""
-        work = self._work.pieces
-        if left := [index for index in step.pieces if not work.is_done(index)]:
-            errand = Errand(
-                step.kind, work.folder, len(step.pieces), left, work.piece, self._command, self._piece_bytes(step),
-                self._question,
-            )  # fmt: skip
+        """Let the shards of a step be done that are not."""
+        job = replace(self._work.job, kind=step.kind)
+        if left := [index for index in step.shards if not job.is_done(index)]:
+            needs = ShardNeeds(self._shard_bytes(step), self._question)
             # No photographs are read.
-            errand.run(replace(self._wish, image_gb=1e-9), self._console, work.mark_queued)
+            job.send(left, len(step.shards), needs, replace(self._wish, image_gb=1e-9), self._console)
 
     def _question(self) -> Question:
         run = self._run
         photographs = photographs_of(run.capture.train_views)
-        return Question(self._work.pieces.folder, [run.folder.config_file, run.model_path, *photographs])
+        return Question(self._work.job.folder, [run.folder.config_file, run.model_path, *photographs])
 
-    def _piece_bytes(self, step: Step) -> int:
+    def _shard_bytes(self, step: Step) -> int:
         """Memory by estimate."""
         model = self._run.model_path.stat().st_size
         if step.kind in (SURVEY, COMPARE):
@@ -170,21 +160,3 @@ class BakedElsewhere:
         pairs = sum(file.stat().st_size for file in self._work.files(before)) // (12 if step.kind is MEND else 8)
         most = min(PARTS_AT_ONCE, len(step.items))
         return drawing_bytes(model, PAIR_BYTES * pairs * most // len(step.items), part_size(self._run.model))
-
-    def _command(self, index: int, share: Share, device: str) -> list[str]:
-        """As it was asked for, so that a piece finds the same work; floats with all their digits."""
-        asked = self._asked
-        given = [word for path in asked.to for word in ("--to", os.path.abspath(path))]
-        given += [] if asked.rounds is None else ["--rounds", str(asked.rounds)]
-        given += [] if asked.block is None else ["--block", str(asked.block)]
-        given += [] if asked.bbox is None else ["--bbox", *map(repr, asked.bbox)]
-        given += [] if asked.crs is None else ["--crs", asked.crs]
-        return [
-            sys.executable, "-m", "vdgs.cli", "export", os.path.abspath(self._run.folder.path), "--piece", str(index),
-            "--model", self._run.name, *given, "--max-gaussians", str(asked.max_gaussians),
-            "--sh-degree", str(asked.sh_degree), "--threads", str(share.needs.processors), "--device", device,
-        ]  # fmt: skip
-
-
-def _spool(scene: Scene, file: Path) -> None:
-    spooled(scene, file)

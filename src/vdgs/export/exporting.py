@@ -18,10 +18,10 @@ from vdgs.cameras import Camera
 from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
 from vdgs.captures.overview import overview
 from vdgs.errors import VdgsError
-from vdgs.executors.errand import Wish
+from vdgs.executors.sharded_job import Wish
 from vdgs.export.baking import gaussian_count
 from vdgs.export.between import endless, round_count
-from vdgs.export.elsewhere import BakedElsewhere, baked_elsewhere, forget_pieces
+from vdgs.export.elsewhere import BakedElsewhere, baked_elsewhere, forget_shards
 from vdgs.export.formats import registry
 from vdgs.export.formats.scene import ROWS, Page, Scene
 from vdgs.export.formats.spool import Spooled
@@ -90,10 +90,10 @@ def _point(place: np.ndarray) -> tuple[float, float, float]:
 def export_run(asked: ExportRequest, console: Console, wish: Wish | None = None) -> dict[str, Any]:
     """Write what was asked for, on a device that is chosen already; returns what RUN/export.json holds.
 
-    The scene is baked in this process, or in pieces where a `wish` sends them: the files are the same. Raises
+    The scene is baked in this process, or in shards where a `wish` sends them: the files are the same. Raises
     VdgsError, before any Gaussian is baked, for file names of no format, outputs that are the run's report or among a
-    capture's inputs, an empty choice, and coordinates that a format or the capture does not have; and what `Errand.run`
-    raises.
+    capture's inputs, an empty choice, and coordinates that a format or the capture does not have; and what
+    `ShardedJob.send` raises.
     """
     _check_names(asked.run, asked.to)
     asked = as_files_hold(asked)
@@ -134,10 +134,10 @@ def export_run(asked: ExportRequest, console: Console, wish: Wish | None = None)
 def _baker(
     run: TrainedRun, asked: ExportRequest, wish: Wish | None, console: Console
 ) -> AbstractContextManager[BakedHere | BakedElsewhere]:
-    """What bakes the scene: this process, or pieces."""
+    """What bakes the scene: this process, or shards."""
     if wish is not None and wish.sends:
         return baked_elsewhere(run, asked, wish, console)
-    forget_pieces(run)
+    forget_shards(run)
     return nullcontext(BakedHere(run, asked, console))
 
 

@@ -1,4 +1,4 @@
-"""What pieces of baking leave, in .npy files that are read in part: memory holds what is looked at.
+"""What shards of baking leave, in .npy files that are read in part: memory holds what is looked at.
 
 Columns of 32 bits lie behind each other, [c, p] int32, whatever their numbers are: a reader finds a range of Gaussians
 in the first and takes the same range of the others.

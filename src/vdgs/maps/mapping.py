@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.progress import track
 
 from vdgs.errors import VdgsError
-from vdgs.executors.errand import Wish
-from vdgs.executors.work import clear
+from vdgs.executors.job_folders import clear
+from vdgs.executors.sharded_job import Wish
 from vdgs.maps.folder import (
     DSM,
     FACTS,
@@ -50,10 +50,10 @@ _DISK_SHARE = 2.4
 def map_run(context: RunContext, asked: MapRequest, console: Console, wish: Wish | None = None) -> Path:
     """Write the maps of a run, on a device that is chosen already; returns their folder.
 
-    Tiles are drawn in this process, or in pieces where a `wish` sends them: the files are the same. Raises VdgsError,
+    Tiles are drawn in this process, or in shards where a `wish` sends them: the files are the same. Raises VdgsError,
     before anything is drawn, for a system, pixel size or extent that makes no map, a folder among a capture's inputs or
-    with such files of others, a disk without room, and where rasterio or pyproj is missing; and what `Errand.run`
-    raises.
+    with such files of others, a disk without room, and where rasterio or pyproj is missing; and what
+    `ShardedJob.send` raises.
     """
     require_rasterio()
     refuse_foreign(folder_of(asked, asked.run))
@@ -80,7 +80,7 @@ def _map_here(context: RunContext, asked: MapRequest, console: Console) -> tuple
 
 
 def _map_in_pieces(context: RunContext, asked: MapRequest, wish: Wish, console: Console) -> tuple[dict[str, Any], Path]:
-    """Let pieces of the tiles be drawn elsewhere, and gather them one at a time. No model is in the memory of this
+    """Let shards of the tiles be drawn elsewhere, and gather them one at a time. No model is in the memory of this
     process."""
     context.release_models()
     run = RunFolder(Path(os.path.abspath(asked.run)))  # as in `stages.train`: other machines may mount it so
@@ -142,7 +142,7 @@ def _announce(plan: Plan, console: Console, in_pieces: bool = False) -> None:
     grid, placement, folder = plan.grid, plan.placement, plan.folder
     for note in placement.notes:
         console.print(f"[yellow]note[/] {note}", highlight=False)
-    # What pieces have drawn lies beside it until all is gathered.
+    # What shards have drawn lies beside it until all is gathered.
     share = _DISK_SHARE + 1 if in_pieces else _DISK_SHARE
     needed = int(share * grid.width * grid.height * sum(layer.bytes_per_pixel for layer in layers_of(placement)))
     needed += 5_000_000

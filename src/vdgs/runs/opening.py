@@ -97,7 +97,7 @@ class FoundModel:
     """One of the models of a run, not read yet; as `OpenedModel`."""
 
     stage: StageFolder
-    name: str
+    name: ModelName
     key: str
     caution: str
 

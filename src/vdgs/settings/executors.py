@@ -1,4 +1,4 @@
-"""Where blocks are trained and pieces of other stages done: on this machine, a Ray cluster or by SLURM.
+"""Where blocks are trained and shards of other stages done: on this machine, a Ray cluster or by SLURM.
 
 Never changes the result.
 """
@@ -37,21 +37,21 @@ class SlurmOptions:
 
 @dataclass(frozen=True)
 class ExecutorOptions:
-    """Where blocks are trained and pieces of other stages done, and what each asks of the place."""
+    """Where blocks are trained and shards of other stages done, and what each asks of the place."""
 
     executor: ExecutorName = "local"
-    """What runs blocks and pieces of other stages: processes of this machine, a Ray cluster, or SLURM
+    """What runs blocks and shards of other stages: processes of this machine, a Ray cluster, or SLURM
     (docs/clusters.md)."""
     address: str | None = None
     """Ray: where the cluster is (`auto`, or `head:6379`); without it what RAY_ADDRESS says, else a Ray of this machine
     alone that ends with the command."""
     processors: Annotated[int, WORKERS] = 0
-    """Ray and SLURM: processors of a block or piece; 0 shares out those of the cluster (SLURM: 4)."""
+    """Ray and SLURM: processors of a block or shard; 0 shares out those of the cluster (SLURM: 4)."""
     memory_gb: Annotated[float, Range(0, LARGE)] = 0.0
-    """Ray and SLURM: memory of a block or piece; 0 takes what it needs by estimate. After an out-of-memory kill half as
+    """Ray and SLURM: memory of a block or shard; 0 takes what it needs by estimate. After an out-of-memory kill half as
     much more is asked for."""
     gpus: Annotated[float, Range(0, 64)] = 0.0
-    """Ray and SLURM: GPUs of a block or piece. Ray also knows shares (0.5: two blocks on one)."""
+    """Ray and SLURM: GPUs of a block or shard. Ray also knows shares (0.5: two blocks on one)."""
     slurm: SlurmOptions = field(default_factory=SlurmOptions)
 
     def check(self) -> None:

@@ -49,7 +49,7 @@ class RunRequest:
     redo: bool = False
     """Allow other settings than the run has to discard what was trained with the old ones."""
     jobs: Annotated[int, WORKERS] = 0
-    """Blocks trained at once, on a cluster also pieces of other stages; 0 takes what there is room for."""
+    """Blocks trained at once, on a cluster also shards of other stages; 0 takes what there is room for."""
     incomplete: bool = False
     """Go on if a block fails: the coarse model stands in for it."""
     maps: bool = True

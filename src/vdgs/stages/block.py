@@ -19,6 +19,7 @@ from vdgs.captures.facts import capture_facts
 from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
 from vdgs.errors import RunError
+from vdgs.executors.shard import Shard
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.sizes import largest_log_scales
 from vdgs.model.visibility import effective_count
@@ -57,6 +58,12 @@ def train_block(context: RunContext, index: int, options: WatchOptions, console:
                 return
             folder.discard_unless(key)
             _train(context, index, blocks, options, console, torch.device(device))
+
+
+def train_shard(shard: Shard) -> None:
+    """Train, or continue, a block of RUN/blocks as `vdgs train RUN` asks for it."""
+    options = replace(shard.request(WatchOptions), image_memory_gb=shard.image_gb)
+    train_block(RunContext.from_path(shard.folder.parent), shard.index, options, shard.console, shard.device)
 
 
 def _train(

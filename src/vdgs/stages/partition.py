@@ -7,10 +7,10 @@ RUN/partition/   blocks.geojson (ground frame), blocks_wgs84.geojson (if georefe
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +22,11 @@ from rich.table import Table
 
 from vdgs.cameras import Camera
 from vdgs.errors import RunError
-from vdgs.executors.errand import Errand, Wish
 from vdgs.executors.fitness import Question, photographs_of
-from vdgs.executors.kinds import Kind
-from vdgs.executors.placement import Share
-from vdgs.executors.work import PieceWork, at_work, clear, remove, spans_of
+from vdgs.executors.job_folders import clear, remove
+from vdgs.executors.kinds import shard_kind
+from vdgs.executors.shard import Results, Shard
+from vdgs.executors.sharded_job import ShardedJob, ShardNeeds, Wish, spans_of
 from vdgs.memory.estimate import drawing_bytes, largest_picture
 from vdgs.memory.process import forget_peak, peak_memory_bytes
 from vdgs.partition.assignment.assign import Assignment, assign
@@ -48,13 +48,21 @@ from vdgs.storage.files import read_json, write_json
 from vdgs.storage.records import plain
 from vdgs.watching.interrupts import stop_if_asked
 
-#: Cameras that are scored and saved together; how many such groups a piece has, least and most, and how many pieces
+#: Cameras that are scored and saved together; how many such groups a shard has, least and most, and how many shards
 #: there are in between (choice).
 CAMERAS_OF_ITEM = 8
-ITEMS_OF_PIECE = 1, 8, 16
-CAMERAS = Kind("piece", "pieces", "score cameras", "at work", "cameras", "cameras/s")
-#: The blocks that pieces score cameras for, in the folder of the pieces.
+ITEMS_OF_SHARD = 1, 8, 16
+CAMERAS = shard_kind("score cameras", "groups")
+#: The blocks that shards score cameras for, in the folder of the job.
 CUT = "blocks.geojson"
+
+
+@dataclass(frozen=True)
+class ScoreRequest:
+    """What shards that score cameras are asked for."""
+
+    run: Path
+    """Run folder."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +85,8 @@ class _Scene:
 def partition_run(context: RunContext, console: Console, device: str = "cpu", wish: Wish | None = None) -> None:
     """Cut the scene of a run and assign its cameras, drawing on a device; what is there for the same settings is kept.
 
-    Cameras are scored in this process, or in pieces where a `wish` sends them: the scores are the same. Raises RunError
-    without a coarse model, and what `Errand.run` raises.
+    Cameras are scored in this process, or in shards where a `wish` sends them: the scores are the same. Raises RunError
+    without a coarse model, and what `ShardedJob.send` raises.
     """
     run = context.run
     keys, before = run.keys(), _record_before(run)
@@ -89,8 +97,8 @@ def partition_run(context: RunContext, console: Console, device: str = "cpu", wi
     with run.locked():
         forget_peak()
         began, method, scene = time.monotonic(), run.method(), _Scene.of(context, device)
-        work, config = _work(run, len(scene.cameras)), _assignment(method)
-        begun = _begun_cut(work)
+        job, config = _job(run, len(scene.cameras)), _assignment(method)
+        begun = _begun_cut(job)
         if begun is not None:
             blocks, warnings = begun
         elif kept is not None:
@@ -98,9 +106,9 @@ def partition_run(context: RunContext, console: Console, device: str = "cpu", wi
         else:
             blocks, warnings = _cut(scene, method)
         sends = wish is not None and wish.sends
-        clear(run.partition, work.key if sends else None)
+        clear(run.partition, job.key if sends else None)
         if wish is not None and sends:
-            scores = _score_in_pieces(run, scene, work, (blocks, warnings), wish, console)
+            scores = _score_in_shards(run, scene, job, (blocks, warnings), wish, console)
         else:
             scores = _score(scene, blocks, config, console)
         if method.partition.strategy != "visibility":
@@ -121,7 +129,7 @@ def partition_run(context: RunContext, console: Console, device: str = "cpu", wi
         )  # fmt: skip
         write_json(run.partition / "partition.json", plain(record))  # last: where it stands, the rest is complete
         if sends:
-            remove(work)
+            remove(job.folder)
     console.print(assignment_table(rows))
     console.print(f"figures: {run.partition / 'blocks.png'} and beside it", highlight=False)
 
@@ -193,69 +201,53 @@ def _score(scene: _Scene, blocks: Blocks, config: AssignmentConfig, console: Con
         return score_matrix(scene.opened.model, blocks, scene.cameras, config, show)
 
 
-def _work(run: RunFolder, cameras: int) -> PieceWork:
-    """Groups of training cameras in pieces; what their scores depend on."""
-    groups = -(-cameras // CAMERAS_OF_ITEM)
+def _job(run: RunFolder, cameras: int) -> ShardedJob:
+    """Groups of training cameras in shards; what their scores depend on."""
+    request = ScoreRequest(Path(os.path.abspath(run.path)))
     depends_on = [run.keys().assignment, run.coarse_identity(), cameras]
-    return PieceWork.of(run.partition, depends_on, spans_of(groups, *ITEMS_OF_PIECE))
+    spans = spans_of(-(-cameras // CAMERAS_OF_ITEM), *ITEMS_OF_SHARD)
+    return ShardedJob.of("scores", request, run.partition, CAMERAS, depends_on, spans)
 
 
-def _begun_cut(work: PieceWork) -> tuple[Blocks, list[str]] | None:
-    """The blocks for which pieces of an earlier command score cameras, and the warnings of their cut, if there are."""
-    file = work.folder / CUT
+def _begun_cut(job: ShardedJob) -> tuple[Blocks, list[str]] | None:
+    """The blocks for which shards of an earlier command score cameras, and the warnings of their cut, if there are."""
+    file = job.folder / CUT
     if not file.exists():
         return None
     return load_blocks(file), list(read_json(file)["warnings"])
 
 
-def _score_in_pieces(
-    run: RunFolder, scene: _Scene, work: PieceWork, cut: tuple[Blocks, list[str]], wish: Wish, console: Console
+def _score_in_shards(
+    run: RunFolder, scene: _Scene, job: ShardedJob, cut: tuple[Blocks, list[str]], wish: Wish, console: Console
 ) -> Scores:
-    """Let pieces of the cameras be scored elsewhere, and join their rows."""
+    """Let shards of the cameras be scored elsewhere, and join their rows."""
     blocks, warnings = cut
-    with hold(work.folder):  # from here on `executors.work` knows it as a work, whenever this process ends
-        save_blocks(work.folder / CUT, blocks, [{} for _ in blocks.items], {"warnings": warnings})
-    if left := work.left:
-        views = scene.opened.capture.train_views
-        pixels = max(camera.width * camera.height for camera in scene.cameras)
-        model = run.coarse.model.stat().st_size
-        errand = Errand(
-            CAMERAS, work.folder, len(work.spans), left, work.piece, lambda *given: _command(run, *given),
-            drawing_bytes(model, len(scene.positions) * len(blocks), pixels),
-            lambda: Question(work.folder, [run.config_file, run.coarse.model, *photographs_of(views)]),
-        )  # fmt: skip
-        errand.run(wish, console, work.mark_queued)
-    return joined([load_part(work.file(item)) for item in range(work.spans[-1].stop)])
+    with hold(job.folder):  # from here on `job_folders` knows it as a job, whenever this process ends
+        save_blocks(job.folder / CUT, blocks, [{} for _ in blocks.items], {"warnings": warnings})
+    pixels = max(camera.width * camera.height for camera in scene.cameras)
+    model, photographs = run.coarse.model, photographs_of(scene.opened.capture.train_views)
+    needs = ShardNeeds(
+        drawing_bytes(model.stat().st_size, len(scene.positions) * len(blocks), pixels),
+        lambda: Question(job.folder, [run.config_file, model, *photographs]),
+    )
+    job.run(needs, wish, console)
+    return joined(list(job.gather(load_part)))
 
 
-def _command(run: RunFolder, index: int, share: Share, device: str) -> list[str]:
-    return [
-        sys.executable, "-m", "vdgs.cli", "partition", os.path.abspath(run.path), "--piece", str(index),
-        "--threads", str(share.needs.processors), "--device", device,
-    ]  # fmt: skip
-
-
-def score_piece(context: RunContext, index: int, console: Console, device: str = "cpu") -> None:
-    """Score one piece of the cameras for the blocks that a command has cut, continue it, or do nothing if it is done.
-    Its scores stay beside its status until all pieces are joined. RunError where no command has cut them."""
-    run, opened = context.run, context.open_model("coarse", device)
+def score_shard(shard: Shard) -> None:
+    """Score a shard of the cameras for the blocks that a command has cut; scores stay beside its status until all are
+    joined."""
+    context = RunContext.from_path(shard.request(ScoreRequest).run)
+    run, opened = context.run, context.open_model("coarse", shard.device)
     cameras = [view.camera for view in opened.capture.train_views]
-    work = _work(run, len(cameras))
-    span, cut = work.span(index), _begun_cut(work)
-    if cut is None:
-        raise RunError(f"{work.folder}: has no blocks to score cameras for. vdgs partition {run.path} cuts them.")
-    if work.is_done(index):
-        console.print(f"{work.piece(index).path}: already scored; nothing to do", highlight=False)
-        return
-    groups = {item: cameras[item * CAMERAS_OF_ITEM : (item + 1) * CAMERAS_OF_ITEM] for item in span}
-    done = sum(len(group) for item, group in groups.items() if work.file(item).exists())
-    with at_work(work.piece(index), done, sum(map(len, groups.values()))) as tell:
-        scorer = Scorer(opened.model, cut[0], _assignment(run.method()))
-        for item in (item for item in span if not work.file(item).exists()):
-            stop_if_asked()
-            save_part(work.file(item), scorer.scores(groups[item]))
-            done += len(groups[item])
-            tell(done)
+
+    def results(left: Sequence[int]) -> Results:
+        scorer = Scorer(opened.model, load_blocks(shard.folder / CUT), _assignment(run.method()))
+        for item in left:
+            scores = scorer.scores(cameras[item * CAMERAS_OF_ITEM : (item + 1) * CAMERAS_OF_ITEM])
+            yield partial(save_part, scores=scores)
+
+    shard.do(_job(run, len(cameras)), results)
 
 
 def _save(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -14,10 +13,9 @@ from rich.console import Console
 
 from vdgs.cameras import Camera
 from vdgs.errors import RunError, VdgsError
-from vdgs.executors.errand import Errand, Wish
 from vdgs.executors.fitness import Question, photographs_of
 from vdgs.executors.kinds import BLOCKS
-from vdgs.executors.placement import Share
+from vdgs.executors.sharded_job import ShardedJob, ShardNeeds, Wish
 from vdgs.memory.estimate import decoded_bytes, estimate, largest_picture, need_of_block
 from vdgs.runs.cut import blocks_of
 from vdgs.runs.folder import RunFolder
@@ -58,11 +56,11 @@ def train_blocks(
         context.release_models()  # the memory is for the blocks
         views = context.capture.train_views
         cameras, files = [view.camera for view in views], [run.config_file, run.coarse.model, *photographs_of(views)]
-        errand = Errand(
-            BLOCKS, run.path / "blocks", len(blocks), left, run.block,
-            lambda index, share, device: _command(run, index, share, options, device), _block_bytes(run, cameras),
-            lambda: Question(run.path, files), photographs_bytes=decoded_bytes(cameras),
+        job = ShardedJob(
+            worker="block", request=options, folder=run.path / "blocks", kind=BLOCKS,
+            spans=tuple(range(index, index + 1) for index in range(len(blocks))),
         )  # fmt: skip
+        needs = ShardNeeds(_block_bytes(run, cameras), lambda: Question(run.path, files), decoded_bytes(cameras))
 
         def ready() -> None:
             _note_discarded(run, left, key, console)
@@ -70,19 +68,8 @@ def train_blocks(
                 _mark_queued(run.block(index), key)
 
         wish = Wish(where or ExecutorOptions(), jobs, options.image_memory_gb, device)
-        errand.run(wish, console, ready)
+        job.send(left, len(blocks), needs, wish, console, ready)
     console.print(f"blocks trained in {(time.monotonic() - began) / 60:.1f} min", highlight=False)
-
-
-def _command(run: RunFolder, index: int, share: Share, options: WatchOptions, device: str) -> list[str]:
-    command = [
-        sys.executable, "-m", "vdgs.cli", "train", str(run.path), "--block", str(index),
-        "--threads", str(share.needs.processors), "--image-memory-gb", f"{share.image_gb:.3f}",
-        "--save-every", str(options.save_every), "--device", device,
-    ]  # fmt: skip
-    if options.tensorboard:
-        command.append("--tensorboard")
-    return command
 
 
 def _note_discarded(run: RunFolder, left: list[int], key: str, console: Console) -> None:

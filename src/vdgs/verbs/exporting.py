@@ -10,7 +10,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from vdgs.kernels import configure_threads
 from vdgs.settings.executors import ExecutorOptions
-from vdgs.settings.ranges import WORKERS, Range
+from vdgs.settings.ranges import WORKERS
 from vdgs.settings.requests import ExportRequest
 from vdgs.verbs.shared import open_console, parse, use_device
 
@@ -28,10 +28,8 @@ class ExportArguments(ExportRequest):
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
     jobs: Annotated[int, WORKERS] = 0
-    """Pieces of the baking done at once, each in a process of its own; 0: on this machine one process bakes all, a
+    """Shards of the baking done at once, each in a process of its own; 0: on this machine one process bakes all, a
     cluster as many as it has room for."""
-    piece: Annotated[int | None, Range(0, 100_000)] = None
-    """Only do this piece of the baking, in this process: what is sent out."""
     where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
 
 
@@ -39,14 +37,7 @@ def export(arguments: list[str]) -> None:
     asked = parse(ExportArguments, arguments, "vdgs export")
     device, console = use_device(asked.device), open_console(asked.quiet)
     configure_threads(asked.threads)
-    if asked.piece is not None:
-        from vdgs.executors.parent import stop_when_parent_dies
-        from vdgs.export.piece import bake_piece
-
-        stop_when_parent_dies()
-        bake_piece(replace(asked, device=device), asked.piece, console)
-        return
-    from vdgs.executors.errand import Wish
+    from vdgs.executors.sharded_job import Wish
     from vdgs.export.exporting import export_run
 
     asked.where.check()

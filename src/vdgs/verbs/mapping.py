@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from vdgs.kernels import configure_threads
 from vdgs.settings.executors import ExecutorOptions
-from vdgs.settings.ranges import WORKERS, Range
+from vdgs.settings.ranges import WORKERS
 from vdgs.settings.requests import MapRequest
 from vdgs.verbs.shared import open_console, parse, use_device
 
@@ -25,10 +25,8 @@ class MapArguments(MapRequest):
     run: Positional[Path]
     """Run folder."""
     jobs: Annotated[int, WORKERS] = 0
-    """Pieces of the tiles drawn at once, each in a process of its own; 0: on this machine one process draws all, a
+    """Shards of the tiles drawn at once, each in a process of its own; 0: on this machine one process draws all, a
     cluster as many as it has room for."""
-    piece: Annotated[int | None, Range(0, 10_000)] = None
-    """Only draw this piece of the tiles, in this process: what is sent out."""
     quiet: bool = False
     """Print nothing but notes, warnings and errors."""
     where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
@@ -38,14 +36,7 @@ def map(arguments: list[str]) -> None:
     asked = parse(MapArguments, arguments, "vdgs map")
     device = use_device(asked.device)
     configure_threads(asked.threads)
-    if asked.piece is not None:
-        from vdgs.executors.parent import stop_when_parent_dies
-        from vdgs.maps.pieces import map_piece
-
-        stop_when_parent_dies()
-        map_piece(replace(asked, device=device), asked.piece, open_console(asked.quiet))
-        return
-    from vdgs.executors.errand import Wish
+    from vdgs.executors.sharded_job import Wish
     from vdgs.maps.mapping import map_run
     from vdgs.runs.run_context import RunContext
 

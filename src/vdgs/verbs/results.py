@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from vdgs.kernels import configure_threads
 from vdgs.settings.executors import ExecutorOptions
-from vdgs.settings.ranges import WORKERS, Range
+from vdgs.settings.ranges import WORKERS
 from vdgs.settings.requests import BINS, ModelName, RenderRequest
 from vdgs.verbs.shared import open_console, parse, use_device
 
@@ -63,12 +63,10 @@ class EvalArguments:
     bins: Annotated[int, BINS] = 4
     """Number of visibility quantiles by which metrics are reported."""
     jobs: Annotated[int, WORKERS] = 0
-    """Pieces of the views measured at once, each in a process of its own; 0: on this machine one process measures all,
+    """Shards of the views measured at once, each in a process of its own; 0: on this machine one process measures all,
     a cluster as many as it has room for."""
-    piece: Annotated[int | None, Range(0, 10_000)] = None
-    """Only this piece of the views, in this process: what is sent out."""
     threads: Annotated[int, WORKERS] = 0
-    """Threads of the kernels, of one process or of --piece; 0 for all cores."""
+    """Threads of the kernels; 0 for all cores."""
     device: str = "auto"
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
     quiet: bool = False
@@ -78,23 +76,16 @@ class EvalArguments:
 
 def eval(arguments: list[str]) -> None:
     asked = parse(EvalArguments, arguments, "vdgs eval")
+    from vdgs.executors.sharded_job import Wish
     from vdgs.runs.run_context import RunContext
-    from vdgs.stages.evaluate import Measuring, evaluate_piece, evaluate_stage
+    from vdgs.stages.evaluate import Measuring, evaluate_stage
 
     device, console = use_device(asked.device), open_console(asked.quiet)
     measuring = Measuring(asked.run, asked.model, asked.lpips_weights, asked.bins, asked.views, device)
     configure_threads(asked.threads)
-    if asked.piece is not None:
-        from vdgs.executors.parent import stop_when_parent_dies
-
-        stop_when_parent_dies()
-        evaluate_piece(RunContext.from_path(asked.run), measuring, asked.piece, console)
-    else:
-        from vdgs.executors.errand import Wish
-
-        asked.where.check()
-        context = RunContext.from_path(asked.run, asked.capture)
-        evaluate_stage(context, measuring, console, Wish(asked.where, asked.jobs, device=device))
+    context = RunContext.from_path(asked.run, asked.capture)
+    asked.where.check()
+    evaluate_stage(context, measuring, console, Wish(asked.where, asked.jobs, device=device))
 
 
 @dataclass(frozen=True)

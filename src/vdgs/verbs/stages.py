@@ -58,10 +58,8 @@ class PartitionArguments:
     why: str | None = None
     """Name of a training photograph: also say how well it shows each block and why it was assigned or not."""
     jobs: Annotated[int, WORKERS] = 0
-    """Pieces of the cameras scored at once, each in a process of its own; 0: on this machine one process scores all, a
+    """Shards of the cameras scored at once, each in a process of its own; 0: on this machine one process scores all, a
     cluster as many as it has room for."""
-    piece: Annotated[int | None, Range(0, 10_000)] = None
-    """Only score this piece of the cameras, in this process: what is sent out."""
     threads: Annotated[int, WORKERS] = 0
     """Threads of the kernels; 0 for all cores. The result does not depend on it."""
     device: str = "auto"
@@ -77,19 +75,12 @@ def partition(arguments: list[str]) -> None:
         return PartitionArguments(tyro.MISSING, partition=method.partition, assignment=method.assignment)
 
     asked, run, method = parse_for_run(PartitionArguments, arguments, "vdgs partition", defaults)
+    from vdgs.executors.sharded_job import Wish
     from vdgs.runs.run_context import RunContext
-    from vdgs.stages.partition import explain_view, partition_run, score_piece
+    from vdgs.stages.partition import explain_view, partition_run
 
     device = use_device(asked.device)
     configure_threads(asked.threads)
-    if asked.piece is not None:
-        from vdgs.executors.parent import stop_when_parent_dies
-
-        stop_when_parent_dies()
-        score_piece(RunContext(run), asked.piece, open_console(asked.quiet), device)
-        return
-    from vdgs.executors.errand import Wish
-
     asked.where.check()
     context = RunContext.from_path(asked.run, asked.capture)
     change_settings(
@@ -136,10 +127,8 @@ def train(arguments: list[str]) -> None:
     context = RunContext.from_path(asked.run, asked.capture)
     change_settings(run, replace(method, block=asked.settings), asked.redo, asked.quiet)
     if asked.block is not None:
-        from vdgs.executors.parent import stop_when_parent_dies
         from vdgs.stages.block import train_block
 
-        stop_when_parent_dies()
         configure_threads(asked.threads)
         train_block(context, asked.block, asked.watching, open_console(asked.quiet), device)
     else:
