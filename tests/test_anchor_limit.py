@@ -76,6 +76,7 @@ def merged(capture: Path, output: Path, max_anchors: int) -> tuple[RunFolder, in
     """A run, and how many anchors its coarse model and its merged scene have."""
     console = Console(file=io.StringIO())
     context = begin_run(capture, output, CaptureOptions(), eager(max_anchors))
+    run = context.run
     train_coarse(context, WatchOptions(), console)
     measure_visibility(context, console)
     partition_run(context, console)
