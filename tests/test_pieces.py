@@ -28,11 +28,12 @@ from vdgs.evaluation.records import load_view, save_view
 from vdgs.evaluation.seams import BlockFigures
 from vdgs.evaluation.view import ViewFigures
 from vdgs.executors import run_shard as entry
-from vdgs.executors.job_folders import alone, clear, remove
+from vdgs.executors.job_folders import clear, remove
 from vdgs.executors.kinds import shard_kind
 from vdgs.executors.shard import WORKERS, Results, Shard, run_shard, shard_session
 from vdgs.executors.sharded_job import REQUEST, ShardedJob, ShardNeeds, Wish, spans_of
 from vdgs.runs.folder import RunFolder
+from vdgs.runs.locks import hold
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.settings.executors import ExecutorOptions
 from vdgs.settings.plain import to_dict
@@ -240,17 +241,21 @@ def test_a_shard_refuses_what_it_was_not_made_for(tmp_path, halves):
     assert not job.file(0).exists()
 
 
-def test_shards_of_other_jobs_go_unless_they_are_shard_session(tmp_path):
+def test_shards_of_other_jobs_go_unless_they_are_at_work(tmp_path):
     wanted, other = (job_of(tmp_path, name) for name in ("this", "that"))
     assert wanted.key != other.key
-    for work in (wanted, other):
-        work.mark_queued()
-    with alone(tmp_path, wanted.key), pytest.raises(RunError, match="another vdgs process"), alone(tmp_path):
+    for job in (wanted, other):
+        job.mark_queued()
+    with wanted.held(), pytest.raises(RunError, match="another vdgs process"), wanted.held():
+        pass
+    assert not list(tmp_path.iterdir())
+    for job in (wanted, other):
+        job.mark_queued()
+    with wanted.shard(0).locked(), pytest.raises(RunError, match="that an earlier command sent out"):
+        clear(tmp_path)
+    with hold(wanted.folder), pytest.raises(RunError, match="another vdgs process gathers shards there"), other.held():
         pass
     assert wanted.folder.exists()
-    assert not other.folder.exists()
-    with wanted.shard(0).locked(), pytest.raises(RunError, match="that an earlier command sent out"), alone(tmp_path):
-        pass
 
 
 def test_what_a_person_keeps_in_a_folder_of_that_name_stays(tmp_path):
@@ -263,8 +268,8 @@ def test_what_a_person_keeps_in_a_folder_of_that_name_stays(tmp_path):
     elsewhere.mark_queued()
     (tmp_path / "shards" / "ba9876543210").symlink_to(elsewhere.folder)
     wanted, other = (job_of(tmp_path, name) for name in ("this", "that"))
-    for work in (wanted, other):
-        work.mark_queued()
+    for job in (wanted, other):
+        job.mark_queued()
     clear(tmp_path, wanted.key)
     assert wanted.folder.exists()
     assert not other.folder.exists()

@@ -7,28 +7,16 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 from vdgs.errors import RunError
-from vdgs.runs.locks import hold, is_locked
+from vdgs.runs.locks import is_locked
 
 #: The name of the folder of all jobs in the folder that they are for.
 SHARDS = "shards"
 #: What the names of the folders of jobs look like (`ShardedJob.of`).
 _KEY = re.compile(r"[0-9a-f]{12}")
-
-
-@contextmanager
-def alone(output: Path, key: str | None = None) -> Iterator[None]:
-    """Be the one process that works for a folder, but for shards of the job with this `key` (`clear`).
-
-    Raises RunError where another process works for it, or shards of other jobs do without their driver.
-    """
-    with hold(output):
-        clear(output, key)
-        yield
 
 
 def clear(output: Path, key: str | None = None) -> None:

@@ -36,7 +36,7 @@ from vdgs.evaluation.seams import conclude as conclude_blocks
 from vdgs.evaluation.seams import measure_view as measure_view_of_blocks
 from vdgs.evaluation.view import ViewInputs, measure_view
 from vdgs.executors.fitness import Question, photographs_of
-from vdgs.executors.job_folders import alone
+from vdgs.executors.job_folders import clear
 from vdgs.executors.kinds import shard_kind
 from vdgs.executors.shard import Results, Shard
 from vdgs.executors.sharded_job import ShardedJob, ShardNeeds, Wish, spans_of
@@ -96,7 +96,8 @@ def _measure_here(context: RunContext, found: FoundModel, asked: Measuring, cons
     """Measure in this process; the most memory that it took (bytes)."""
     run = context.run
     output = evaluation_folder(run, found.name, asked.views)
-    with alone(output):
+    with hold(output):
+        clear(output)
         opened = context.open_model(asked.which, asked.device)
         coarse = context.open_model("coarse", asked.device)
         _announce(found, len(views_of(opened.capture, asked.views)), asked.views, console)
