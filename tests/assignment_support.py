@@ -41,7 +41,7 @@ def scene() -> AnchorModel:
     tensors = Decoder.initial(4, False, 0, 1, g).tensors()
     tensors["opacity_b2"] = tensors["opacity_b2"] + 3.0  # what is in view is opaque
     tensors["colour_b2"] = tensors["colour_b2"] + 1.0  # and lighter than the black behind it
-    return AnchorModel(anchors, Decoder.from_tensors(tensors), 0.4, (0.5, 0.5, 0.5), {})
+    return AnchorModel(anchors=anchors, decoder=Decoder.from_tensors(tensors), voxel=0.4, background=(0.5, 0.5, 0.5))
 
 
 def strips(count: int, margin: float = 0.5) -> Blocks:
@@ -53,7 +53,7 @@ def strips(count: int, margin: float = 0.5) -> Blocks:
 
 def camera(x: float, y: float = 3.0, height: float = 4.0, tilt_deg: float = 0.0) -> Camera:
     pose = look_down(np.array([x, y, height]), tilt_deg, 90.0)
-    return Camera(pose, 70.0, 70.0, 32.0, 24.0, 64, 48)
+    return Camera(camera_from_world=pose, fx=70.0, fy=70.0, cx=32.0, cy=24.0, width=64, height=48)
 
 
 def flight() -> list[Camera]:
@@ -69,4 +69,7 @@ def hand_made(scores, held=None, mode="coverage") -> Scores:
     values = np.array(scores, np.float32)
     held = (values > 0).astype(np.int32) if held is None else np.array(held, np.int32)
     anchors = np.full(values.shape[1], 1000, np.int64)
-    return Scores(mode, values, held, values.copy(), anchors, np.zeros(len(values), np.int64))
+    return Scores(
+        mode=mode, scores=values, held=held, covered=values.copy(), anchors=anchors,
+        beneath=np.zeros(len(values), np.int64),
+    )  # fmt: skip

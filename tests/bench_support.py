@@ -28,7 +28,7 @@ class InThisProcess:
         with threads_as_before():
             for task in tasks:
                 work(replace(Job.read(Path(task.command[-1])), threads=1))
-        return [Outcome(task.name, "done") for task in tasks]
+        return [Outcome(name=task.name, state="done") for task in tasks]
 
 
 def write_data(folder: Path) -> None:

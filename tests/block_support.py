@@ -53,7 +53,8 @@ def block_stage(config: BlockConfig, index: int = 0, training: TrainConfig = CON
     own, around = split_anchors(anchors, BLOCKS, index, config)
     surroundings = anchors.select(around & drawn_by(anchors, photographs.cameras))
     stage = Stage(
-        training, photographs, 8, 0.4, 5.0, frozen_decoder=True, surroundings=Surroundings(surroundings, decoder),
-        may_hold=holds(BLOCKS, index, config), mobility=ramp(BLOCKS, index, config),
+        config=training, images=photographs, image_count=8, voxel=0.4, camera_height=5.0, frozen_decoder=True,
+        surroundings=Surroundings(surroundings, decoder), may_hold=holds(BLOCKS, index, config),
+        mobility=ramp(BLOCKS, index, config),
     )  # fmt: skip
     return stage, start_state(anchors.select(own), decoder, stage)

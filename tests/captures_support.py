@@ -54,7 +54,10 @@ def look_down(position: np.ndarray, tilt_deg: float = 0.0, yaw_deg: float = 0.0)
 def camera_at(x: float, y: float, z: float = 4.0, tilt: float = 0.0, yaw: float = 0.0, width: int = 64) -> Camera:
     """A camera of 4 to 3 and 53° across at a place, looking down but for its tilt (degrees)."""
     height = width * 3 // 4
-    return Camera(look_down(np.array([x, y, z]), tilt, yaw), width, width, width / 2, height / 2, width, height)
+    return Camera(
+        camera_from_world=look_down(np.array([x, y, z]), tilt, yaw), fx=width, fy=width, cx=width / 2, cy=height / 2,
+        width=width, height=height,
+    )  # fmt: skip
 
 
 def tiny_scene(
@@ -68,7 +71,10 @@ def tiny_scene(
         for column in range(columns):
             position = np.array([3.0 * column, 3.0 * row, altitude + generator.uniform(-0.3, 0.3)])
             pose = look_down(position, generator.uniform(0, 8), generator.uniform(0, 360))
-            camera = Camera(pose, 0.9 * width, 0.9 * width, width / 2, height / 2, width, height)
+            camera = Camera(
+                camera_from_world=pose, fx=0.9 * width, fy=0.9 * width, cx=width / 2, cy=height / 2, width=width,
+                height=height,
+            )  # fmt: skip
             cameras[f"frame_{len(cameras):03d}.png"] = camera
     low, high = np.array([-4.0, -4.0]), np.array([3.0 * columns + 1, 3.0 * rows + 1])
     flat = generator.uniform(low, high, (points, 2))

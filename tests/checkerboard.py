@@ -21,7 +21,7 @@ class Photographs:
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
         pose[:3, 3] = -pose[:3, :3] @ np.array([x, y, 5.0])
         width, height = SIZE
-        return Camera(pose, 40.0, 40.0, width / 2, height / 2, width, height)
+        return Camera(camera_from_world=pose, fx=40.0, fy=40.0, cx=width / 2, cy=height / 2, width=width, height=height)
 
     def camera(self, index: int, downscale: int = 1) -> Camera:
         return self.cameras[index].resized(SIZE[0] // downscale, SIZE[1] // downscale)

@@ -68,7 +68,7 @@ class CommandsHere:
             with task.output.open("a") as output, redirect_stdout(output), redirect_stderr(output), threads_as_before():
                 code = _exit_code(importlib.import_module(module).main, arguments)
             assert not code, f"{task.name}: exit code {code}, see {task.output}"
-        return [Outcome(task.name, "done", 1) for task in tasks]
+        return [Outcome(name=task.name, state="done", attempts=1) for task in tasks]
 
 
 def _exit_code(main: Callable[[list[str]], int | None], arguments: list[str]) -> object:

@@ -42,7 +42,7 @@ class CountedProgram(Program):
 
     def __init__(self, program: Program, folder: Path):
         self._library = build_on_host(program.name, folder, counted=True)
-        super().__init__(program.name, HostDriver(self._library), program.headers)
+        super().__init__(name=program.name, driver=HostDriver(self._library), headers=program.headers)
         self.traffic: list[Traffic] = []
         self._launches = 0
 

@@ -17,7 +17,10 @@ def looking_down(model: CameraModel = "pinhole", width: int = 64, height: int = 
     camera_from_world = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 10], [0, 0, 0, 1]])
     focal = 80.0 if model == "pinhole" else 8.0
     focal *= width / 64
-    return Camera(camera_from_world, focal, focal * 1.1, width / 2 + 1, height / 2 - 2, width, height, model)
+    return Camera(
+        camera_from_world=camera_from_world, fx=focal, fy=focal * 1.1, cx=width / 2 + 1, cy=height / 2 - 2, width=width,
+        height=height, model=model,
+    )  # fmt: skip
 
 
 def turned(width: int = 64, height: int = 48) -> Camera:
@@ -30,7 +33,9 @@ def turned(width: int = 64, height: int = 48) -> Camera:
     rotation = np.stack([right, np.cross(forward, right), forward])
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = rotation, -rotation @ (-9.0 * forward + 0.1 * rng.normal(size=3))
-    return Camera(rigid, 1.2 * width, 1.1 * width, width / 2, height / 2, width, height)
+    return Camera(
+        camera_from_world=rigid, fx=1.2 * width, fy=1.1 * width, cx=width / 2, cy=height / 2, width=width, height=height
+    )
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ def noisy(image: np.ndarray, rng: np.random.Generator, sigma: float = 0.05) -> n
 def view(name: str, width: int = 64, height: int = 48, shift: float = 0.0, mask: Path | None = None) -> View:
     pose = np.eye(4)
     pose[0, 3] = shift
-    camera = Camera(pose, 60.0, 60.0, width / 2, height / 2, width, height)
-    return View(name, camera, Path("images") / name, mask, "test")
+    camera = Camera(camera_from_world=pose, fx=60.0, fy=60.0, cx=width / 2, cy=height / 2, width=width, height=height)
+    return View(name=name, camera=camera, image_path=Path("images") / name, mask_path=mask, split="test")
 
 
 def load_mask(view: View) -> np.ndarray | None:

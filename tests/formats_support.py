@@ -35,7 +35,9 @@ def overhead(height: float = 8.0, aside: float = 2.0, size: int = 96) -> Camera:
     rotation = np.stack([right, np.cross(forward, right), forward])
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ position
-    return Camera(matrix, size * 1.0, size * 1.0, size / 2, size / 2, size, size)
+    return Camera(
+        camera_from_world=matrix, fx=size * 1.0, fy=size * 1.0, cx=size / 2, cy=size / 2, width=size, height=size
+    )
 
 
 def picture(gaussians: Gaussians, camera: Camera | None = None) -> np.ndarray:

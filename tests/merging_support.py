@@ -10,7 +10,7 @@ import torch
 
 from captures_support import look_down
 from vdgs.cameras import Camera
-from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.partition.blocks import Block, Blocks
@@ -41,7 +41,9 @@ def model_at(positions: np.ndarray, seed: int = 0, decoder_seed: int = 0) -> Anc
         log_scales=0.1 * torch.randn(n, 6, generator=g) - 1.0,
     )
     decoder = Decoder.initial(OFFSETS, False, 0, 0, torch.Generator().manual_seed(decoder_seed))
-    return AnchorModel(anchors, decoder, 0.1, (0.1, 0.2, 0.3), {"place": "plane"})
+    return AnchorModel(
+        anchors=anchors, decoder=decoder, voxel=0.1, background=(0.1, 0.2, 0.3), metadata=ModelMetadata(version="plane")
+    )
 
 
 def opaque_plane(spacing: float = 0.2, half: float = 3.0) -> AnchorModel:
@@ -64,4 +66,4 @@ def opaque_plane(spacing: float = 0.2, half: float = 3.0) -> AnchorModel:
 
 def camera_above(x: float, y: float, altitude: float = 4.0, tilt_deg: float = 0.0, yaw_deg: float = 0.0) -> Camera:
     pose = look_down(np.array([x, y, altitude]), tilt_deg, yaw_deg)
-    return Camera(pose, 60.0, 60.0, 32.0, 24.0, 64, 48)
+    return Camera(camera_from_world=pose, fx=60.0, fy=60.0, cx=32.0, cy=24.0, width=64, height=48)

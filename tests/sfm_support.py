@@ -53,7 +53,11 @@ def grid(strips: int, each: int, step: float) -> list[Camera]:
             place = np.array([step * along, step * (strip - (strips - 1) / 2), ALTITUDE_M + rng.normal(0, 0.5)])
             heading = np.pi / 2 if strip % 2 == 0 else -np.pi / 2
             pose = look_from(place, np.radians(rng.normal(0, 2)), heading, np.radians(rng.normal(0, 1)))
-            cameras.append(Camera(pose, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT))
+            cameras.append(
+                Camera(
+                    camera_from_world=pose, fx=FOCAL, fy=FOCAL, cx=WIDTH / 2, cy=HEIGHT / 2, width=WIDTH, height=HEIGHT
+                )
+            )
     return cameras
 
 
@@ -79,7 +83,9 @@ def folders_of_steps(flight: Flight, folder: Path) -> dict[str, Path]:
     with pytest.MonkeyPatch.context() as patch:
         for step, name in (("matching", "_matches"), ("mapping", "_models"), ("writing", "_write")):
             patch.setattr(reconstructing, name, _after_copying(getattr(reconstructing, name), output, folder / step))
-        reconstructing.reconstruct(SfmRequest((flight.folder,), output, threads=1), Console(file=io.StringIO()))
+        reconstructing.reconstruct(
+            SfmRequest(photographs=(flight.folder,), output=output, threads=1), Console(file=io.StringIO())
+        )
     return {step: folder / step for step in ("matching", "mapping", "writing")}
 
 

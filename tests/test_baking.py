@@ -156,7 +156,11 @@ def steep(model: AnchorModel) -> AnchorModel:
 
 
 def on_disk(seen: Survey, kept: np.ndarray, folder: Path, degree: int = 3) -> Baked:
-    return Baked(seen.model, kept, spooled(Scene(bake(seen, kept, degree), len(kept), degree), folder / "spool"))
+    return Baked(
+        seen.model,
+        kept,
+        spooled(Scene(chunks=bake(seen, kept, degree), count=len(kept), degree=degree), folder / "spool"),
+    )
 
 
 def error(shown: Baked, views: Sequence[Camera]) -> float:

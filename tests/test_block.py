@@ -139,8 +139,9 @@ def test_one_block_without_surroundings_is_plain_training():
         (Surroundings(anchors.select(around), decoder), holds(whole, 0, BlockConfig())),
     ):
         stage = Stage(
-            CONFIG, Photographs(), 8, 0.4, 5.0, frozen_decoder=True, surroundings=surroundings, may_hold=may_hold
-        )
+            config=CONFIG, images=Photographs(), image_count=8, voxel=0.4, camera_height=5.0, frozen_decoder=True,
+            surroundings=surroundings, may_hold=may_hold,
+        )  # fmt: skip
         copied = anchors.select(torch.arange(len(anchors)))
         states.append(finish(stage, start_state(copied, decoder, stage)))
     assert rows_of(states[0].anchors) == rows_of(states[1].anchors)
@@ -170,7 +171,13 @@ def test_compensation_that_adds_nothing_is_plain_growth_bit_for_bit(change):
 
 
 def test_a_cycle_lasts_from_decision_to_decision():
-    stage = Stage(replace(CONFIG, growth=GrowthConfig(interval=3, statistics_from=0, start=6)), Photographs(), 8, 1, 1)
+    stage = Stage(
+        config=replace(CONFIG, growth=GrowthConfig(interval=3, statistics_from=0, start=6)),
+        images=Photographs(),
+        image_count=8,
+        voxel=1,
+        camera_height=1,
+    )
     assert len(views_in_cycle(6, stage)) == 6  # the first cycle counts since the statistics began
     late = replace(stage, config=replace(CONFIG, growth=GrowthConfig(interval=3, statistics_from=4, start=6)))
     assert len(views_in_cycle(6, late)) == 2  # the statistics began after the cycle would have

@@ -37,7 +37,16 @@ def views_of(scene: TinyScene) -> list[View]:
         numbers = np.flatnonzero(camera.sees(scene.points))
         pixels, _ = camera.project(scene.points[numbers])
         rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        views.append(View(name, camera, Path(name), None, "train", Sightings(scene.points[numbers], rays, numbers)))
+        views.append(
+            View(
+                name=name,
+                camera=camera,
+                image_path=Path(name),
+                mask_path=None,
+                split="train",
+                sightings=Sightings(scene.points[numbers], rays, numbers),
+            )
+        )
     return views
 
 

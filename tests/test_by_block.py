@@ -37,7 +37,16 @@ CAMERAS = [
     camera_above(0.3, -0.2),
     camera_above(-1.0, 0.5, tilt_deg=25, yaw_deg=40),
     camera_above(0.0, 1.0, tilt_deg=70, yaw_deg=200),  # the horizon is in sight
-    Camera(camera_above(0.2, 0.1).camera_from_world, 9.0, 11.0, 30.0, 25.0, 64, 48, "orthographic"),
+    Camera(
+        camera_from_world=camera_above(0.2, 0.1).camera_from_world,
+        fx=9.0,
+        fy=11.0,
+        cx=30.0,
+        cy=25.0,
+        width=64,
+        height=48,
+        model="orthographic",
+    ),
 ]
 
 
@@ -234,7 +243,10 @@ class Plane:
     """Test views of the textured plane; the merged render has an error along the borders, block 3 was not trained."""
 
     def __init__(self, cameras: list[Camera]) -> None:
-        self.views = [View(f"{i}.png", each, Path(f"{i}.png"), None, "test") for i, each in enumerate(cameras)]
+        self.views = [
+            View(name=f"{i}.png", camera=each, image_path=Path(f"{i}.png"), mask_path=None, split="test")
+            for i, each in enumerate(cameras)
+        ]
         self.asked: list[int] = []
         self.rng = np.random.default_rng(0)
 
@@ -259,7 +271,10 @@ class Plane:
 
     def evaluate(self, output: Path, mask: np.ndarray | None = None, **more) -> dict:
         photographs = ReferenceViews(self.views, self.load_image, lambda _: mask)
-        inputs = BlockInputs(photographs, self.coarse, self.merged, self.block, quadrants(), **more)
+        inputs = BlockInputs(
+            photographs=photographs, render_coarse=self.coarse, render_merged=self.merged, render_block=self.block,
+            blocks=quadrants(), **more,
+        )  # fmt: skip
         return evaluate_blocks(inputs, output)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,10 +30,14 @@ def random_rotation(generator: np.random.Generator) -> np.ndarray:
 
 def source_of(scene) -> SourceCapture:
     views = tuple(
-        SourceView(name, camera.camera_from_world, Intrinsics("PINHOLE", (50.0, 50.0, 32.0, 24.0), 64, 48))
+        SourceView(
+            name=name,
+            camera_from_world=camera.camera_from_world,
+            intrinsics=Intrinsics("PINHOLE", (50.0, 50.0, 32.0, 24.0), 64, 48),
+        )
         for name, camera in scene.cameras.items()
     )
-    return SourceCapture("colmap", "images", views, scene.points, scene.colours)
+    return SourceCapture(source="colmap", images="images", views=views, points=scene.points, colours=scene.colours)
 
 
 def ground_of(scene, tmp_path, **options):
@@ -148,7 +153,7 @@ def test_gps_along_one_line_falls_back_to_the_estimate(tmp_path):
     for name, camera in truth.cameras.items():
         pose = camera.camera_from_world.copy()
         pose[:3, 3] = -pose[:3, :3] @ np.array([camera.position[0], 0.0, 10.0])
-        truth.cameras[name] = type(camera)(pose, camera.fx, camera.fy, camera.cx, camera.cy, 64, 48)
+        truth.cameras[name] = replace(camera, camera_from_world=pose, width=64, height=48)
     frame, warnings = ground_of(truth, tmp_path, gps=write_gps(tmp_path / "gps.csv", truth))
     assert not frame.metric
     assert any("along one line" in warning for warning in warnings)
@@ -285,10 +290,19 @@ def test_on_real_flights_the_estimate_agrees_with_the_georeference(name, degrees
     capture = load_capture(folder, CaptureOptions(images="images_4"))
     assert capture.ground.metric
     source = SourceCapture(
-        "colmap", "images_4",
-        tuple(SourceView(v.name, v.camera.camera_from_world, Intrinsics("PINHOLE", (1.0,) * 4, 1, 1)) for v
-        in capture.views), capture.points, capture.point_colours,
-    )  # fmt: skip
+        source="colmap",
+        images="images_4",
+        views=tuple(
+            SourceView(
+                name=v.name,
+                camera_from_world=v.camera.camera_from_world,
+                intrinsics=Intrinsics("PINHOLE", (1.0,) * 4, 1, 1),
+            )
+            for v in capture.views
+        ),
+        points=capture.points,
+        colours=capture.point_colours,
+    )
     frame, _ = find_ground_frame(source, folder / "sparse", CaptureOptions())
     assert np.degrees(np.arccos(frame.rotation[2, 2])) < degrees
 

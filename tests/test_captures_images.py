@@ -26,7 +26,15 @@ def picture(seed: int = 0) -> np.ndarray:
 
 
 def make_view(path: Path, mask: Path | None = None, width: int = WIDTH, height: int = HEIGHT) -> View:
-    return View(path.name, Camera(np.eye(4), 50.0, 50.0, width / 2, height / 2, width, height), path, mask, "train")
+    return View(
+        name=path.name,
+        camera=Camera(
+            camera_from_world=np.eye(4), fx=50.0, fy=50.0, cx=width / 2, cy=height / 2, width=width, height=height
+        ),
+        image_path=path,
+        mask_path=mask,
+        split="train",
+    )
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import tracemalloc
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -100,7 +101,11 @@ def test_sizes_that_any_resizer_makes_are_accepted(tmp_path_factory, width, heig
     """Floor, ceil and round of an even division all fit; the camera covers the same field of view."""
     rounding = -1 if up_rounded else 1
     w, h = (rounding * (rounding * side // factor) for side in (width, height))
-    view = SourceView("a.png", np.eye(4), Intrinsics("PINHOLE", (width, width, width / 2, height / 2), width, height))
+    view = SourceView(
+        name="a.png",
+        camera_from_world=np.eye(4),
+        intrinsics=Intrinsics("PINHOLE", (width, width, width / 2, height / 2), width, height),
+    )
     path = tmp_path_factory.mktemp("sizes") / "a.bmp"
     header = b"BM" + bytes(12) + (40).to_bytes(4, "little") + w.to_bytes(4, "little") + h.to_bytes(4, "little")
     path.write_bytes(header + (1).to_bytes(2, "little") + (24).to_bytes(2, "little") + bytes(24))
@@ -380,7 +385,7 @@ def test_undistorting_gives_the_pinhole_picture(tmp_path, model, extra):
         lens = pycolmap.Camera(model=model, width=160, height=120, params=list(params))
         x, y = np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5)
         rays = np.asarray(lens.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1)))
-        wide = type(camera)(camera.camera_from_world, camera.fx, camera.fy, 160.0, 120.0, 320, 240)
+        wide = replace(camera, cx=160.0, cy=120.0, width=320, height=240)
         grid = (rays * [camera.fx, camera.fy] + [160.0, 120.0] - 0.5).astype(np.float32).reshape(120, 160, 2)
         bent = cv2.remap(render_plane(wide), grid[..., 0], grid[..., 1], cv2.INTER_CUBIC)
         cv2.imwrite(str(tmp_path / "images" / name), bent[:, :, ::-1])
@@ -391,10 +396,7 @@ def test_undistorting_gives_the_pinhole_picture(tmp_path, model, extra):
     capture = load_capture(tmp_path, up(undistort=True))
     assert any("undistorted into" in warning for warning in capture.warnings)
     for view in capture.views:
-        truth = type(view.camera)(
-            scene.cameras[view.name].camera_from_world, view.camera.fx, view.camera.fy, view.camera.cx,
-            view.camera.cy, view.camera.width, view.camera.height,
-        )  # fmt: skip
+        truth = replace(view.camera, camera_from_world=scene.cameras[view.name].camera_from_world)
         straight = decode_photograph(view.image_path)[0].astype(float)
         assert np.abs(straight - render_plane(truth)).mean() < 3.0
     mask = load_picture(capture.views[2]).mask

@@ -75,7 +75,7 @@ def test_a_run_leaves_what_the_documents_say(unbroken):
     assert log[-1]["loss"] < 0.5 * log[0]["loss"]
     status = json.loads((unbroken / "coarse/status.json").read_text())
     assert status["state"] == "done"
-    assert AnchorModel.load(unbroken / "coarse/model.safetensors").facts["iterations"] == 200
+    assert AnchorModel.load(unbroken / "coarse/model.safetensors").metadata.iterations == 200
 
 
 def test_what_stereo_found_is_kept_and_looked_for_once(tmp_path):

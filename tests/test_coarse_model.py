@@ -15,6 +15,7 @@ from pretended_device import CARD, pretended_card
 from vdgs.captures.capture import Capture
 from vdgs.captures.facts import capture_facts
 from vdgs.errors import RunError
+from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.runs.beginning import begin_run
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
@@ -49,14 +50,14 @@ def train(run: RunFolder, capture: Capture) -> None:
     train_coarse(RunContext(run, capture), WatchOptions(), QUIET)
 
 
-def finished(run: RunFolder, capture: Capture, model: object) -> None:
+def finished(run: RunFolder, capture: Capture, model: AnchorModel) -> None:
     """A coarse stage that is done with a model."""
     write_json(run.capture_file, capture_facts(capture))
     run.coarse.discard_unless(run.keys().coarse)
-    model.facts.update({"key": run.keys().coarse, "capture": capture_facts(capture)})  # type: ignore[attr-defined]
-    model.save(run.coarse.model)  # type: ignore[attr-defined]
-    count = len(model.anchors)  # type: ignore[attr-defined]
-    run.coarse.set_status(Status("done", iteration=6, anchors=count, model=identity(run.coarse.model)))
+    metadata = ModelMetadata(key=run.keys().coarse, capture=capture_facts(capture))
+    replace(model, metadata=metadata).save(run.coarse.model)
+    count = len(model.anchors)
+    run.coarse.set_status(Status(state="done", iteration=6, anchors=count, model=identity(run.coarse.model)))
 
 
 def test_training_that_leaves_no_anchors_is_not_done_and_says_what_to_change(tmp_path):

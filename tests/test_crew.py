@@ -79,7 +79,7 @@ class Heard(Lines):
 
 def run(folder: Path, engine: Scripted, task: Task | None = None, retries: int = 2):
     heard = Heard()
-    task = task or Task("block 00", ["train"], folder / "output.log", needs=Needs(1, 4 * GB))
+    task = task or Task(name="block 00", command=["train"], output=folder / "output.log", needs=Needs(1, 4 * GB))
     (outcome,) = run_crew([task], engine, Policy(1, retries, 1e-6), heard)
     return outcome, heard.lines
 
@@ -110,10 +110,10 @@ def test_a_time_limit_costs_no_attempt_as_long_as_the_task_gets_further(tmp_path
 
     class Further(Scripted):
         def start(self, tasks):
-            folder.set_status(Status("running", iteration=10 * min(len(self.asked) + 1, 6)))
+            folder.set_status(Status(state="running", iteration=10 * min(len(self.asked) + 1, 6)))
             return super().start(tasks)
 
-    task = Task("block 00", ["train"], tmp_path / "output.log", folder=folder.path)
+    task = Task(name="block 00", command=["train"], output=tmp_path / "output.log", folder=folder.path)
     engine = Further([SAVED] * 5 + [End(0)])
     outcome, lines = run(tmp_path, engine, task, retries=0)
     assert (outcome.state, outcome.attempts) == ("done", 1)
@@ -147,7 +147,7 @@ places = st.lists(st.builds(Place, st.integers(1, 64), st.integers(GB, 10**12)),
 
 @given(places, st.integers(1, 40), st.integers(0, 8), st.integers(10**8, 10**11))
 def test_blocks_find_room_on_a_cluster(places, blocks, jobs, each):
-    share = on_cluster(Work(blocks, each, jobs), places, ExecutorOptions("ray"))
+    share = on_cluster(Work(pieces=blocks, piece_bytes=each, jobs=jobs), places, ExecutorOptions(executor="ray"))
     needs, most = share.needs, max(place.memory_bytes for place in places)
     assert share.at_once == min(blocks, jobs or blocks)
     assert 1 <= needs.processors <= max(place.processors for place in places)
@@ -173,26 +173,26 @@ def test_blocks_at_once_and_their_photographs_fit_into_one_machine(work, cores, 
 
 def test_large_photographs_leave_room_for_fewer_blocks():
     """Photographs of 20 MP: 3 GB for the picture of a block and 16 GB for those that are kept."""
-    large = Work(32, 3_800_000_000, photographs_bytes=10**11)
+    large = Work(pieces=32, piece_bytes=3_800_000_000, photographs_bytes=10**11)
     share = on_this_machine(large, 32, 64 * GB)
     assert (share.at_once, share.image_gb) == (12, 16 / 12)
     assert on_this_machine(replace(large, image_gb=40), 32, 64 * GB).at_once == 6
     # Small ones need no quarter of the memory.
-    small = Work(32, 2 * GB, photographs_bytes=10**7)
+    small = Work(pieces=32, piece_bytes=2 * GB, photographs_bytes=10**7)
     assert on_this_machine(small, 32, 64 * GB).at_once == 31
 
 
 def test_two_small_blocks_fit_into_a_laptop_with_4_gb_free():
     """`make demo`: 56 photographs of 400 x 300 pixels, four blocks; with more anchors than it has."""
-    cameras = [Camera(np.eye(4), 1, 1, 0, 0, 400, 300)] * 56
+    cameras = [Camera(camera_from_world=np.eye(4), fx=1, fy=1, cx=0, cy=0, width=400, height=300)] * 56
     largest = need_of_block(PRESETS["laptop"], 100_000, 200_000, 400 * 300)
-    work = Work(4, estimate(largest).total, photographs_bytes=decoded_bytes(cameras))
+    work = Work(pieces=4, piece_bytes=estimate(largest).total, photographs_bytes=decoded_bytes(cameras))
     assert on_this_machine(work, 2, 4 * GB).at_once == 2
     assert not exceeds(work, 2, 4 * GB)
 
 
 def test_photographs_give_way_to_blocks_that_a_person_asked_for():
-    work = Work(4, 3 * GB, jobs=2, photographs_bytes=10**11)
+    work = Work(pieces=4, piece_bytes=3 * GB, jobs=2, photographs_bytes=10**11)
     assert on_this_machine(work, 4, 7 * GB).image_gb == 0.5
     assert on_this_machine(work, 4, 6 * GB).image_gb == 0.1
     assert [exceeds(work, 2, free) for free in (6 * GB, 7 * GB)] == [True, False]
@@ -200,7 +200,7 @@ def test_photographs_give_way_to_blocks_that_a_person_asked_for():
 
 
 def test_people_are_told_what_blocks_and_their_photographs_take(question):
-    work = Work(4, 2 * GB, photographs_bytes=10**11)
+    work = Work(pieces=4, piece_bytes=2 * GB, photographs_bytes=10**11)
     with choose(ExecutorOptions(), work, Machine(4, 8 * GB), lambda: question) as chosen:
         assert "a block takes at most 2.00 GB and 667 MB for photographs, of 8.00 GB free" in chosen.line
         assert chosen.line.startswith("3 at once")
@@ -210,20 +210,28 @@ def test_people_are_told_what_blocks_and_their_photographs_take(question):
 
 
 def test_what_a_person_asks_for_is_asked_of_the_cluster():
-    asked = ExecutorOptions("ray", processors=3, memory_gb=5, gpus=0.5)
-    for share in (on_cluster(Work(4, GB), [Place(8, 64 * GB)], asked), by_queue(Work(4, GB), asked)):
+    asked = ExecutorOptions(executor="ray", processors=3, memory_gb=5, gpus=0.5)
+    for share in (
+        on_cluster(Work(pieces=4, piece_bytes=GB), [Place(8, 64 * GB)], asked),
+        by_queue(Work(pieces=4, piece_bytes=GB), asked),
+    ):
         assert share.needs == Needs(3, 5 * GB, 0.5)
-    assert on_cluster(Work(4, GB, image_gb=2), [Place(8, 64 * GB)], ExecutorOptions("ray")).image_gb == 2
-    assert on_this_machine(Work(8, 2 * GB, image_gb=4), 2, 8 * GB).image_gb == 2
+    assert (
+        on_cluster(
+            Work(pieces=4, piece_bytes=GB, image_gb=2), [Place(8, 64 * GB)], ExecutorOptions(executor="ray")
+        ).image_gb
+        == 2
+    )
+    assert on_this_machine(Work(pieces=8, piece_bytes=2 * GB, image_gb=4), 2, 8 * GB).image_gb == 2
 
 
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        (ExecutorOptions("slurm", gpus=0.5), "SLURM gives whole GPUs"),
-        (ExecutorOptions("local", address="auto"), "add --executor ray"),
-        (ExecutorOptions("ray", address="ray://head:10001"), "on one of its machines"),
-        (ExecutorOptions("slurm", slurm=SlurmOptions(grace_seconds=0)), "--slurm.grace-seconds 0"),
+        (ExecutorOptions(executor="slurm", gpus=0.5), "SLURM gives whole GPUs"),
+        (ExecutorOptions(executor="local", address="auto"), "add --executor ray"),
+        (ExecutorOptions(executor="ray", address="ray://head:10001"), "on one of its machines"),
+        (ExecutorOptions(executor="slurm", slurm=SlurmOptions(grace_seconds=0)), "--slurm.grace-seconds 0"),
     ],
 )
 def test_options_that_do_not_fit_together_are_refused(asked, said):
@@ -294,5 +302,5 @@ def test_of_many_photographs_some_are_looked_for(question):
 
 
 def test_listeners_need_not_listen():
-    listener, task = Listener(), Task("a", ["b"], Path("c"))
+    listener, task = Listener(), Task(name="a", command=["b"], output=Path("c"))
     assert listener.placed(task, "node", False) is listener.paused(task, "") is None

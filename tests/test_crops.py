@@ -111,7 +111,7 @@ def model_and_own() -> tuple[AnchorModel, torch.Tensor]:
     anchors, decoder = coarse()
     anchors = replace(anchors, log_scales=torch.full_like(anchors.log_scales, -1.0))
     own, _ = split_anchors(anchors, BLOCKS, 0, BlockConfig())
-    return AnchorModel(anchors, decoder, 0.4, (0.0, 0.0, 0.0), {}), own
+    return AnchorModel(anchors=anchors, decoder=decoder, voxel=0.4, background=(0.0, 0.0, 0.0)), own
 
 
 def test_parts_hold_nearly_all_that_shows_the_block_and_little_else():

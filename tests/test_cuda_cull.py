@@ -30,7 +30,7 @@ def library(tmp_path_factory):
 def kept(
     positions: torch.Tensor, log_scales: torch.Tensor, camera: Camera, library: ctypes.CDLL, order: int = 0
 ) -> torch.Tensor:
-    program = Program(PROGRAM.name, HostDriver(library, order), PROGRAM.headers)
+    program = Program(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
     return cull(positions, log_scales, camera, program=program)
 
 

@@ -42,7 +42,7 @@ def library(tmp_path_factory):
 
 
 def decoded(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order: int = 0) -> AnchorSplats:
-    program = Program(PROGRAM.name, HostDriver(library, order), PROGRAM.headers)
+    program = Program(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
     anchors = scene.positions, scene.features, scene.offsets, scene.log_scales
     with torch.no_grad():
         return decode(*anchors, scene.weights, camera, rows, program=program)
@@ -50,14 +50,14 @@ def decoded(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order
 
 def scattered(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order: int = 0) -> TrainingSplats:
     """As a training step is given them."""
-    program = Program(PROGRAM.name, HostDriver(library, order), PROGRAM.headers)
+    program = Program(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
     return decode_to_train(*scene.arguments, camera, rows, program=program)
 
 
 def put_in_order(splats: TrainingSplats, library: ctypes.CDLL) -> dict[str, torch.Tensor]:
     """All that is known of each splat, in the order of the anchors."""
     order = splats.runs.order(len(splats.source))
-    program = Program(PROGRAM.name, HostDriver(library), PROGRAM.headers)
+    program = Program(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers)
     named = {field.name: getattr(splats, field.name) for field in fields(Splats)}
     named["source"] = sources_of(splats.source, program=program)
     return {name: tensor[order] for name, tensor in named.items()}
@@ -128,7 +128,9 @@ def test_for_training_splats_are_the_same_in_another_order(order, library):
     splats, expected = scattered(scene, turned(), library, rows, order), decoded(scene, turned(), library, rows)
     found = put_in_order(splats, library)
     assert all(torch.equal(tensor, getattr(expected, name)) for name, tensor in found.items())
-    in_rows = sources_of(splats.source, program=Program(PROGRAM.name, HostDriver(library), PROGRAM.headers))
+    in_rows = sources_of(
+        splats.source, program=Program(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers)
+    )
     assert torch.equal(in_rows, expected.source) is (order == 0)  # other orders of blocks do give another one
     torch.testing.assert_close(splats.volume, expected.volumes.mean())
     assert torch.equal(splats.volume, scattered(scene, turned(), library, rows).volume)
@@ -173,7 +175,7 @@ class Watched(Program):
 @pytest.mark.parametrize("order", ORDERS)
 def test_where_there_is_too_little_room_they_are_decoded_once_more(order, library):
     scene = Scene.random(40, 10)
-    program = Watched(PROGRAM.name, HostDriver(library, order), PROGRAM.headers)
+    program = Watched(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
     with torch.no_grad():
         found = decode(*scene.arguments, turned(), program=program, room=Narrow())
     assert [name for name, *_ in program.driver.launched] == ["decode_anchors"] * 2
@@ -209,7 +211,7 @@ def test_barriers_that_are_missing_are_noticed(tmp_path):
 @needs_a_compiler
 def test_where_autograd_follows_the_reference_decodes(library):
     scene = Scene.random(10, 4).to(torch.float32)
-    program = Program(PROGRAM.name, HostDriver(library), PROGRAM.headers)
+    program = Program(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers)
     anchors = scene.positions, scene.features, scene.offsets, scene.log_scales
     splats = decode(*anchors, scene.weights, turned(), program=program)
     assert splats.opacities.requires_grad
@@ -257,8 +259,9 @@ def moved_by(
     g = torch.Generator().manual_seed(8)
     m = len(splats.source)
     gradients = SplatGradients(
-        0.1 * torch.randn(m, 2, generator=g), torch.randn(m, 3, generator=g), torch.randn(m, 3, generator=g),
-        torch.randn(m, generator=g), 0.3, splats.source, splats.colours, splats.opacities,
+        means_px=0.1 * torch.randn(m, 2, generator=g), conics=torch.randn(m, 3, generator=g),
+        colours=torch.randn(m, 3, generator=g), opacities=torch.randn(m, generator=g), volume=0.3, source=splats.source,
+        colour_values=splats.colours, opacity_values=splats.opacities,
     )  # fmt: skip
     if spoil:
         gradients.means_px[0] = torch.nan
@@ -292,7 +295,10 @@ def elsewhere(gradients: SplatGradients, shown: Shown) -> SplatGradients:
 class TestMoving:
     @pytest.fixture
     def moving(self, library):
-        return partial(decode_backward_adam, program=Program(PROGRAM.name, HostDriver(library), PROGRAM.headers))
+        return partial(
+            decode_backward_adam,
+            program=Program(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers),
+        )
 
     @pytest.mark.parametrize("name", CAMERAS)
     @pytest.mark.parametrize(("k", "with_distance"), [(10, False), (3, True)])
@@ -362,7 +368,7 @@ class TestMoving:
     def test_the_order_in_which_threads_take_turns_changes_no_bit(self, order, library):
         results = []
         for turns in (0, order):
-            program = Program(PROGRAM.name, HostDriver(library, turns), PROGRAM.headers)
+            program = Program(name=PROGRAM.name, driver=HostDriver(library, turns), headers=PROGRAM.headers)
             moving = partial(decode_backward_adam, program=program)
             results.append(moved_by(moving, Scene.random(17, 10), turned(), torch.arange(17)))
         assert all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
@@ -374,7 +380,7 @@ class TestMoving:
         without = build_on_host(PROGRAM.name, tmp_path, before + after)
         scene, results = Scene.random(9, 4), []
         for turns in (0, 1):
-            program = Program(PROGRAM.name, HostDriver(without, turns), PROGRAM.headers)
+            program = Program(name=PROGRAM.name, driver=HostDriver(without, turns), headers=PROGRAM.headers)
             results.append(moved_by(partial(decode_backward_adam, program=program), scene, turned(), torch.arange(9)))
         assert not all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
 
@@ -383,14 +389,8 @@ class TestMoving:
         states = [AdamState(t, t, t, 0.1, early) for t, early in zip(scene.trainable[:3], (1.0, 2.0, 1.0), strict=True)]
         nothing = torch.zeros(0)
         none = SplatGradients(
-            torch.zeros(0, 2),
-            torch.zeros(0, 3),
-            torch.zeros(0, 3),
-            nothing,
-            0.0,
-            nothing.int(),
-            torch.zeros(0, 3),
-            nothing,
-        )
+            means_px=torch.zeros(0, 2), conics=torch.zeros(0, 3), colours=torch.zeros(0, 3), opacities=nothing,
+            volume=0.0, source=nothing.int(), colour_values=torch.zeros(0, 3), opacity_values=nothing,
+        )  # fmt: skip
         with pytest.raises(ValueError, match="annealed alike"):
             moving(scene.positions, states, scene.weights, turned(), torch.arange(4), none, torch.zeros(4).int())

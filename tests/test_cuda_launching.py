@@ -203,9 +203,9 @@ class TestChecks:
     )
     def test_sides_out_of_range(self, grid, block):
         with pytest.raises(ValueError, match="cannot be launched"):
-            Program("loss.cu", driver=Counting()).launch("kernel", grid, block, torch.zeros(1))
+            Program(name="loss.cu", driver=Counting()).launch("kernel", grid, block, torch.zeros(1))
 
     def test_an_empty_grid_is_nothing_to_do(self):
         driver = Counting()
-        Program("loss.cu", driver=driver).launch("kernel", (0, 3), (32,), torch.zeros(1))
+        Program(name="loss.cu", driver=driver).launch("kernel", (0, 3), (32,), torch.zeros(1))
         assert driver.launched == 0

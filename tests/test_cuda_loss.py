@@ -40,7 +40,7 @@ def numbered(tmp_path_factory):
 
 @pytest.fixture
 def program(library):
-    return Program("loss.cu", driver=HostDriver(library))
+    return Program(name="loss.cu", driver=HostDriver(library))
 
 
 def on_host(program: Program, image, target, mask=None, **options):
@@ -75,7 +75,7 @@ def test_no_barrier_is_missing(program, library):
     """The order in which the threads of a block take turns changes no bit."""
     image, target, mask = scene(40, 35, kept=0.8)
     result, gradient = on_host(program, image, target, mask)
-    turned = Program("loss.cu", driver=HostDriver(library, order=1))
+    turned = Program(name="loss.cu", driver=HostDriver(library, order=1))
     again, gradient_again = on_host(turned, image, target, mask)
     assert torch.equal(gradient, gradient_again)
     assert [float(value.detach()) for value in result] == [float(value.detach()) for value in again]
@@ -90,7 +90,7 @@ def test_a_missing_barrier_would_be_noticed(barrier, numbered):
 
     def loss_and_gradient(left: int, order: int) -> tuple[float, bytes]:
         left_out.value = left
-        result, gradient = on_host(Program("loss.cu", driver=HostDriver(numbered, order)), image, target)
+        result, gradient = on_host(Program(name="loss.cu", driver=HostDriver(numbered, order)), image, target)
         return float(result.loss.detach()), gradient.numpy().tobytes()
 
     assert loss_and_gradient(barrier, 0) != loss_and_gradient(barrier, 1)

@@ -60,7 +60,7 @@ int maybe_syncthreads_or(int number, int mine) { return number == left_out ? min
 
 
 def drawn(scene: Scene, library: ctypes.CDLL, order: int = 0, depth: bool = True) -> Raster:
-    program = Program("rasterise.cu", HostDriver(library, order), PROGRAM.headers)
+    program = Program(name="rasterise.cu", driver=HostDriver(library, order), headers=PROGRAM.headers)
     return rasterise(*splats_of(scene.tensors), scene.width, scene.height, depth=depth, program=program)
 
 
@@ -96,7 +96,7 @@ def test_no_barrier_is_missing(order, library):
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_wherever_splats_stand_picture_and_gradients_have_the_same_bits(seed, library):
     """Where depths are equal, the order that splats are given with decides."""
-    program = Program("rasterise.cu", HostDriver(library), PROGRAM.headers)
+    program = Program(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers)
     scene = SCENES["ordinary"]
     splats, background = splats_of(scene.tensors)
     level = replace(splats, depths=(splats.depths / 40).floor() + 1)
@@ -185,7 +185,10 @@ class TestMeaning:
         assert_close(drawn(scene, library, depth=False).image, exact.image, 1e-5)
 
     def test_the_way_back_overwrites_what_it_may(self, library):
-        scene, program = SCENES["ordinary"], Program("rasterise.cu", HostDriver(library), PROGRAM.headers)
+        scene, program = (
+            SCENES["ordinary"],
+            Program(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers),
+        )
         splats, background = splats_of([tensor.detach().clone() for tensor in scene.tensors])
         by_alpha = torch.randn(scene.height, scene.width, generator=torch.Generator().manual_seed(0))
         expected = rasterise_vjp(splats, background, scene.width, scene.height, program=program)[1](None, by_alpha)
@@ -198,7 +201,7 @@ class TestMeaning:
 
     @pytest.mark.parametrize("name", SCENES)
     def test_gradients_of_the_first_splats_alone_have_the_bits_that_they_have_among_all(self, name, library):
-        scene, program = SCENES[name], Program("rasterise.cu", HostDriver(library), PROGRAM.headers)
+        scene, program = SCENES[name], Program(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers)
         size, (splats, background) = (scene.width, scene.height), splats_of([each.detach() for each in scene.tensors])
         assert_first_gradients_are_those_of_all(
             lambda: rasterise_vjp(splats, background, *size, program=program)[1], len(splats.depths), *size
@@ -206,7 +209,7 @@ class TestMeaning:
 
     def test_unsuitable_tensors_are_refused(self, library):
         splats, background = splats_of(SCENES["ordinary"].to(torch.float64).tensors)
-        program = Program("rasterise.cu", HostDriver(library), PROGRAM.headers)
+        program = Program(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers)
         with pytest.raises(TypeError, match="float32"):
             rasterise(splats, background, 37, 29, program=program)
         with pytest.raises(ValueError, match="width"):

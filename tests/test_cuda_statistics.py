@@ -28,7 +28,10 @@ def library(tmp_path_factory):
 
 
 def on_host(library: ctypes.CDLL, order: int = 0):
-    return partial(add_view_statistics, program=Program(PROGRAM.name, HostDriver(library, order), PROGRAM.headers))
+    return partial(
+        add_view_statistics,
+        program=Program(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers),
+    )
 
 
 def added(add, inputs, sums, views: int = 2) -> list[torch.Tensor]:

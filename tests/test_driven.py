@@ -69,7 +69,7 @@ def run(place: Path, tmp_path: Path) -> RunFolder:
     for stage in (run.coarse, run.block(0)):
         stage.discard_unless(run.keys().coarse if stage == run.coarse else run.keys().blocks)
         stage.model.write_bytes(b"a model")
-        stage.set_status(Status("done", iteration=3000, model="7-any"))
+        stage.set_status(Status(state="done", iteration=3000, model="7-any"))
     return run
 
 
@@ -154,7 +154,9 @@ def test_photographs_are_not_made_a_capture_under_a_run_that_is_driven(tmp_path)
     for k in range(6):
         place = np.array([10.0 * (k % 3), 12.0 * (k // 3), 40.0 + k % 2])
         write_photograph(photographs / f"p{k}.jpg", np.roll(noise, k, axis=0), k, place)
-    request = RunRequest(photographs, run.path, "laptop", threads=1, training=PRESETS["laptop"].training)
+    request = RunRequest(
+        capture=photographs, output=run.path, preset="laptop", threads=1, training=PRESETS["laptop"].training
+    )
     with driven_elsewhere(run), pytest.raises(RunError, match=AT_WORK):
         with_capture(request, Console(file=io.StringIO()))
     assert not run.own_capture.exists()

@@ -64,7 +64,7 @@ def read(path: Path):
 
 def test_what_is_written_is_what_was_measured(city: City, tmp_path: Path):
     facts = ModelFacts(n_anchors=1234, model_bytes=10**6)
-    model = MeasuredModel(city.render, city.visibility, facts)
+    model = MeasuredModel(render=city.render, visibility_map=city.visibility, facts=facts)
     result = evaluate(city.taken, model, tmp_path, lpips_note="LPIPS is null: no weights.")
     assert result == read(tmp_path / "metrics.json")
     rows = read(tmp_path / "per_view.json")
@@ -86,7 +86,7 @@ def test_what_is_written_is_what_was_measured(city: City, tmp_path: Path):
 
 
 def test_quality_by_visibility(city: City, tmp_path: Path):
-    result = evaluate(city.taken, MeasuredModel(city.render, city.visibility), tmp_path)
+    result = evaluate(city.taken, MeasuredModel(render=city.render, visibility_map=city.visibility), tmp_path)
     empty, *bins = result["by_visibility"]
     assert empty["lower"] is None
     assert empty["pixels"] == 4 * 2 * 64
@@ -102,7 +102,7 @@ def test_quality_by_visibility(city: City, tmp_path: Path):
 
 def test_the_same_twice(city: City, tmp_path: Path):
     for folder in ("one", "two"):
-        evaluate(city.taken, MeasuredModel(city.render, city.visibility), tmp_path / folder)
+        evaluate(city.taken, MeasuredModel(render=city.render, visibility_map=city.visibility), tmp_path / folder)
     one, two = (read(tmp_path / folder / "metrics.json") for folder in ("one", "two"))
     assert {**one, "fps": 0} == {**two, "fps": 0}
     for file in (tmp_path / "one").rglob("*.png"):
@@ -114,7 +114,7 @@ def test_masks_are_respected(city: City, tmp_path: Path):
     mask[:, :32] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     masked = view(NAMES[0], mask=tmp_path / "mask.png")
-    result = evaluate(replace(city.taken, views=[masked]), MeasuredModel(city.render), tmp_path / "out")
+    result = evaluate(replace(city.taken, views=[masked]), MeasuredModel(render=city.render), tmp_path / "out")
     left = psnr(city.renders[0][:, :32], city.photographs[0][:, :32])
     assert result["psnr"] == pytest.approx(left, abs=1e-9)
     assert read(tmp_path / "out" / "per_view.json")[0]["kept_pixels"] == 48 * 32
@@ -125,7 +125,7 @@ def test_a_view_that_is_masked_entirely_leaves_the_means_alone(city: City, tmp_p
         return np.full((48, 64), which.name != NAMES[1])
 
     taken = replace(city.taken, load_mask=load_mask)
-    result = evaluate(taken, MeasuredModel(city.render), tmp_path)
+    result = evaluate(taken, MeasuredModel(render=city.render), tmp_path)
     rows = read(tmp_path / "per_view.json")
     assert rows[1]["psnr"] is rows[1]["ssim_cc"] is None
     assert result["psnr"] == pytest.approx(np.mean([rows[i]["psnr"] for i in (0, 2, 3)]))
@@ -135,7 +135,7 @@ def test_a_perfect_render_is_null_not_infinity(city: City, tmp_path: Path):
     def perfect(camera):
         return as_render(city.photographs[round(camera.camera_from_world[0, 3])])
 
-    result = evaluate(city.taken, MeasuredModel(perfect), tmp_path)
+    result = evaluate(city.taken, MeasuredModel(render=perfect), tmp_path)
     assert result["psnr"] is None
     assert result["ssim"] == pytest.approx(1.0)
 
@@ -149,12 +149,12 @@ def test_lpips_is_measured_raw_and_corrected(city: City, tmp_path: Path):
             error = float(metrics.squared_error(image, reference).mean())
             return LpipsScores(error, 2 * error)
 
-    result = evaluate(city.taken, MeasuredModel(city.render), tmp_path, lpips=Fake())
+    result = evaluate(city.taken, MeasuredModel(render=city.render), tmp_path, lpips=Fake())
     rows = read(tmp_path / "per_view.json")
     assert result["lpips_vgg_01"] == pytest.approx(2 * result["lpips_vgg"])
     assert rows[0]["lpips_vgg_cc"] == pytest.approx(10 ** (-rows[0]["psnr_cc"] / 10))
     plain = EvaluationSettings(colour_correction=False, comparisons=False, contact_views=2)
-    result = evaluate(city.taken, MeasuredModel(city.render), tmp_path / "plain", settings=plain)
+    result = evaluate(city.taken, MeasuredModel(render=city.render), tmp_path / "plain", settings=plain)
     assert result["psnr_cc"] is None
     assert not (tmp_path / "plain" / "comparisons").exists()
 
@@ -162,7 +162,7 @@ def test_lpips_is_measured_raw_and_corrected(city: City, tmp_path: Path):
 def test_the_table_shows_the_figures(city: City, tmp_path: Path):
     out = StringIO()
     result = evaluate(
-        city.taken, MeasuredModel(city.render, city.visibility), tmp_path,
+        city.taken, MeasuredModel(render=city.render, visibility_map=city.visibility), tmp_path,
         lpips_note="LPIPS is null: no weights.", console=Console(file=out, width=100),
     )  # fmt: skip
     text = out.getvalue()
@@ -179,7 +179,7 @@ def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutr
     )
     settings = EvaluationSettings(exposed="in the exposure of its neighbours")
     out = StringIO()
-    neutral = MeasuredModel(city.render, city.visibility)
+    neutral = MeasuredModel(render=city.render, visibility_map=city.visibility)
     evaluate(photographs, neutral, tmp_path / "plain", settings=settings)
     model = replace(neutral, exposure=lambda v: gains[v.name])
     evaluate(photographs, model, tmp_path / "exposed", settings=settings, console=Console(file=out, width=120))
@@ -209,7 +209,7 @@ def test_pictures_are_measured_in_the_exposure_that_the_model_knows_beside_neutr
 
 
 def test_what_cannot_be_evaluated_is_said(city: City, tmp_path: Path):
-    model = MeasuredModel(city.render)
+    model = MeasuredModel(render=city.render)
     with pytest.raises(RunError, match="no test views"):
         evaluate(replace(city.taken, views=[]), model, tmp_path)
     with pytest.raises(CaptureError, match=r"a/b.jpg is 60 x 48 pixels, its camera 64 x 48"):
@@ -219,7 +219,7 @@ def test_what_cannot_be_evaluated_is_said(city: City, tmp_path: Path):
     broken = as_render(city.renders[0])
     broken.image[3, 4, 1] = torch.nan
     with pytest.raises(TrainingDiverged, match="not finite"):
-        evaluate(city.taken, MeasuredModel(lambda camera: broken), tmp_path)
+        evaluate(city.taken, MeasuredModel(render=lambda camera: broken), tmp_path)
     assert not (tmp_path / "metrics.json").exists()
 
 
@@ -275,7 +275,7 @@ def test_on_photographs(tmp_path: Path):
         return as_render(noisy(cv2.GaussianBlur(photographs[index], (0, 0), 1.0), rng, 0.01))
 
     taken = ReferenceViews(views, lambda v: photographs[int(v.name[0])], load_mask)
-    result = evaluate(taken, MeasuredModel(render), tmp_path)
+    result = evaluate(taken, MeasuredModel(render=render), tmp_path)
     assert 20 < result["psnr"] < 40
     assert result["psnr_cc"] >= result["psnr"]
     assert 0.3 < result["ssim"] < 1

@@ -218,7 +218,13 @@ def test_a_folder_that_another_process_holds_is_waited_for(tmp_path):
 
 
 def task(root: Path, name: str, script: str, after: str | None = None) -> Task:
-    return Task(name, [sys.executable, "-S", "-c", script], root / f"{name}.log", {"WHO": name}, after=after)
+    return Task(
+        name=name,
+        command=[sys.executable, "-S", "-c", script],
+        output=root / f"{name}.log",
+        environment={"WHO": name},
+        after=after,
+    )
 
 
 def test_a_failed_task_stops_only_those_that_come_after_it(tmp_path):

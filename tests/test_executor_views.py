@@ -71,7 +71,10 @@ def test_the_table_fits_the_screen_and_keeps_what_matters():
     rows[37].started()
     rows[38].state = "failed"
     console = Console(file=io.StringIO(), width=80)
-    figures = Figures(11_200, 15_000, 24.31, 1_234_567, 5000.0, 1_400_000_000)
+    figures = Figures(
+        iteration=11_200, iterations=15_000, psnr=24.31, anchors=1_234_567, seconds_left=5000.0,
+        memory_bytes=1_400_000_000,
+    )  # fmt: skip
     rows[37].observe(figures, 0.0)
     console.print(progress_table(rows, 2, 5))
     lines = [line for line in console.file.getvalue().splitlines() if line.strip()]

@@ -21,7 +21,7 @@ def test_points_stand_where_the_map_says(tmp_path, ending):
     some = random_gaussians(500, 1, reach=800.0)
     path = tmp_path / f"a{ending}"
     chunks = iter([some.select(torch.arange(200)), some.select(torch.arange(200, 500))])
-    registry.write(path, Scene(chunks, 500, 1, Facts(ORIGIN, "EPSG:32632")))
+    registry.write(path, Scene(chunks=chunks, count=500, degree=1, facts=Facts(ORIGIN, "EPSG:32632")))
     read = laspy.read(path)
     assert len(read.points) == 500
     assert read.header.are_points_compressed == (ending == ".laz")
@@ -43,15 +43,15 @@ def test_without_a_map_coordinates_are_local(tmp_path):
 
 def test_a_wrong_map_is_refused_before_work(tmp_path):
     with pytest.raises(VdgsError, match="'EPSG:1' is not understood"):
-        registry.check(tmp_path / "a.laz", Scene([], 5, 0, Facts(crs="EPSG:1")))
+        registry.check(tmp_path / "a.laz", Scene(chunks=[], count=5, degree=0, facts=Facts(crs="EPSG:1")))
 
 
 def test_missing_packages_are_named(tmp_path, monkeypatch):
     there = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "lazrs" else there(name))
     with pytest.raises(VdgsError, match=r"needs lazrs, not installed.*pip install 'vdgs\[geo\]'"):
-        registry.check(tmp_path / "a.laz", Scene([], 5, 0))
-    registry.check(tmp_path / "a.las", Scene([], 5, 0))
+        registry.check(tmp_path / "a.laz", Scene(chunks=[], count=5, degree=0))
+    registry.check(tmp_path / "a.las", Scene(chunks=[], count=5, degree=0))
 
 
 def test_a_point_cloud_has_colours_and_opacity(tmp_path):

@@ -40,8 +40,10 @@ def independent(path: Path) -> Gaussians:
         return torch.from_numpy(np.frombuffer(data[name], np.float32).reshape(shape).copy())
 
     rest = tensor("sh", n, -1, 3) if data["sh"] else torch.zeros(n, 0, 3)
-    return Gaussians(tensor("positions", n, 3), tensor("scales", n, 3), tensor("rotations", n, 4),
-                     tensor("alphas", n), tensor("colors", n, 3), rest)  # fmt: skip
+    return Gaussians(
+        means=tensor("positions", n, 3), log_scales=tensor("scales", n, 3), quaternions=tensor("rotations", n, 4),
+        logits=tensor("alphas", n), dc=tensor("colors", n, 3), rest=rest,
+    )  # fmt: skip
 
 
 def turned(gaussians: Gaussians, matrix: np.ndarray) -> Gaussians:
@@ -133,7 +135,7 @@ def test_chunks_and_their_sizes_make_no_difference(tmp_path, monkeypatch):
         registry.write(tmp_path / f"1{name}", Scene.of(whole, PLACED))
     monkeypatch.setattr(scene, "ROWS", 16)
     for name in names:
-        registry.write(tmp_path / f"2{name}", Scene(iter(parts), 100, 2, PLACED))
+        registry.write(tmp_path / f"2{name}", Scene(chunks=iter(parts), count=100, degree=2, facts=PLACED))
         one, other = (tmp_path / f"{i}{name}" for i in (1, 2))
         if name.endswith((".laz", ".las")):
             continue  # tested by their numbers: headers hold a date
@@ -232,7 +234,7 @@ def test_what_no_spz_can_hold_is_refused_before_work(tmp_path):
 
     far = random_gaussians(4, 0)
     far.means[2, 1] = 2500.0
-    known = Scene(chunks(), 4, 0, bounds=((-3, -3, -1), (3, 2500, 1)))
+    known = Scene(chunks=chunks(), count=4, degree=0, bounds=((-3, -3, -1), (3, 2500, 1)))
     with pytest.raises(VdgsError, match=r"2500 m from the origin.*tileset\.json"):
         registry.write(tmp_path / "a.spz", known)
     assert not asked
@@ -270,7 +272,7 @@ def test_numbers_that_are_none_leave_no_file(tmp_path, ending):
     broken = random_gaussians(20, 1)
     broken.logits[13] = float("nan")
     with pytest.raises(VdgsError, match="Gaussian 13: its logits are not finite"):
-        registry.write(tmp_path / name, Scene(iter([broken]), 20, 1))
+        registry.write(tmp_path / name, Scene(chunks=iter([broken]), count=20, degree=1))
     assert [each.name for each in tmp_path.iterdir()] == [name]
     assert (tmp_path / name).read_text() == "before"
 
@@ -278,11 +280,11 @@ def test_numbers_that_are_none_leave_no_file(tmp_path, ending):
 def test_scenes_that_are_not_what_they_announce_are_refused(tmp_path):
     some = random_gaussians(20, 1)
     with pytest.raises(ValueError, match="21 Gaussians were announced, 20 came"):
-        registry.write(tmp_path / "a.ply", Scene([some], 21, 1))
+        registry.write(tmp_path / "a.ply", Scene(chunks=[some], count=21, degree=1))
     with pytest.raises(ValueError, match="degree 1, announced was 3"):
-        registry.write(tmp_path / "a.ply", Scene([some], 20, 3))
+        registry.write(tmp_path / "a.ply", Scene(chunks=[some], count=20, degree=3))
     with pytest.raises(VdgsError, match="no Gaussians"):
-        registry.write(tmp_path / "a.ply", Scene([], 0, 3))
+        registry.write(tmp_path / "a.ply", Scene(chunks=[], count=0, degree=3))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -296,7 +298,7 @@ def test_endings_choose_formats(tmp_path):
         registry.read(tmp_path / "a.glb")
     (tmp_path / "a.ply").mkdir()
     with pytest.raises(VdgsError, match="is a folder"):
-        registry.check(tmp_path / "a.ply", Scene([], 1, 0))
+        registry.check(tmp_path / "a.ply", Scene(chunks=[], count=1, degree=0))
 
 
 @pytest.mark.parametrize("ending", [".ply", ".spz", ".splat"])
@@ -327,7 +329,7 @@ def test_a_stream_that_is_packed_in_parallel_is_one_gzip_member():
 
 def test_a_glb_beyond_4_gib_is_refused_before_work(tmp_path):
     with pytest.raises(VdgsError, match=r"GiB as glTF, and a GLB holds 4 GiB.*tileset\.json"):
-        registry.check(tmp_path / "a.glb", Scene([], 20_000_000, 3))
+        registry.check(tmp_path / "a.glb", Scene(chunks=[], count=20_000_000, degree=3))
 
 
 def test_more_than_every_reader_of_spz_opens_is_said(tmp_path, monkeypatch):

@@ -128,7 +128,7 @@ def test_older_tiles_go_when_new_ones_are_there(tmp_path, town):
     assert sorted(each.name for each in tmp_path.iterdir()) == ["mine.txt", "tiles-2", "tileset.json"]
     broken = replace(some, dc=some.dc * float("inf"))
     with pytest.raises(VdgsError, match="not finite"):
-        registry.write(path, Scene([broken], 50, 1))
+        registry.write(path, Scene(chunks=[broken], count=50, degree=1))
     assert sorted(each.name for each in tmp_path.iterdir()) == ["mine.txt", "tiles-2", "tileset.json"]
     assert len(tiles_of(path)[0][2]) == 50
 

@@ -38,14 +38,22 @@ QUIET = Console(quiet=True)
 
 
 def ground(origin: tuple[float, float, float] | None) -> GroundFrame:
-    return GroundFrame(1.0, np.eye(3), np.zeros(3), True, "hand-made", origin)
+    return GroundFrame(
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="hand-made", origin_geo=origin
+    )
 
 
 def capture_at(origin: tuple[float, float, float] | None) -> Capture:
     cameras = [camera_above(0.3, -0.2), camera_above(-2.0, 1.0, tilt_deg=30.0), camera_above(1.5, 2.0)]
-    views = [View(f"{n}.png", camera, Path("images") / f"{n}.png", None, "train") for n, camera in enumerate(cameras)]
+    views = [
+        View(name=f"{n}.png", camera=camera, image_path=Path("images") / f"{n}.png", mask_path=None, split="train")
+        for n, camera in enumerate(cameras)
+    ]
     points = np.zeros((1, 3))
-    return Capture(Path("place"), "colmap", "images", tuple(views), points, np.zeros((1, 3), np.uint8), ground(origin))
+    return Capture(
+        root=Path("place"), source="colmap", images="images", views=tuple(views), points=points,
+        point_colours=np.zeros((1, 3), np.uint8), ground=ground(origin),
+    )  # fmt: skip
 
 
 def scattered(parts: tuple[int, ...] = ()) -> AnchorModel:
@@ -63,10 +71,13 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     ) -> dict[str, Any]:
         file, shown = tmp_path / "run" / "merged" / "model.safetensors", model or scattered()
         shown.save(file)
-        opened = TrainedRun(RunFolder(tmp_path / "run"), shown, file, "merged", Status(), "k", "", capture_at(origin))
+        opened = TrainedRun(
+            folder=RunFolder(tmp_path / "run"), model=shown, model_path=file, name="merged", status=Status(), key="k",
+            caution="", capture=capture_at(origin),
+        )  # fmt: skip
         monkeypatch.setattr(exporting, "open_run", lambda *_: opened)
         request = ExportRequest(
-            tmp_path / "run", tuple(tmp_path / name for name in names), measure=False, device="cpu", **asked
+            run=tmp_path / "run", to=tuple(tmp_path / name for name in names), measure=False, device="cpu", **asked
         )
         return export_run(request, QUIET)
 
@@ -224,7 +235,18 @@ def test_what_cannot_be_written_is_said_before_anything_is_baked(
 def looking_down_at(monkeypatch: pytest.MonkeyPatch, *x: float) -> None:
     """Let captures have training cameras above these places."""
     capture = capture_at(None)
-    cameras = [Camera(look_down(np.array([at, 0, 8.0]), 0.0, 90.0), 60.0, 60.0, 32.0, 24.0, 64, 48) for at in x]
+    cameras = [
+        Camera(
+            camera_from_world=look_down(np.array([at, 0, 8.0]), 0.0, 90.0),
+            fx=60.0,
+            fy=60.0,
+            cx=32.0,
+            cy=24.0,
+            width=64,
+            height=48,
+        )
+        for at in x
+    ]
     views = tuple(replace(capture.views[0], camera=camera) for camera in cameras)
     monkeypatch.setattr(f"{__name__}.capture_at", lambda origin: replace(capture, views=views, ground=ground(origin)))
 

@@ -117,9 +117,15 @@ def test_photographs_of_a_folder_follow_each_other_as_their_numbers_do():
 
 def flown(**splits: str) -> Capture:
     """Photographs of two flights; t trains, x tests."""
-    pose = Camera(np.eye(4), 60.0, 60.0, 32.0, 24.0, 64, 48)
+    pose = Camera(camera_from_world=np.eye(4), fx=60.0, fy=60.0, cx=32.0, cy=24.0, width=64, height=48)
     views = [
-        View(f"{flight}/{number}.jpg", pose, Path(f"{number}.jpg"), None, "train" if letter == "t" else "test")
+        View(
+            name=f"{flight}/{number}.jpg",
+            camera=pose,
+            image_path=Path(f"{number}.jpg"),
+            mask_path=None,
+            split="train" if letter == "t" else "test",
+        )
         for flight, letters in splits.items()
         for number, letter in enumerate(letters)
     ]
@@ -136,7 +142,9 @@ class Lit(Exposures):
     def __init__(self, capture: Capture, departures: torch.Tensor, light: Callable[[View], float]):
         plain = Decoder.initial(2, False, 0, 0, torch.Generator())
         decoder = replace(plain, exposure=departures.float())
-        super().__init__(AnchorModel(nothing(), decoder, 0.4, (0.0, 0.0, 0.0), {}), capture)
+        super().__init__(
+            AnchorModel(anchors=nothing(), decoder=decoder, voxel=0.4, background=(0.0, 0.0, 0.0)), capture
+        )
         self._light = light
 
     def _drawn(self, view: View) -> np.ndarray:
@@ -187,7 +195,7 @@ def test_a_camera_that_meters_exposes_what_is_brighter_less(slope):
 
 def test_a_model_without_exposures_has_none():
     plain = Decoder.initial(2, False, 0, 0, torch.Generator())
-    model = AnchorModel(nothing(), plain, 0.4, (0.0, 0.0, 0.0), {})
+    model = AnchorModel(anchors=nothing(), decoder=plain, voxel=0.4, background=(0.0, 0.0, 0.0))
     assert exposures_of(model, flown(a="tx")) is None
 
 
@@ -280,7 +288,7 @@ def test_photographs_of_unequal_brightness_are_told_from_the_scene():
 
     def error(trained) -> float:
         """Against the place as it is, at the mean brightness."""
-        model = AnchorModel(trained.anchors, trained.decoder, 0.4, (0.0, 0.0, 0.0), {})
+        model = AnchorModel(anchors=trained.anchors, decoder=trained.decoder, voxel=0.4, background=(0.0, 0.0, 0.0))
         truth, errors = Photographs(), []
         for index, camera in enumerate(truth.cameras):
             picture = truth.get(index)[0] * (0.7 / 255)
@@ -311,7 +319,9 @@ def test_a_stopped_run_and_a_file_keep_them(tmp_path):
     run(state, unequal, until=33)
     again = run(from_saved(to_saved(state), unequal), unequal)
     assert bits(again) == whole
-    AnchorModel(again.anchors, again.decoder, 0.4, (0.0, 0.0, 0.0), {}).save(tmp_path / "model.safetensors")
+    AnchorModel(anchors=again.anchors, decoder=again.decoder, voxel=0.4, background=(0.0, 0.0, 0.0)).save(
+        tmp_path / "model.safetensors"
+    )
     read = AnchorModel.load(tmp_path / "model.safetensors")
     assert torch.equal(read.decoder.exposure, again.decoder.exposure)
     assert read.decoder.exposure.abs().max() > 0

@@ -13,7 +13,7 @@ VOXEL = 0.25
 def camera(x: float = 0.0, y: float = 0.0, height: float = 20.0) -> Camera:
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[:3, 3] = -pose[:3, :3] @ np.array([x, y, height])
-    return Camera(pose, 100.0, 100.0, 100.0, 100.0, 200, 200)
+    return Camera(camera_from_world=pose, fx=100.0, fy=100.0, cx=100.0, cy=100.0, width=200, height=200)
 
 
 def ground(seed: int = 0, count: int = 4000) -> np.ndarray:

@@ -55,14 +55,14 @@ def test_a_gaussian_shows_another_colour_from_another_side():
     rest = torch.zeros(1, 3, 3)
     rest[0, 2, 0] = -0.6
     shown = Gaussians(
-        torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1,), 5.0),
-        torch.zeros(1, 3), rest,
+        means=torch.zeros(1, 3), log_scales=torch.zeros(1, 3), quaternions=torch.tensor([[1.0, 0, 0, 0]]),
+        logits=torch.full((1,), 5.0), dc=torch.zeros(1, 3), rest=rest,
     )  # fmt: skip
     reds = []
     for x in (-3.0, 3.0):
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
         pose[:3, 3] = -pose[:3, :3] @ np.array([x, 0, 5.0])
-        camera = Camera(pose, 20.0, 20.0, 16.0, 16.0, 32, 32)
+        camera = Camera(camera_from_world=pose, fx=20.0, fy=20.0, cx=16.0, cy=16.0, width=32, height=32)
         reds.append(float(GaussiansModel(shown, (0.0, 0.0, 0.0), {}).render(camera).image[..., 0].max()))
     assert reds[0] > reds[1] + 0.1  # seen from -x the viewing direction has a positive x
 

@@ -100,7 +100,9 @@ def test_the_background_is_black_or_that_of_the_photographs(trained, capture, tm
     mean = replace(SHORT, iterations=1, background="mean")
     model = comparator.train_gaussians(capture, mean, tmp_path, QUIET)
     assert all(0.3 < value < 0.7 for value in model.background)
-    away = Camera(np.diag([1.0, 1, 1, 1]), 20.0, 20.0, 4.0, 4.0, 8, 8)  # looks up from the ground
+    away = Camera(
+        camera_from_world=np.diag([1.0, 1, 1, 1]), fx=20.0, fy=20.0, cx=4.0, cy=4.0, width=8, height=8
+    )  # looks up from the ground
     moved = replace(model.gaussians, means=model.gaussians.means - torch.tensor([0.0, 0.0, 100.0]))
     nothing = replace(model, gaussians=moved).render(away).image
     torch.testing.assert_close(nothing, torch.tensor(model.background).expand(8, 8, 3))

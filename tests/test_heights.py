@@ -20,9 +20,15 @@ from vdgs.training.loop import _volume_weight
 
 def capture_of(scene: TinyScene) -> Capture:
     """The scene as a capture in which all views are for training."""
-    views = tuple(View(name, camera, Path(name), None, "train") for name, camera in scene.cameras.items())
-    frame = GroundFrame(1.0, np.eye(3), np.zeros(3), True, "as it is")
-    return Capture(Path(), "colmap", "images", views, scene.points, scene.colours, frame)
+    views = tuple(
+        View(name=name, camera=camera, image_path=Path(name), mask_path=None, split="train")
+        for name, camera in scene.cameras.items()
+    )
+    frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="as it is")
+    return Capture(
+        root=Path(), source="colmap", images="images", views=views, points=scene.points, point_colours=scene.colours,
+        ground=frame,
+    )  # fmt: skip
 
 
 def about_a_tower(below: float) -> TinyScene:
@@ -34,7 +40,9 @@ def about_a_tower(below: float) -> TinyScene:
     for index, angle in enumerate(np.linspace(0, 2 * np.pi, 12, endpoint=False)):
         place = np.array([25 * np.cos(angle), 25 * np.sin(angle), np.median(tower[:, 2]) - below])
         pose = look_down(place, 90.0, np.degrees(np.arctan2(-place[0], -place[1])))
-        cameras[f"{index}.png"] = Camera(pose, 60.0, 60.0, 32.0, 24.0, 64, 48)
+        cameras[f"{index}.png"] = Camera(
+            camera_from_world=pose, fx=60.0, fy=60.0, cx=32.0, cy=24.0, width=64, height=48
+        )
     return TinyScene(cameras, tower, np.zeros((500, 3), np.uint8))
 
 
@@ -45,7 +53,9 @@ def plain_height(capture: Capture) -> float:
 
 def volume_weight(capture: Capture) -> float:
     nothing: object = None  # no photographs
-    return _volume_weight(Stage(TrainConfig(), nothing, 1, 1.0, camera_height(capture)))  # type: ignore[arg-type]
+    return _volume_weight(
+        Stage(config=TrainConfig(), images=nothing, image_count=1, voxel=1.0, camera_height=camera_height(capture))
+    )  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("altitude", [10.0, 37.5, 120.0])

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 
 from vdgs.runs.keys import stage_keys
+from vdgs.runs.run_settings import RunSettings
+from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.method import MethodConfig
-from vdgs.settings.plain import to_dict
 
-CAPTURE = {"capture": {"path": "/somewhere", "images": None}}
 PLAIN = MethodConfig()
 CHANGED = {
     "adam": replace(PLAIN, training=replace(PLAIN.training, adam="dense")),
@@ -24,7 +24,7 @@ CHANGED = {
 
 
 def keys(method: MethodConfig):
-    return stage_keys(to_dict(method) | CAPTURE)
+    return stage_keys(RunSettings.of("/somewhere", CaptureOptions(), method))
 
 
 @pytest.mark.parametrize("name", CHANGED)

@@ -73,12 +73,26 @@ def capture_of(points: np.ndarray, origin: tuple[float, float, float] | None = P
     """Cameras in a row over the scene, looking down; the sparse points as given."""
     views = []
     for number, x in enumerate((-6.0, -2.0, 2.0, 6.0)):
-        camera = Camera(look_down(np.array([x, 0.0, flying]), 5.0, 90.0), 80.0, 80.0, 32.0, 24.0, 64, 48)
-        views.append(View(f"{number}.png", camera, Path("images") / f"{number}.png", None, "train"))
-    ground = GroundFrame(1.0, np.eye(3), np.zeros(3), True, "hand-made", origin)
-    return Capture(
-        Path("place"), "colmap", "images", tuple(views), points, np.zeros((len(points), 3), np.uint8), ground
+        camera = Camera(
+            camera_from_world=look_down(np.array([x, 0.0, flying]), 5.0, 90.0), fx=80.0, fy=80.0, cx=32.0, cy=24.0,
+            width=64, height=48,
+        )  # fmt: skip
+        views.append(
+            View(
+                name=f"{number}.png",
+                camera=camera,
+                image_path=Path("images") / f"{number}.png",
+                mask_path=None,
+                split="train",
+            )
+        )
+    ground = GroundFrame(
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="hand-made", origin_geo=origin
     )
+    return Capture(
+        root=Path("place"), source="colmap", images="images", views=tuple(views), points=points,
+        point_colours=np.zeros((len(points), 3), np.uint8), ground=ground,
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -90,7 +104,7 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         status = SimpleNamespace(model="1-2")
         opened = SimpleNamespace(folder=folder, capture=capture, model=model, name="coarse", status=status)
         monkeypatch.setattr(RunContext, "open_model", lambda *_: opened)
-        request = MapRequest(tmp_path / "run", device="cpu", **asked)
+        request = MapRequest(run=tmp_path / "run", device="cpu", **asked)
         return mapping.map_run(RunContext.from_path(request.run), request, Console(file=sys.stderr, soft_wrap=True))
 
     run.path = tmp_path / "run"
@@ -205,7 +219,7 @@ def looking_in(distance: float, turn: float) -> Camera:
     pose = np.eye(4)
     pose[:3, :3] = [[-out[1], out[0], 0.0], [0.0, 0.0, -1.0], -out]
     pose[:3, 3] = -pose[:3, :3] @ (distance * out + [0, 0, 5.0])
-    return Camera(pose, 40.0, 40.0, 32.0, 24.0, 64, 48)
+    return Camera(camera_from_world=pose, fx=40.0, fy=40.0, cx=32.0, cy=24.0, width=64, height=48)
 
 
 def test_tiles_show_what_one_picture_shows(house):
@@ -254,7 +268,9 @@ def test_what_hangs_as_high_as_cameras_is_not_in_the_map_and_a_tower_is():
 
 
 def _above(x: float, y: float, z: float) -> Camera:
-    return Camera(look_down(np.array([x, y, z])), 80.0, 80.0, 32.0, 24.0, 64, 48)
+    return Camera(
+        camera_from_world=look_down(np.array([x, y, z])), fx=80.0, fy=80.0, cx=32.0, cy=24.0, width=64, height=48
+    )
 
 
 def test_a_capture_without_georeference_has_a_map_that_says_so(house, make, capsys):
@@ -328,9 +344,9 @@ def test_maps_of_others_are_not_written_over(house, make, tmp_path, monkeypatch,
         (tmp_path / "map.json").write_text(facts)
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
     with pytest.raises(VdgsError, match=r"holds dsm\.tif.*Nothing was drawn"):
-        mapping.map_run(context, MapRequest(tmp_path / "run", output=tmp_path), Console(quiet=True))
+        mapping.map_run(context, MapRequest(run=tmp_path / "run", output=tmp_path), Console(quiet=True))
     with pytest.raises(VdgsError, match="is a file"):
-        mapping.map_run(context, MapRequest(tmp_path / "run", output=tmp_path / "dsm.tif"), Console(quiet=True))
+        mapping.map_run(context, MapRequest(run=tmp_path / "run", output=tmp_path / "dsm.tif"), Console(quiet=True))
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 

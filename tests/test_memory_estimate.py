@@ -72,7 +72,10 @@ def test_what_is_more_takes_more(need):
 
 
 def test_the_picture_of_a_block_counts_in_the_largest_size_that_it_trains_with():
-    cameras = [Camera(np.eye(4), 1, 1, 0, 0, *size) for size in ((4000, 3000), (5472, 3648), (3648, 5472))]
+    cameras = [
+        Camera(camera_from_world=np.eye(4), fx=1, fy=1, cx=0, cy=0, width=width, height=height)
+        for width, height in ((4000, 3000), (5472, 3648), (3648, 5472))
+    ]
     assert largest_picture(cameras, ((0.0, 4), (0.1, 2), (0.4, 1))) == 5472 * 3648
     assert largest_picture(cameras, ((0.0, 4), (0.5, 2))) == 2736 * 1824
     paper, laptop = (need_of_block(PRESETS[name], 50_000, 400_000, 5472 * 3648) for name in ("paper", "laptop"))
@@ -100,7 +103,7 @@ def test_a_mean_of_models_takes_one_more_model(need):
 
 @pytest.mark.parametrize(("kind", "option"), [("coarse", "--average 0"), ("block", "--block.average 0")])
 def test_the_mean_may_be_given_up(kind, option):
-    need = Need(1_000_000, 0, 10, 0.4, 10**6, 10**8, averaged=True)
+    need = Need(anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=10**6, images_bytes=10**8, averaged=True)
     (found,) = [each for each in advice(need, kind, 10**9) if option in each.setting]
     assert found.saves == estimate(need).total - estimate(replace(need, averaged=False)).total
     assert not [each for each in advice(replace(need, averaged=False), kind, 10**9) if option in each.setting]
@@ -119,7 +122,9 @@ def test_advice_is_worth_its_words(kind, need, share):
 
 @pytest.mark.parametrize("averaged", [False, True])
 def test_the_limit_of_anchors_makes_it_fit(averaged):
-    need = Need(1_000_000, 0, 10, 0.4, 10**6, 10**8, averaged=averaged)
+    need = Need(
+        anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=10**6, images_bytes=10**8, averaged=averaged
+    )
     missing = 10**9
     (limit,) = [each for each in advice(need, "coarse", missing) if "max-anchors" in each.setting]
     given = int(limit.setting.split()[1])
@@ -132,7 +137,12 @@ def test_the_limit_of_anchors_makes_it_fit(averaged):
 
 
 def test_the_line_for_people_says_what_takes_it_and_what_there_is():
-    line = describe(estimate(Need(100_000, 200_000, 10, 0.5, 10**6, 2 * 10**8)), 3 * 10**9)
+    line = describe(
+        estimate(
+            Need(anchors=100_000, max_anchors=200_000, offsets=10, seen=0.5, pixels=10**6, images_bytes=2 * 10**8)
+        ),
+        3 * 10**9,
+    )
     assert line.startswith("memory by estimate: 872 MB at the start, 1.04 GB at most (photographs 200 MB")
     assert line.endswith("this process may take 3.00 GB")
 
@@ -145,7 +155,7 @@ def test_the_line_for_people_says_what_takes_it_and_what_there_is():
     ],
 )
 def test_a_warning_comes_before_training_where_it_will_not_fit(kind, said, monkeypatch, capsys):
-    need = Need(1_000_000, 0, 10, 0.4, 2 * 10**7, 10**9)
+    need = Need(anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=2 * 10**7, images_bytes=10**9)
     taken = psutil.Process().memory_info().rss  # it grows with the tests that ran before
     monkeypatch.setattr(memory_notes, "available_bytes", lambda: int(5.4e9) - taken)
     announce(need, kind, Console(width=2000))

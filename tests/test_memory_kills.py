@@ -63,7 +63,10 @@ def test_what_the_kernel_ends_for_want_of_memory_is_known_as_such_and_started_ag
 
 def test_who_keeps_a_command_on_a_node_says_so_too(tmp_path, greedy):
     made = job(tmp_path, 0, greedy)
-    order = Order(tuple(made.command), str(made.output), {}, 1, sys.executable, Question(tmp_path, ()).plain())
+    order = Order(
+        command=tuple(made.command), output=str(made.output), environment={}, attempt=1, python=sys.executable,
+        question=Question(tmp_path, ()).plain(),
+    )  # fmt: skip
     for expected in (End(-signal.SIGKILL, out_of_memory=True), End(0)):
         keeper = Keeper(order, collect_seconds=1e6)  # when nobody collects, it would end this process
         keeper.begin()

@@ -54,8 +54,8 @@ def test_merging_one_block_is_the_identity(config: MergeConfig):
     blocks, coarse, trained = Blocks((Block(core, core.buffer(0.4)),)), scattered(50), scattered(80, seed=1)
     merged, became = merge(coarse, [trained], blocks, [[camera_above(0, 0)]], config)
     assert bits(merged.anchors) == bits(trained.anchors)
-    assert (merged.voxel, merged.background, merged.facts) == (coarse.voxel, coarse.background, coarse.facts)
-    assert replace(became[0], unseen=0) == MergedBlock(0, trained=80, kept=80, dropped=0, from_coarse=0, unseen=0)
+    assert (merged.voxel, merged.background, merged.metadata) == (coarse.voxel, coarse.background, coarse.metadata)
+    assert replace(became[0], unseen=0) == MergedBlock(block=0, trained=80, kept=80, dropped=0, from_coarse=0, unseen=0)
 
 
 @settings(max_examples=25)

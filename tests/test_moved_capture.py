@@ -94,7 +94,7 @@ def test_another_capture_is_not_remembered(folder, tmp_path):
 
 def test_the_kept_flight_is_that_of_the_capture(trained):
     run = RunFolder(trained / "run")
-    kept = kept_flight(run, open_model(run).model.facts["capture"])
+    kept = kept_flight(run, open_model(run).model.metadata.capture)
     assert kept is not None
     read = flight_of(open_capture(run))
     assert [name for name, _ in kept.train + kept.test] == [name for name, _ in read.train + read.test]
@@ -107,7 +107,10 @@ def test_the_kept_flight_is_that_of_the_capture(trained):
 def test_views_and_orbits_are_drawn_without_the_photographs(trained, folder, tmp_path):
     for views, extra in (("test", {}), ("orbit", {"seconds": 0.1})):
         for run in (trained / "run", folder / "run"):
-            render_run(RenderRequest(run, tmp_path / run.parent.name / views, views, **extra, device="cpu"), QUIET)
+            render_run(
+                RenderRequest(run=run, output=tmp_path / run.parent.name / views, views=views, **extra, device="cpu"),
+                QUIET,
+            )
         ours, theirs = (sorted((tmp_path / each.name / views).glob("*.png")) for each in (trained, folder))
         assert [file.read_bytes() for file in ours] == [file.read_bytes() for file in theirs]
         assert ours
@@ -116,7 +119,7 @@ def test_views_and_orbits_are_drawn_without_the_photographs(trained, folder, tmp
 def test_maps_are_drawn_without_the_photographs_too(trained, folder, tmp_path):
     for kind in ("depth", "visibility", "alpha"):
         for run in (trained / "run", folder / "run"):
-            render_run(RenderRequest(run, tmp_path / run.parent.name / kind, kind=kind, device="cpu"), QUIET)
+            render_run(RenderRequest(run=run, output=tmp_path / run.parent.name / kind, kind=kind, device="cpu"), QUIET)
         ours, theirs = (sorted((tmp_path / each.name / kind).glob("*.png")) for each in (trained, folder))
         assert ours
         assert [file.read_bytes() for file in ours] == [file.read_bytes() for file in theirs]
@@ -129,7 +132,7 @@ def test_nothing_is_drawn_among_the_photographs_though_they_are_not_read(trained
     context = begin_run(tmp_path / "place", tmp_path / "run", options, METHOD)
     run, capture = context.run, context.capture
     train_coarse(context, WatchOptions(), QUIET)
-    flight = kept_flight(run, open_model(run).model.facts["capture"])
+    flight = kept_flight(run, open_model(run).model.metadata.capture)
     assert flight is not None
     assert flight.inputs == flight_of(capture).inputs
     assert flight.height == flight_of(capture).height
@@ -137,7 +140,7 @@ def test_nothing_is_drawn_among_the_photographs_though_they_are_not_read(trained
     remember_capture(run, tmp_path / "moved")
     for inside in ("", "new", "film.mp4"):
         with pytest.raises(VdgsError, match="photos, which is for inputs of the capture"):
-            render_run(RenderRequest(run.path, tmp_path / "moved" / "photos" / inside, device="cpu"), QUIET)
+            render_run(RenderRequest(run=run.path, output=tmp_path / "moved" / "photos" / inside, device="cpu"), QUIET)
 
 
 def test_the_command_that_is_advised_names_the_capture_where_it_lies_now(folder, tmp_path):
@@ -157,7 +160,7 @@ def test_the_command_that_is_advised_names_the_capture_where_it_lies_now(folder,
 
 def test_a_run_without_cameras_takes_the_capture_that_is_named(folder, tmp_path):
     (folder / "run" / "cameras.json").unlink()
-    asked = RenderRequest(folder / "run", tmp_path / "o", device="cpu")
+    asked = RenderRequest(run=folder / "run", output=tmp_path / "o", device="cpu")
     with pytest.raises(CaptureError, match="--capture PATH"):
         render_run(asked, QUIET)
     render_run(replace(asked, capture=folder / "place"), QUIET)
@@ -169,15 +172,15 @@ def test_a_run_without_cameras_takes_the_capture_that_is_named(folder, tmp_path)
 def test_damaged_cameras_are_said_or_read_anew(folder, tmp_path, text):
     (folder / "run" / "cameras.json").write_text(text)
     with pytest.raises(VdgsError, match=r"cameras\.json: is damaged|--capture PATH"):
-        render_run(RenderRequest(folder / "run", tmp_path / "o", device="cpu"), QUIET)
+        render_run(RenderRequest(run=folder / "run", output=tmp_path / "o", device="cpu"), QUIET)
 
 
 def test_pictures_too_large_for_memory_are_refused_before_they_are_drawn(trained, tmp_path, monkeypatch):
     monkeypatch.setattr("vdgs.films.film.available_bytes", lambda: 1_000_000)
     with pytest.raises(VdgsError, match=r"a picture of 1000x750 takes about \d+ MB.*smaller --width"):
-        render_run(RenderRequest(trained / "run", tmp_path / "o", width=1000, device="cpu"), QUIET)
+        render_run(RenderRequest(run=trained / "run", output=tmp_path / "o", width=1000, device="cpu"), QUIET)
     with pytest.raises(VdgsError, match=r"pictures of 12000x\d+ are too large|takes about"):
-        render_run(RenderRequest(trained / "run", tmp_path / "o", width=12_000, device="cpu"), QUIET)
+        render_run(RenderRequest(run=trained / "run", output=tmp_path / "o", width=12_000, device="cpu"), QUIET)
     assert not (tmp_path / "o").exists()
 
 

@@ -120,7 +120,7 @@ def bench(_: Path, output: Path) -> None:
 
 def map_scene(root: Path, output: Path) -> None:
     pytest.importorskip("rasterio")
-    asked = MapRequest(root.parent / "run", output=output)
+    asked = MapRequest(run=root.parent / "run", output=output)
     map_run(RunContext.from_path(asked.run), asked, Console(quiet=True))
 
 

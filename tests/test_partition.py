@@ -294,7 +294,10 @@ def test_a_block_by_memory_takes_at_most_that_in_training(
     def taken(blocks: int) -> int:
         own = [SimpleNamespace(anchors_core=anchors // blocks)] * blocks
         run = SimpleNamespace(method=lambda: method, partition_record=lambda: SimpleNamespace(blocks=own))
-        return _block_bytes(cast(RunFolder, run), [Camera(np.eye(4), 1, 1, 0, 0, pixels // 1000, 1000)])
+        return _block_bytes(
+            cast(RunFolder, run),
+            [Camera(camera_from_world=np.eye(4), fx=1, fy=1, cx=0, cy=0, width=pixels // 1000, height=1000)],
+        )
 
     assert taken(count) <= 1e9 * gb < 1.001 * taken(count - 1)
 
@@ -375,7 +378,9 @@ def test_blocks_on_the_map(tmp_path: Path, origin: tuple[float, float, float]) -
     ring = shapely.box(-400, -300, 500, 300).difference(shapely.box(-50, -50, 60, 50))
     hole = shapely.box(-50, -50, 60, 50)
     blocks = Blocks((Block(ring, ring.buffer(40)), Block(hole, hole.buffer(10))))
-    ground = GroundFrame(1.0, np.eye(3), np.zeros(3), True, "GPS", origin)
+    ground = GroundFrame(
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="GPS", origin_geo=origin
+    )
     save_blocks_wgs84(tmp_path / "map.geojson", blocks, [{}, {}], ground)
     features = json.loads((tmp_path / "map.geojson").read_text())["features"]
     assert [(f["properties"]["block"], f["properties"]["boundary"]) for f in features][1:3] == [
@@ -402,5 +407,8 @@ def test_blocks_on_the_map(tmp_path: Path, origin: tuple[float, float, float]) -
     np.testing.assert_allclose((apart + 180) % 360 - 180, 0, atol=1e-9)
     with pytest.raises(ValueError, match="not georeferenced"):
         save_blocks_wgs84(
-            tmp_path / "map.geojson", blocks, [{}, {}], GroundFrame(1.0, np.eye(3), np.zeros(3), True, "-")
+            tmp_path / "map.geojson",
+            blocks,
+            [{}, {}],
+            GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="-"),
         )

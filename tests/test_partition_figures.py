@@ -44,7 +44,7 @@ def cameras_above(count: int, side: float = 100.0) -> list[Camera]:
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
         pose[:3, 3] = -pose[:3, :3] @ (x, y, 50.0)
         poses.append(pose)
-    return [Camera(pose, 400, 400, 200, 150, 400, 300) for pose in poses]
+    return [Camera(camera_from_world=pose, fx=400, fy=400, cx=200, cy=150, width=400, height=300) for pose in poses]
 
 
 def scene(anchors: int, cameras: int, blocks: int) -> tuple[np.ndarray, np.ndarray, list[Camera], np.ndarray]:
@@ -160,7 +160,7 @@ def test_many_anchors_are_thinned_and_the_heading_counts_cameras_beyond_the_map(
     positions, views, cameras, _ = scene(figures.MOST_DRAWN + 1, 3, 1)
     far = cameras[0].camera_from_world.copy()
     far[0, 3] = -500.0
-    cameras.append(Camera(far, 400, 400, 200, 150, 400, 300))
+    cameras.append(Camera(camera_from_world=far, fx=400, fy=400, cx=200, cy=150, width=400, height=300))
     assigned = np.ones((4, 1), bool)
     figures.draw_blocks(tmp_path / "blocks.png", positions, views, cameras, assigned, [("not cut", grid(1))], METRES)
     assert headings[0][1] == "60,001 anchors (60,000 drawn)  ·  4 training cameras (1 beyond the map)"
@@ -210,7 +210,7 @@ def test_titles_stay_on_the_figure(width: float) -> None:
 
 
 def test_axes_are_east_and_north_only_where_the_place_is_known() -> None:
-    frame = GroundFrame(1.0, np.eye(3), np.zeros(3), metric=True, how="")
+    frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="")
     assert frame.axis_names == ("x (m)", "y (m)")
     assert replace(frame, origin_geo=(50.8, -0.1, 60.0)).axis_names == METRES
     assert replace(frame, metric=False).axis_names == ("x (units)", "y (units)")

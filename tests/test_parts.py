@@ -10,7 +10,7 @@ import torch
 
 from merging_support import camera_above, model_at, quadrant_of, quadrants
 from vdgs.errors import VdgsError
-from vdgs.model.anchor_model import AnchorModel, Part
+from vdgs.model.anchor_model import AnchorModel, ModelMetadata, Part
 from vdgs.model.anchors import Anchors
 from vdgs.model.render import decode_view, render, render_values
 from vdgs.partition.merging import merge
@@ -51,7 +51,12 @@ def test_every_part_is_decoded_by_its_own_decoder():
         alone = []
         for first, last, decoder in model.spans():
             rows = torch.arange(first, last)
-            alone.append(decode_view(AnchorModel(model.anchors.select(rows), decoder, 0.1, (0, 0, 0), {}), view)[1])
+            alone.append(
+                decode_view(
+                    AnchorModel(anchors=model.anchors.select(rows), decoder=decoder, voxel=0.1, background=(0, 0, 0)),
+                    view,
+                )[1]
+            )
         assert torch.equal(splats.colours, torch.cat([each.colours for each in alone]))
         assert torch.equal(splats.means_px, torch.cat([each.means_px for each in alone]))
         assert bool((splats.source.diff() > 0).all())
@@ -88,7 +93,8 @@ def trained_apart(coarse: AnchorModel, own: bool) -> list[AnchorModel | None]:
         anchors = coarse.anchors.select(torch.from_numpy(owner == index))
         anchors = Anchors(**(anchors.tensors() | {"features": anchors.features + 0.1 * index}))
         decoder = model_at(np.zeros((1, 3)), decoder_seed=10 + index).decoder if own else coarse.decoder
-        models.append(replace(coarse, anchors=anchors, decoder=decoder, facts={"decoder": "own" if own else "frozen"}))
+        metadata = ModelMetadata(decoder="own" if own else "frozen")
+        models.append(replace(coarse, anchors=anchors, decoder=decoder, metadata=metadata))
     return models
 
 

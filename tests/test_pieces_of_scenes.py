@@ -87,7 +87,7 @@ def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path,
     wishes = []
     monkeypatch.setattr(pipeline, "map_run", lambda context, asked, console, wish: wishes.append(wish))
     for executor in ("local", "slurm"):
-        asked = RunRequest(tmp_path, tmp_path, jobs=3, where=ExecutorOptions(executor))
+        asked = RunRequest(capture=tmp_path, output=tmp_path, jobs=3, where=ExecutorOptions(executor=executor))
         pipeline._map(RunContext.from_path(tmp_path), asked, Console(quiet=True))
     assert [(wish.sends, wish.jobs, wish.where.executor) for wish in wishes] == [
         (False, 0, "local"),

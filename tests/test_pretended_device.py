@@ -38,8 +38,9 @@ def begun(device: torch.device, **changes: Any) -> tuple[TrainingState, Stage]:
     anchors, decoder = coarse()
     away = replace(anchors, positions=anchors.positions + torch.tensor([3.0, 0.0, 0.0]))
     stage = Stage(
-        replace(CONFIG, **changes), Photographs(), 8, 0.4, 5.0, kind="block", background=(0.3, 0.4, 0.5),
-        surroundings=Surroundings(away.to(device), decoder.to(device)), device=device,
+        config=replace(CONFIG, **changes), images=Photographs(), image_count=8, voxel=0.4, camera_height=5.0,
+        kind="block", background=(0.3, 0.4, 0.5), surroundings=Surroundings(away.to(device), decoder.to(device)),
+        device=device,
     )  # fmt: skip
     return start_state(anchors.to(device), decoder.copy().to(device), stage), stage
 

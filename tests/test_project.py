@@ -125,7 +125,10 @@ def test_moving_the_world_and_the_camera_together_changes_nothing(seed, angle):
     rotation = rotation_matrices(turn[None])[0]
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = rotation.numpy(), [1.0, -2.0, 3.0]
-    moved = Camera(camera.camera_from_world @ np.linalg.inv(motion), camera.fx, camera.fy, camera.cx, camera.cy, 64, 48)
+    moved = Camera(
+        camera_from_world=camera.camera_from_world @ np.linalg.inv(motion), fx=camera.fx, fy=camera.fy, cx=camera.cx,
+        cy=camera.cy, width=64, height=48,
+    )  # fmt: skip
     w, x, y, z = quaternions.unbind(-1)
     c, s = turn[0], turn[3]
     turned_quaternions = torch.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], -1)

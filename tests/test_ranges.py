@@ -31,11 +31,23 @@ from vdgs.verbs.viewing import ViewArguments
 
 HERE = Path("here")
 ARGUMENTS: tuple[Any, ...] = (
-    BenchArguments("toy", HERE), InspectArguments(HERE, HERE), SynthArguments(HERE), EvalArguments(HERE),
-    RenderArguments(HERE, HERE), PartitionArguments(HERE), TrainArguments(HERE), MergeArguments(HERE),
-    MapArguments(HERE), ExportArguments(HERE), SfmArguments((HERE,), HERE), ViewArguments(HERE),
-    CoarseArguments(HERE, HERE), RunArguments(HERE, HERE), MethodConfig(), *PRESETS.values(),
-)  # fmt: skip
+    BenchArguments(table="toy", output=HERE),
+    InspectArguments(HERE, HERE),
+    SynthArguments(HERE),
+    EvalArguments(run=HERE),
+    RenderArguments(run=HERE, output=HERE),
+    PartitionArguments(run=HERE),
+    TrainArguments(run=HERE),
+    MergeArguments(HERE),
+    MapArguments(run=HERE),
+    ExportArguments(run=HERE),
+    SfmArguments(photographs=(HERE,), output=HERE),
+    ViewArguments(run=HERE),
+    CoarseArguments(capture=HERE, output=HERE),
+    RunArguments(capture=HERE, output=HERE),
+    MethodConfig(),
+    *PRESETS.values(),
+)
 
 
 @pytest.mark.parametrize("asked", ARGUMENTS, ids=lambda asked: type(asked).__name__)

@@ -12,16 +12,46 @@ from vdgs.runs.status import Status
 from vdgs.storage.records import known, plain, record_of
 
 MERGED = Status(
-    "done", anchors=3, blocks_trained=1, blocks=(MergedBlock(0, 3, 2, 1, 0, 1), MergedBlock(1, 0, 0, 0, 1, 0)),
-    block_models=("a-1", None), seconds=1.0, merge_seconds=0.25, model="b-2",
-)  # fmt: skip
+    state="done",
+    anchors=3,
+    blocks_trained=1,
+    blocks=(
+        MergedBlock(block=0, trained=3, kept=2, dropped=1, from_coarse=0, unseen=1),
+        MergedBlock(block=1, trained=0, kept=0, dropped=0, from_coarse=1, unseen=0),
+    ),
+    block_models=("a-1", None),
+    seconds=1.0,
+    merge_seconds=0.25,
+    model="b-2",
+)
 CUT = PartitionRecord(
-    "k", "a", "visibility", 1.0, ("a warning",), (),
-    (AssignedBlock(0, 2, 1, 1, 0, 5, 7, None, None, 2.5),), (CutBlock(0, 5, 2.5, 1.5, 0.5),), 3.0, 4,
-)  # fmt: skip
+    key="k",
+    assignment_key="a",
+    strategy="visibility",
+    lambda_vis=1.0,
+    warnings=("a warning",),
+    complaints=(),
+    blocks=(
+        AssignedBlock(
+            block=0,
+            cameras=2,
+            above_threshold=1,
+            best_block=1,
+            topped_up=0,
+            anchors_core=5,
+            anchors_expanded=7,
+            mean_v=None,
+            std_v=None,
+            area=2.5,
+        ),
+    ),
+    spatial=(CutBlock(0, 5, 2.5, 1.5, 0.5),),
+    seconds=3.0,
+    peak_memory_bytes=4,
+)
 
 
-@pytest.mark.parametrize("record", [Status(), Status("running", iteration=3, seconds_left=7), MERGED, CUT])
+@pytest.mark.parametrize("record", [Status(), Status(state="running", iteration=3, seconds_left=7), MERGED, CUT])
 @pytest.mark.parametrize("written", [plain, known])
 def test_what_is_read_is_what_was_written(record, written):
     assert record_of(type(record), json.loads(json.dumps(written(record)))) == record
@@ -30,7 +60,7 @@ def test_what_is_read_is_what_was_written(record, written):
 def test_what_is_missing_or_foreign_in_a_status_is_left_out(tmp_path):
     folder = StageFolder(tmp_path)
     folder.status_file.write_text('{"state": "done", "seconds": 3, "psnr_training": null, "of_the_future": [1]}')
-    assert folder.status() == Status("done", seconds=3.0)
+    assert folder.status() == Status(state="done", seconds=3.0)
 
 
 @pytest.mark.parametrize(

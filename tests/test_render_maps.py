@@ -148,6 +148,6 @@ def test_legends_fit_below_every_picture(name: str, size: tuple[int, int]) -> No
 
 def test_numbers_are_of_maps_in_folders(tmp_path: Path) -> None:
     with pytest.raises(VdgsError, match="--raw"):
-        _check(RenderRequest(tmp_path, tmp_path / "out", raw=True))
+        _check(RenderRequest(run=tmp_path, output=tmp_path / "out", raw=True))
     with pytest.raises(VdgsError, match="a film holds no numbers"):
-        _check(RenderRequest(tmp_path, tmp_path / "film.mp4", kind="depth", raw=True))
+        _check(RenderRequest(run=tmp_path, output=tmp_path / "film.mp4", kind="depth", raw=True))

@@ -4,13 +4,15 @@ import json
 from dataclasses import replace
 
 import pytest
+import yaml
 
 from captures_support import tiny_scene, write_colmap
 from vdgs.captures.facts import capture_facts
 from vdgs.errors import RunError
 from vdgs.runs.beginning import begin_run
 from vdgs.runs.folder import RunFolder
-from vdgs.runs.keys import NEEDS, stage_keys
+from vdgs.runs.keys import NEEDS, counted, stage_keys
+from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.settings.capture import CaptureOptions
@@ -18,12 +20,12 @@ from vdgs.settings.checks import validate
 from vdgs.settings.method import BlockConfig, GrowthConfig, MethodConfig, TrainConfig, with_iterations
 from vdgs.settings.plain import differences, from_dict, to_dict
 from vdgs.settings.presets import PRESETS
-from vdgs.storage.files import write_json
+from vdgs.storage.files import write_json, write_text
 
 
-def settings(**changes) -> dict:
-    method = to_dict(PRESETS["laptop"])
-    return {"capture": {"format": "auto", "path": "/data/a"}} | method | {"training": method["training"] | changes}
+def settings(**changes) -> RunSettings:
+    laptop = PRESETS["laptop"]
+    return RunSettings.of("/data/a", CaptureOptions(), replace(laptop, training=replace(laptop.training, **changes)))
 
 
 def test_the_same_settings_continue(tmp_path):
@@ -62,10 +64,26 @@ def test_a_damaged_config_is_named(tmp_path, text):
         RunFolder(tmp_path).settings()
 
 
-def test_who_changes_the_settings_that_were_read_changes_none_of_the_run(tmp_path):
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"capture": {"path": "/data/a", "imagse": "x"}}, r"capture has no 'imagse'; did you mean 'images'\?"),
+        ({"capture": {"path": "/data/a", "images": 5}}, r"capture\.images is 5; it must be text"),
+        ({"capture": {"images": None}}, "`capture` must be a group of settings with a path"),
+        ({"merge": {"rule": "mine"}}, r"merge\.rule is 'mine'; it must be owner or best_seen"),
+        ({"blocks": 4}, "this file has no 'blocks'"),
+    ],
+)
+def test_a_setting_that_is_none_is_named(tmp_path, change, complaint):
+    run = RunFolder(tmp_path)
+    write_text(run.config_file, yaml.safe_dump(settings().to_dict() | change))
+    with pytest.raises(RunError, match=complaint):
+        run.settings()
+
+
+def test_settings_are_read_anew_where_the_file_changes(tmp_path):
     run = RunFolder(tmp_path / "run")
     run.begin(settings())
-    run.settings()["training"]["seed"] = 5
     assert run.settings() == settings()
     run.config.write(settings(seed=7))
     assert run.settings() == settings(seed=7)
@@ -106,7 +124,7 @@ def test_an_unknown_setting_is_named():
 def test_a_change_that_costs_trained_work_needs_redo(tmp_path):
     run = RunFolder(tmp_path / "run")
     run.begin(settings())
-    other = settings() | {"partition": settings()["partition"] | {"lambda_vis": 0.7}}
+    other = replace(settings(), partition=replace(settings().partition, lambda_vis=0.7))
     run.change_settings(other, redo=False)  # nothing is trained yet
     run.block(0).discard_unless(run.keys().blocks)
     run.block(0).model.write_bytes(b"a trained block")
@@ -121,13 +139,13 @@ def test_a_stage_deletes_what_was_made_for_other_settings_and_nothing_else(tmp_p
     folder = StageFolder(tmp_path / "stage")
     folder.discard_unless("a")
     folder.model.write_bytes(b"model")
-    folder.set_status(Status("done", iteration=3))
+    folder.set_status(Status(state="done", iteration=3))
     folder.discard_unless("a")
     assert folder.is_done("a")
     assert not folder.is_done("b")
     folder.discard_unless("b")
     assert not folder.model.exists()
-    assert folder.status() == Status("new")
+    assert folder.status() == Status(state="new")
     assert folder.key() == "b"
 
 
@@ -135,7 +153,7 @@ def test_work_of_unknown_settings_is_not_taken_over(tmp_path):
     folder = StageFolder(tmp_path / "stage")
     folder.discard_unless("a")
     folder.model.write_bytes(b"model")
-    folder.set_status(Status("done"))
+    folder.set_status(Status(state="done"))
     folder.status_file.unlink()  # as the message about a damaged one advises: the key stays known
     folder.discard_unless("a")
     assert folder.model.exists()
@@ -154,12 +172,16 @@ def test_what_is_built_on_the_coarse_model_depends_on_the_very_model():
 def test_each_setting_invalidates_the_stages_that_depend_on_it_and_no_others():
     order = ["coarse", "partition", "assignment", "blocks", "merge"]
     before = stage_keys(settings())
-    for section, first in [("capture", 0), ("training", 0), ("partition", 1), ("assignment", 2), ("block", 3),
-                           ("merge", 4)]:  # fmt: skip
-        changed = stage_keys(settings() | {section: settings()[section] | {"new": 1}})
+    changes: list[tuple[str, dict[str, object], int]] = [
+        ("capture", {"images": "other"}, 0), ("training", {"seed": 5}, 0), ("partition", {"lambda_vis": 0.7}, 1),
+        ("assignment", {"tau": 0.1}, 2), ("block", {"offset_rate": 0.5}, 3), ("merge", {"rule": "best_seen"}, 4),
+    ]  # fmt: skip
+    for section, change, first in changes:
+        section_changed = replace(getattr(settings(), section), **change)
+        changed = stage_keys(replace(settings(), **{section: section_changed}))
         same = [getattr(before, stage) == getattr(changed, stage) for stage in order]
         assert same == [index < first for index in range(5)], section
-    moved = stage_keys(settings() | {"capture": settings()["capture"] | {"path": "/elsewhere"}})
+    moved = stage_keys(replace(settings(), capture_path="/elsewhere"))
     assert moved == before
 
 
@@ -187,7 +209,11 @@ def test_every_setting_counts_beside_the_one_that_it_needs():
     settings = {"capture": {"images": None}} | to_dict(MethodConfig())
     for path in _leaves(settings):
         beside = _changed(settings, (path[0], NEEDS[path])) if path in NEEDS else settings
-        assert stage_keys(_changed(beside, path), "model") != stage_keys(beside, "model"), path
+        assert _counted(_changed(beside, path)) != _counted(beside), path
+
+
+def _counted(settings: dict) -> dict:
+    return {section: counted(section, values) for section, values in settings.items()}
 
 
 def _leaves(settings: dict, above: tuple[str, ...] = ()) -> list[tuple[str, ...]]:

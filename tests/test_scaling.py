@@ -40,7 +40,7 @@ def flight(count: int, extent: float, seed: int = 0) -> list[Camera]:
         pose = np.eye(4)
         pose[:3, :3] = np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ np.diag([1.0, -1.0, -1.0]) @ turn
         pose[:3, 3] = -pose[:3, :3] @ [*generator.uniform(0, extent, 2), 30.0]
-        cameras.append(Camera(pose, 90.0, 80.0, 60.0, 41.0, 120, 80))
+        cameras.append(Camera(camera_from_world=pose, fx=90.0, fy=80.0, cx=60.0, cy=41.0, width=120, height=80))
     return cameras
 
 
@@ -73,7 +73,9 @@ def test_groups_lose_no_place_that_a_camera_holds(count: int) -> None:
 @pytest.mark.parametrize("count", [1, GROUP, 12 * GROUP + 3])
 def test_many_cameras_asked_at_once_answer_as_each_alone(count: int) -> None:
     places, cameras = site(count, 400.0), flight(40, 400.0)
-    cameras[7] = Camera(cameras[7].camera_from_world, 45.0, 50.0, 61.0, 30.0, 120, 80)
+    cameras[7] = Camera(
+        camera_from_world=cameras[7].camera_from_world, fx=45.0, fy=50.0, cx=61.0, cy=30.0, width=120, height=80
+    )
     frusta = Frusta.of(cameras)
     together = frusta.project(places)
     alone = [project(places, camera) for camera in cameras]
@@ -92,7 +94,7 @@ def test_a_camera_inside_a_group_and_coincident_places_are_held() -> None:
     places = torch.zeros(3 * GROUP, 3)
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 0.0, 0.5]
-    camera = Camera(pose, 90.0, 80.0, 60.0, 41.0, 120, 80)
+    camera = Camera(camera_from_world=pose, fx=90.0, fy=80.0, cx=60.0, cy=41.0, width=120, height=80)
     assert len(Groups.of(places).about(camera)) == len(places)
     spread = site(GROUP, 1.0)
     assert len(Groups.of(spread).about(camera)) == GROUP
@@ -100,7 +102,9 @@ def test_a_camera_inside_a_group_and_coincident_places_are_held() -> None:
 
 def test_bounds_of_sizes_are_those_of_all_cameras_asked_about_all_places() -> None:
     places, cameras = site(3000, 400.0), flight(30, 400.0)
-    cameras[7] = Camera(cameras[7].camera_from_world, 45.0, 45.0, 60.0, 41.0, 120, 80)
+    cameras[7] = Camera(
+        camera_from_world=cameras[7].camera_from_world, fx=45.0, fy=45.0, cx=60.0, cy=41.0, width=120, height=80
+    )
     held = torch.full_like(places[:, 0], math.inf)
     near = held.clone()
     for camera in cameras:
@@ -186,7 +190,7 @@ def test_a_block_that_a_view_does_not_reach_scores_as_if_it_were_drawn(mode: str
     model, blocks = small_model(600), stripes(12, 12.0)
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[:3, 3] = -pose[:3, :3] @ [2.0, 2.0, 4.0]
-    camera = Camera(pose, 40.0, 40.0, 24.0, 18.0, 48, 36)
+    camera = Camera(camera_from_world=pose, fx=40.0, fy=40.0, cx=24.0, cy=18.0, width=48, height=36)
     config = AssignmentConfig(mode=mode)  # type: ignore[arg-type]
     found = scoring.score_matrix(model, blocks, [camera], config)
     members = scoring._Members.of(model, blocks)
@@ -215,7 +219,9 @@ def small_model(count: int, extent: float = 12.0) -> AnchorModel:
         positions, 0.5 * torch.randn(count, 32, generator=g), 0.3 * torch.randn(count, 4, 3, generator=g),
         torch.full((count, 6), -1.0),
     )  # fmt: skip
-    return AnchorModel(anchors, Decoder.initial(4, False, 0, 1, g), 0.1, (0.5, 0.5, 0.5), {})
+    return AnchorModel(
+        anchors=anchors, decoder=Decoder.initial(4, False, 0, 1, g), voxel=0.1, background=(0.5, 0.5, 0.5)
+    )
 
 
 def stripes(count: int, extent: float) -> Blocks:
@@ -227,7 +233,12 @@ def test_blocks_that_are_opened_one_by_one_merge_to_the_same_bits() -> None:
     model, blocks = small_model(500), stripes(3, 12.0)
     owner = torch.from_numpy(blocks.owner(model.anchors.positions[:, :2].double().numpy()))
     trained = [
-        AnchorModel(model.anchors.select(owner == index), model.decoder, 0.1, model.background, {})
+        AnchorModel(
+            anchors=model.anchors.select(owner == index),
+            decoder=model.decoder,
+            voxel=0.1,
+            background=model.background,
+        )
         for index in range(3)
     ]
     open_now: list[int] = []

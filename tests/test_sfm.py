@@ -65,7 +65,7 @@ def flight(nine, tmp_path_factory) -> Flight:
 @pytest.fixture(scope="module")
 def made(flight, tmp_path_factory) -> Path:
     output = tmp_path_factory.mktemp("made") / "capture"
-    reconstruct(SfmRequest((flight.folder,), output, threads=1, keep_work=True), console())
+    reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1, keep_work=True), console())
     return output
 
 
@@ -119,11 +119,11 @@ def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(mad
     output = tmp_path / "capture"
     shutil.copytree(made, output, symlinks=True)
     before = files(output)
-    reconstruct(SfmRequest((flight.folder,), output, threads=1, keep_work=True), console())
+    reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1, keep_work=True), console())
     assert files(output) == before
     for room, name in ((features, "find_features"), (matching, "match"), (mapping, "find_models")):
         monkeypatch.setattr(room, name, lambda *_: pytest.fail("was done already"))
-    asked = SfmRequest((flight.folder,), output, threads=1, options=SfmOptions(max_size=200))
+    asked = SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(max_size=200))
     reconstruct(asked, console())
     assert max(load_capture(output).views[0].camera.whole_size) <= 200
     assert judge(load_capture(output)).reprojection_px < 1
@@ -132,7 +132,7 @@ def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(mad
 
 def test_what_was_interrupted_goes_on(flight, tmp_path, monkeypatch):
     output = tmp_path / "capture"
-    request = SfmRequest((flight.folder,), output, threads=1, options=SfmOptions(neighbours=3))
+    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(neighbours=3))
     with monkeypatch.context() as patch:
         calls = []
 
@@ -173,7 +173,7 @@ def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
         write_photograph(card / name, np.rot90(pixels).copy() if turned else pixels, k, None, 6 if turned else 1)
     before = files(card)
     said = console()
-    facts = reconstruct(SfmRequest((card,), tmp_path / "capture", threads=1), said)
+    facts = reconstruct(SfmRequest(photographs=(card,), output=tmp_path / "capture", threads=1), said)
     assert (facts.registered, facts.origin, facts.residual_rms_m) == (6, None, None)
     assert "scale of the scene is arbitrary" in said.file.getvalue()
     assert not (tmp_path / "capture/georef.json").exists()
@@ -195,18 +195,18 @@ def test_photographs_that_do_not_overlap_are_no_scene(tmp_path):
         (tmp_path / "card").mkdir(exist_ok=True)
         write_photograph(tmp_path / "card" / f"p{k}.jpg", pixels, k, np.array([50.0 * k, 0, 40]))
     with pytest.raises(CaptureError, match="no two photographs could be joined"):
-        reconstruct(SfmRequest((tmp_path / "card",), tmp_path / "capture", threads=1), console())
+        reconstruct(SfmRequest(photographs=(tmp_path / "card",), output=tmp_path / "capture", threads=1), console())
 
 
 def test_other_things_are_not_written_over_and_a_full_disk_is_told_before(flight, tmp_path, monkeypatch):
     (tmp_path / "full").mkdir()
     (tmp_path / "full/thesis.txt").write_text("three years")
     with pytest.raises(VdgsError, match="holds other things"):
-        reconstruct(SfmRequest((flight.folder,), tmp_path / "full"), console())
+        reconstruct(SfmRequest(photographs=(flight.folder,), output=tmp_path / "full"), console())
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
     with pytest.raises(VdgsError, match="GB are free"):
-        reconstruct(SfmRequest((flight.folder,), tmp_path / "new"), console())
+        reconstruct(SfmRequest(photographs=(flight.folder,), output=tmp_path / "new"), console())
     assert not (tmp_path / "new").exists()
 
 
@@ -252,7 +252,9 @@ def test_positions_that_disagree_leave_the_scale_arbitrary_and_say_why(made, fli
     shutil.copytree(made, output, symlinks=True)
     found = Unplaced("the positions disagree by 2 m", "give better ones")
     monkeypatch.setattr(aligning, "place", lambda *_: found)
-    facts = reconstruct(SfmRequest((flight.folder,), output, threads=1, options=SfmOptions(max_size=200)), said)
+    facts = reconstruct(
+        SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(max_size=200)), said
+    )
     assert (facts.origin, facts.residual_rms_m) == (None, None)
     assert "disagree by 2 m" in facts.georeferenced
     assert (
@@ -271,7 +273,9 @@ def test_facts_are_plain_json(made):
 
 
 def asked(flight: Flight, output: Path) -> RunRequest:
-    return RunRequest(flight.folder, output, "laptop", threads=1, training=PRESETS["laptop"].training)
+    return RunRequest(
+        capture=flight.folder, output=output, preset="laptop", threads=1, training=PRESETS["laptop"].training
+    )
 
 
 def test_a_run_of_photographs_makes_them_a_capture_first_and_reports_how(made, flight, tmp_path):

@@ -54,7 +54,7 @@ def made(flight, nine_begun, tmp_path_factory) -> Path:
     """Placed by GPS; its features, matches and model are kept."""
     output = tmp_path_factory.mktemp("made") / "capture"
     copy_folder(nine_begun["writing"], output)
-    reconstruct(SfmRequest((flight.folder,), output, threads=1, keep_work=True), console())
+    reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1, keep_work=True), console())
     return output
 
 
@@ -178,7 +178,9 @@ def test_files_that_are_no_lists_are_refused(flight, tmp_path):
     with pytest.raises(CaptureError, match=r"--check-points gate: .* has a, b, c"):
         read_control(tmp_path / "sound.txt", collection, ("gate",))
     with pytest.raises(VdgsError, match="give it with --gcp"):
-        prepare(SfmRequest((flight.folder,), tmp_path / "out", options=SfmOptions(check_points=("a",))))
+        prepare(
+            SfmRequest(photographs=(flight.folder,), output=tmp_path / "out", options=SfmOptions(check_points=("a",)))
+        )
 
 
 def test_points_along_a_line_and_in_another_zone_are_refused(flight, tmp_path):
@@ -189,7 +191,11 @@ def test_points_along_a_line_and_in_another_zone_are_refused(flight, tmp_path):
         read_control(tmp_path / "row.txt", collection, ())
     (tmp_path / "zone.txt").write_text(listed(flight, header="EPSG:32718"))
     with pytest.raises(CaptureError, match=r"km from the photographs.*UTM zone 18S"):
-        prepare(SfmRequest((flight.folder,), tmp_path / "out", options=SfmOptions(gcp=tmp_path / "zone.txt")))
+        prepare(
+            SfmRequest(
+                photographs=(flight.folder,), output=tmp_path / "out", options=SfmOptions(gcp=tmp_path / "zone.txt")
+            )
+        )
     check_near(read_control(tmp_path / "zone.txt", collection, ()), np.zeros((0, 3)), ORIGIN, tmp_path / "zone.txt")
 
 
@@ -225,7 +231,9 @@ def surveyed(made: Path, flight: Flight, tmp_path: Path, file: Path, *held_out: 
         shutil.copytree(made, output, symlinks=True)
     options = SfmOptions(gcp=file, check_points=held_out)
     said = console()
-    facts = reconstruct(SfmRequest((flight.folder,), output, threads=1, options=options, keep_work=True), said)
+    facts = reconstruct(
+        SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=options, keep_work=True), said
+    )
     return facts, load_capture(output), said.file.getvalue()
 
 

@@ -82,8 +82,8 @@ def test_two_folders_two_cameras_landscape_and_portrait_become_one_scene(flight,
             turned = np.rot90(pixels, 1 if k % 4 else -1).copy()
             write_photograph(folder / f"DJI_{k // 2}.JPG", turned, k, place, 6 if k % 4 else 8, model="Other")
     request = RunRequest(
-        tmp_path / "first", tmp_path / "run", "laptop", threads=1, training=PRESETS["laptop"].training,
-        photographs=(tmp_path / "second",),
+        capture=tmp_path / "first", output=tmp_path / "run", preset="laptop", threads=1,
+        training=PRESETS["laptop"].training, photographs=(tmp_path / "second",),
     )  # fmt: skip
     said = console()
     found = with_capture(request, said)
@@ -112,7 +112,7 @@ def test_portrait_and_landscape_stand_beside_each_other(flight, tmp_path):
         pixels, place = pixels_of(flight.folder / name), flight.cameras[k].position
         # the file as the sensor has it, and EXIF says that its right side is up
         write_photograph(card / name, pixels, k, place, 6 if k in (3, 4, 5) else 1)
-    facts = reconstruct(SfmRequest((card,), tmp_path / "capture", threads=1), console())
+    facts = reconstruct(SfmRequest(photographs=(card,), output=tmp_path / "capture", threads=1), console())
     assert facts.registered == 9
     sizes = {view.name: view.camera.whole_size for view in load_capture(tmp_path / "capture").views}
     assert {name for name, (width, height) in sizes.items() if height > width} == set(flight.names[3:6])
@@ -120,7 +120,7 @@ def test_portrait_and_landscape_stand_beside_each_other(flight, tmp_path):
 
 def test_more_folders_beside_a_capture_are_refused(flight, tmp_path):
     (tmp_path / "sparse").mkdir()
-    request = RunRequest(tmp_path, tmp_path / "run", "laptop", photographs=(flight.folder,))
+    request = RunRequest(capture=tmp_path, output=tmp_path / "run", preset="laptop", photographs=(flight.folder,))
     with pytest.raises(VdgsError, match="only folders of photographs alone can be several"):
         with_capture(request, console())
 
@@ -133,14 +133,24 @@ def beside(cameras: list[Camera], east: float) -> list[Camera]:
     for camera in cameras:
         pose = camera.camera_from_world.copy()
         pose[:3, 3] -= pose[:3, :3] @ [east, 0, 0]
-        moved.append(Camera(pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height))
+        moved.append(
+            Camera(
+                camera_from_world=pose,
+                fx=camera.fx,
+                fy=camera.fy,
+                cx=camera.cx,
+                cy=camera.cy,
+                width=camera.width,
+                height=camera.height,
+            )
+        )
     return moved
 
 
 def test_of_two_parts_the_larger_is_kept_and_the_other_named(tmp_path):
     flown = fly(tmp_path / "card", [*beside(grid(2, 3, 9.0), -60), *beside(grid(2, 2, 9.0), 60)], 220)
     said = console()
-    facts = reconstruct(SfmRequest((flown.folder,), tmp_path / "capture", threads=1), said)
+    facts = reconstruct(SfmRequest(photographs=(flown.folder,), output=tmp_path / "capture", threads=1), said)
     assert facts.components == (6, 4)
     assert facts.registered == 6
     why = {photo.name: photo.left_out for photo in facts.photographs if photo.left_out}
@@ -183,7 +193,7 @@ def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
     output, stop, function = tmp_path / "capture", Stopper(after), getattr(room, name)
     if step in begun:
         copy_folder(begun[step], output)
-    request = SfmRequest((flight.folder,), output, threads=1)
+    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1)
 
     def then_stopped(*arguments, **named):
         result = function(*arguments, **named)
@@ -249,7 +259,7 @@ def test_another_focal_length_begins_mapping_anew(flight, begun, tmp_path, monke
     with monkeypatch.context() as patch:
         patch.setattr(mapping, "keep_snapshots", lambda work: (keep(work), stop()))
         with pytest.raises(KeyboardInterrupt), stop_requests(interrupts=True):
-            reconstruct(SfmRequest((flight.folder,), output, threads=1), console())
+            reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1), console())
     assert any((output / "work" / "kept").iterdir())
     monkeypatch.setattr(mapping, "find_models", lambda work, *_: pytest.fail("kept") if work.kept.exists() else done())
 
@@ -257,7 +267,10 @@ def test_another_focal_length_begins_mapping_anew(flight, begun, tmp_path, monke
         raise CaptureError("begun anew")
 
     with pytest.raises(CaptureError, match="begun anew"):
-        reconstruct(SfmRequest((flight.folder,), output, threads=1, options=SfmOptions(focal="refine")), console())
+        reconstruct(
+            SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(focal="refine")),
+            console(),
+        )
 
 
 # ---------------------------------------------------------------------------------------------- full disks
@@ -268,7 +281,7 @@ def test_a_disk_that_fills_while_photographs_are_written_is_said_and_nothing_is_
 ):
     output, written = tmp_path / "capture", []
     copy_folder(begun["writing"], output)
-    request = SfmRequest((flight.folder,), output, threads=1)
+    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1)
     write = Path.write_bytes
 
     def until_full(path: Path, content: bytes) -> int:
@@ -293,7 +306,7 @@ def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight
     output, room = tmp_path / "capture", STEPS[step][0]
     if step in begun:
         copy_folder(begun[step], output)
-    request = SfmRequest((flight.folder,), output, threads=1)
+    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1)
     monkeypatch.setattr(matching, "AT_ONCE", 4)
 
     def full(function, *arguments, **named):

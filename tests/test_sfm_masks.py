@@ -86,7 +86,7 @@ def test_masks_beside_photographs_are_masks(tmp_path, asked, names, masks):
     ]  # fmt: skip
     assert any("3 of 4 photographs have a mask" in note for note in found.notes)
     said = console()
-    tell(prepare(SfmRequest((tmp_path / asked,), tmp_path.parent / "new")), said)
+    tell(prepare(SfmRequest(photographs=(tmp_path / asked,), output=tmp_path.parent / "new")), said)
     assert "3 of 4 photographs have one" in said.file.getvalue()
 
 
@@ -110,7 +110,9 @@ def test_other_folders_of_masks_are_asked_of_captures_only(tmp_path):
     options = CaptureOptions(masks="legs")
     training = PRESETS["laptop"].training
     with pytest.raises(VdgsError, match="--masks legs: names a folder of a capture"):
-        sfm_request(RunRequest(tmp_path, tmp_path / "run", "laptop", options=options, training=training))
+        sfm_request(
+            RunRequest(capture=tmp_path, output=tmp_path / "run", preset="laptop", options=options, training=training)
+        )
 
 
 # --------------------------------------------------------------------------------------------------- using
@@ -146,7 +148,7 @@ def test_transparency_is_a_mask_and_both_count(tmp_path):
     assert np.array_equal(kept_of(second), left_half() & upper)
     assert kept_of(third) is None
     said = console()
-    tell(prepare(SfmRequest((tmp_path,), tmp_path.parent / "new")), said)
+    tell(prepare(SfmRequest(photographs=(tmp_path,), output=tmp_path.parent / "new")), said)
     assert "1 of 3 photographs have one; 3 have an alpha channel" in said.file.getvalue()
 
 
@@ -185,7 +187,7 @@ def test_features_lie_where_masks_are_white(masked, tmp_path):
 
 def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_again(nine_begun, masked, tmp_path):
     output, keys = tmp_path / "capture", []
-    request = SfmRequest((masked.folder,), output, threads=1, options=SfmOptions(max_size=200))
+    request = SfmRequest(photographs=(masked.folder,), output=output, threads=1, options=SfmOptions(max_size=200))
     first = masked.folder / f"masks/{masked.names[0]}.png"
     for change in (lambda: None, lambda: write_mask(first, ~left_half(300, 400)), first.unlink):
         change()

@@ -279,7 +279,7 @@ def test_outputs_among_photographs_are_refused(tmp_path):
     flight(tmp_path / "card")
     for output in ("card", "card/out"):
         with pytest.raises(VdgsError, match="among the photographs"):
-            prepare(SfmRequest((tmp_path / "card",), tmp_path / output))
+            prepare(SfmRequest(photographs=(tmp_path / "card",), output=tmp_path / output))
     assert only_photographs(tmp_path / "card")
     (tmp_path / "card/sparse").mkdir()
     assert not only_photographs(tmp_path / "card")  # a capture that lacks something is told so

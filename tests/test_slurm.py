@@ -178,7 +178,10 @@ def test_where_there_is_no_slurm_it_is_said(cut, monkeypatch):
 
 
 def test_a_script_asks_for_what_a_block_needs(tmp_path):
-    options = SlurmOptions("gpu", "lab", "8:00:00", 300, setup="module load cuda", options=("--qos=long",))
+    options = SlurmOptions(
+        partition="gpu", account="lab", time="8:00:00", grace_seconds=300, setup="module load cuda",
+        options=("--qos=long",),
+    )  # fmt: skip
     lines = script(tmp_path / "vdgs-a", 8, Needs(4, 5 << 30, 1), options, 3).splitlines()
     for asked in (
         "--array=0-7%3", "--cpus-per-task=4", "--mem=5120M", "--gres=gpu:1", "--partition=gpu", "--account=lab",

@@ -33,7 +33,7 @@ def camera_at(x: float = 0.0, height: float = 20.0, tilt: float = 0.0) -> Camera
     pose = np.eye(4)
     pose[:3, :3] = turn @ down
     pose[:3, 3] = -pose[:3, :3] @ np.array([x, 0.0, height])
-    return Camera(pose, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT)
+    return Camera(camera_from_world=pose, fx=FOCAL, fy=FOCAL, cx=WIDTH / 2, cy=HEIGHT / 2, width=WIDTH, height=HEIGHT)
 
 
 @settings(max_examples=20)
@@ -80,7 +80,7 @@ def light_through(loss: LossConfig) -> float:
     photographs, grey = Grey(), (128 / 255,) * 3
     stage = replace(stage, config=config, background=grey, surroundings=None, images=photographs)
     train(state, stage, stop=lambda: False, after_step=lambda *_: None)
-    model = AnchorModel(*state.result(), stage.voxel, grey, {})
+    model = state.model(stage.voxel, grey)
     return float((1.0 - render(model, photographs.camera(0)).alpha.clamp(0, 1)).quantile(0.5))
 
 
@@ -161,7 +161,7 @@ def test_training_leaves_no_gaussian_larger_than_its_bound_nor_far_from_its_anch
     for scales, most in ((anchors.log_scales[:, :3], bound + math.log(SPREAD)), (anchors.log_scales[:, 3:], bound)):
         assert (scales <= most[:, None] + 1e-5).all()
         assert (scales > most[:, None] - 0.5).any()
-    model = AnchorModel(anchors, decoder, stage.voxel, (0.0, 0.0, 0.0), {})
+    model = AnchorModel(anchors=anchors, decoder=decoder, voxel=stage.voxel, background=(0.0, 0.0, 0.0))
     for camera in cameras:
         rows, splats = decode_view(model, camera)
         of = rows[splats.source.long() // anchors.offsets.shape[1]]

@@ -64,7 +64,7 @@ def read(path: Path):
 
 
 def test_what_is_opaque_everywhere_is_solid_before_any_background(tmp_path: Path):
-    model = MeasuredModel(veil(1.0), seen_map=seen_from(40), background=BACKGROUND)
+    model = MeasuredModel(render=veil(1.0), seen_map=seen_from(40), background=BACKGROUND)
     result = evaluate(TAKEN, model, tmp_path)
     assert (result["solid_share"], result["seen_pixels"]) == (1.0, 2 * 40 * HEIGHT)
     assert result["psnr_seen_own"] == result["psnr_seen_black"] == result["psnr_seen_white"]
@@ -78,7 +78,7 @@ def test_what_is_opaque_everywhere_is_solid_before_any_background(tmp_path: Path
 
 
 def test_a_veil_is_not_solid_and_shows_what_is_behind_it(tmp_path: Path):
-    result = evaluate(TAKEN, MeasuredModel(veil(0.5), seen_map=seen_from(40), background=BACKGROUND), tmp_path)
+    result = evaluate(TAKEN, MeasuredModel(render=veil(0.5), seen_map=seen_from(40), background=BACKGROUND), tmp_path)
     assert result["solid_share"] == 0.0
     expected = []
     for taken in PHOTOGRAPHS:
@@ -113,7 +113,7 @@ def above(x: float, width: int = WIDTH, pitch: float = 90.0) -> Camera:
     rotation = np.array([[1, 0, 0], [0, -down, -up], [0, up, -down]], float)
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = rotation, -rotation @ np.array([x, 0.0, 10.0])
-    return Camera(rigid, 40.0, 40.0, width / 2, HEIGHT / 2, width, HEIGHT)
+    return Camera(camera_from_world=rigid, fx=40.0, fy=40.0, cx=width / 2, cy=HEIGHT / 2, width=width, height=HEIGHT)
 
 
 def test_seen_are_the_places_that_three_cameras_hold_whatever_splats_reach_beyond():
@@ -161,7 +161,7 @@ def test_masks_in_an_evaluation(tmp_path: Path):
         alpha[:, 32:] = 0.0
         return veil(1.0)(camera)._replace(alpha=alpha)
 
-    everywhere = MeasuredModel(half_open, seen_map=seen_from(WIDTH), background=BACKGROUND)
+    everywhere = MeasuredModel(render=half_open, seen_map=seen_from(WIDTH), background=BACKGROUND)
     assert evaluate(TAKEN, everywhere, tmp_path / "whole")["solid_share"] == 0.5
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:, 32:] = 255
@@ -173,9 +173,11 @@ def test_masks_in_an_evaluation(tmp_path: Path):
 def test_what_is_not_known_is_null(tmp_path: Path):
     opaque = veil(1.0)
     names = ("solid_share", *PSNRS_SEEN, *NAMES, "splats_larger_than_picture", "largest_splats")
-    result = evaluate(TAKEN, MeasuredModel(opaque, background=BACKGROUND), tmp_path / "no V")
+    result = evaluate(TAKEN, MeasuredModel(render=opaque, background=BACKGROUND), tmp_path / "no V")
     assert {result[name] for name in names} == {None}
-    image_only = MeasuredModel(lambda camera: SimpleNamespace(image=opaque(camera).image), seen_map=seen_from(40))
+    image_only = MeasuredModel(
+        render=lambda camera: SimpleNamespace(image=opaque(camera).image), seen_map=seen_from(40)
+    )
     result = evaluate(TAKEN, image_only, tmp_path / "no alpha")
     assert result["psnr_seen_own"] > 10
     assert {result[name] for name in names if name != "psnr_seen_own"} == {None}
@@ -184,7 +186,7 @@ def test_what_is_not_known_is_null(tmp_path: Path):
     assert row["seen_pixels"] == 40 * HEIGHT
     assert not (tmp_path / "no alpha" / "alpha").exists()
     result = evaluate(
-        TAKEN, MeasuredModel(opaque, seen_map=seen_from(0), background=BACKGROUND), tmp_path / "none seen"
+        TAKEN, MeasuredModel(render=opaque, seen_map=seen_from(0), background=BACKGROUND), tmp_path / "none seen"
     )
     assert {result[name] for name in names} == {None}
 
@@ -209,7 +211,7 @@ def test_errors_of_depth_are_exact_shares_of_the_camera_height():
 
 def test_depth_in_an_evaluation(tmp_path: Path):
     model = MeasuredModel(
-        veil(1.0), seen_map=seen_from(40), background=BACKGROUND, camera_height=100.0,
+        render=veil(1.0), seen_map=seen_from(40), background=BACKGROUND, camera_height=100.0,
         true_depth=lambda which: np.full((HEIGHT, WIDTH), 50.0 if which.name == "one.jpg" else 56.0),
         render_depth=lambda camera: drawn_at(50.5, np.ones((HEIGHT, WIDTH))),
     )  # fmt: skip
@@ -281,7 +283,7 @@ def test_large_splats_of_all_views_and_where_most_are(tmp_path: Path):
         return splats(*[large] * (1 + 2 * number(camera)), splat(1.0, 0.9))
 
     out = StringIO()
-    model = MeasuredModel(veil(1.0), seen_map=seen_from(40), background=BACKGROUND, splats_of=splats_of)
+    model = MeasuredModel(render=veil(1.0), seen_map=seen_from(40), background=BACKGROUND, splats_of=splats_of)
     result = evaluate(TAKEN, model, tmp_path, console=Console(file=out, width=100))
     assert result["splats_larger_than_picture"] == 4
     assert (result["largest_splats"], result["largest_splats_view"]) == (3, "two.jpg")

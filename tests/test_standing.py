@@ -7,7 +7,7 @@ import fcntl
 import json
 import shlex
 import shutil
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,16 +17,18 @@ import yaml
 from merging_support import model_at
 from vdgs.cli import main
 from vdgs.errors import RunError
+from vdgs.model.anchor_model import ModelMetadata
 from vdgs.report import write_report
 from vdgs.report.terminal import NOT_WHOLE, next_step, whole_standing
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.locks import hold, is_locked
 from vdgs.runs.opening import open_model, open_run
+from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.standing import OTHER_BLOCKS, OTHER_CUT, OTHER_MODEL, OTHER_SETTINGS, standing_of
 from vdgs.runs.status import Status
 from vdgs.runs.vouching import load_vouched
-from vdgs.settings.method import MethodConfig
-from vdgs.settings.plain import to_dict
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.method import MergeConfig, MethodConfig
 from vdgs.storage.files import write_json
 from vdgs.storage.tensors import identity
 
@@ -34,13 +36,13 @@ PLACES = [[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]
 COMMAND = "vdgs run here --output there"
 
 
-def trained(folder, key: str, seed: int, **facts: object) -> str:
+def trained(folder, key: str, seed: int, block: int | None = None) -> str:
     """A finished stage with a model of its own; what tells the model from others."""
     folder.discard_unless(key)
-    model = model_at(PLACES, seed)
-    model.facts.update({"key": key, **facts})  # type: ignore[attr-defined]
-    model.save(folder.model)
-    folder.set_status(Status("done", iteration=40, iterations=40, anchors=2, seconds=3.0, model=identity(folder.model)))
+    replace(model_at(PLACES, seed), metadata=ModelMetadata(key=key, block=block)).save(folder.model)
+    folder.set_status(
+        Status(state="done", iteration=40, iterations=40, anchors=2, seconds=3.0, model=identity(folder.model))
+    )
     return identity(folder.model)
 
 
@@ -54,7 +56,7 @@ def measured(folder: Path, model: str, psnr: float, name: str) -> None:
 def run(tmp_path) -> RunFolder:
     """A whole run of two blocks, by hand, with its report."""
     run = RunFolder(tmp_path / "run")
-    run.begin({"capture": {"path": "/nowhere"}} | to_dict(MethodConfig()), command=COMMAND)
+    run.begin(RunSettings.of("/nowhere", CaptureOptions(), MethodConfig()), command=COMMAND)
     coarse = trained(run.coarse, run.keys().coarse, 0)
     measured(run.coarse.path / "evaluation", coarse, 21.25, "coarse")
     keys = run.keys()
@@ -157,8 +159,8 @@ def test_figures_that_nothing_vouches_for_are_shown_with_a_caution(run):
 
 
 def test_what_fails_and_stops_is_said_with_its_reason(run):
-    run.block(0).set_status(Status("failed", iteration=7, iterations=40, why="out of memory\nmore of it"))
-    run.block(1).set_status(Status("running", iteration=9, iterations=40))
+    run.block(0).set_status(Status(state="failed", iteration=7, iterations=40, why="out of memory\nmore of it"))
+    run.block(1).set_status(Status(state="running", iteration=9, iterations=40))
     standing = standing_of(run)
     assert (standing.of("block 0").state, standing.of("block 0").why) == ("failed", "out of memory")
     assert standing.of("block 1").state == "stopped"  # no process works on it
@@ -191,7 +193,7 @@ def test_looking_changes_nothing_and_survives_damage(run):
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])
 def test_a_run_is_read_where_no_file_can_be_locked(run, monkeypatch, capsys, number):
     """Lustre without `-o flock`, some of FUSE: finished runs are looked at there, and nothing works on one."""
-    run.block(1).set_status(Status("running", iteration=9, iterations=40))
+    run.block(1).set_status(Status(state="running", iteration=9, iterations=40))
     for folder in (run.block(1).path, run.path / ".run"):
         with hold(folder):
             pass
@@ -238,8 +240,7 @@ def test_models_that_were_copied_to_where_they_do_not_belong_are_refused(run):
     assert standing_of(run).next_command().startswith("delete ")
     zero.model.write_bytes(own)
     model = model_at(PLACES, seed=8)  # of the right block, but not what was trained here
-    model.facts.update({"key": key, "block": 0})  # type: ignore[attr-defined]
-    model.save(zero.model)
+    replace(model, metadata=ModelMetadata(key=key, block=0)).save(zero.model)
     with pytest.raises(RunError, match=r"not the model that status\.json beside it speaks of"):
         load_vouched(zero, key, 0)
     with pytest.raises(RunError, match="of other settings or of another run"):
@@ -282,11 +283,11 @@ def test_a_merged_model_of_other_blocks_is_opened_with_a_caution(run, opened_wit
 def test_the_command_that_began_a_run_is_advised_while_the_settings_are_its_own(run):
     run.merged.model.unlink()
     assert standing_of(run).next_command() == COMMAND
-    other = run.settings() | {"merge": asdict(MethodConfig().merge) | {"rule": "best_seen"}}
+    other = replace(run.settings(), merge=MergeConfig("best_seen"))
     run.change_settings(other, redo=True)
     assert run.config.command() is None
     assert standing_of(run).next_command() == f"vdgs merge {run.path}"
-    run.change_settings(run.settings() | {"merge": asdict(MethodConfig().merge)}, redo=True, command="vdgs run anew")
+    run.change_settings(replace(run.settings(), merge=MergeConfig()), redo=True, command="vdgs run anew")
     assert standing_of(run).next_command() == "vdgs run anew"
 
 

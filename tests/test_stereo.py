@@ -31,7 +31,7 @@ def camera(x: float, y: float, tilt: float = 0.0, turn: float = 0.0, focal: floa
     pose = np.eye(4)
     pose[:3, :3] = about_x @ down @ about_z
     pose[:3, 3] = -pose[:3, :3] @ np.array([x, y, HEIGHT])
-    return Camera(pose, focal, focal, 80.0, 60.0, 160, 120)
+    return Camera(camera_from_world=pose, fx=focal, fy=focal, cx=80.0, cy=60.0, width=160, height=120)
 
 
 def texture() -> np.ndarray:

@@ -30,13 +30,9 @@ def scores_of(blocks, mode: str) -> Scores:
     shape = (len(CAMERAS), len(blocks))
     beneath = blocks.owner(np.array([camera.position[:2] for camera in CAMERAS]))
     return Scores(
-        mode,
-        np.zeros(shape, np.float32),
-        np.ones(shape, np.int32),
-        np.zeros(shape, np.float32),
-        np.ones(shape[1], np.int64),
-        beneath,
-    )
+        mode=mode, scores=np.zeros(shape, np.float32), held=np.ones(shape, np.int32),
+        covered=np.zeros(shape, np.float32), anchors=np.ones(shape[1], np.int64), beneath=beneath,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", STRATEGIES)

@@ -50,7 +50,9 @@ def camera_of(image: pycolmap.Image) -> Camera:
     rigid = np.eye(4)
     rigid[:3] = image.cam_from_world().matrix()
     fx, fy, cx, cy = image.camera.params
-    return Camera(rigid, fx, fy, cx, cy, image.camera.width, image.camera.height)
+    return Camera(
+        camera_from_world=rigid, fx=fx, fy=fy, cx=cx, cy=cy, width=image.camera.width, height=image.camera.height
+    )
 
 
 def observations(

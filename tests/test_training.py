@@ -12,7 +12,7 @@ from checkerboard import Photographs
 from vdgs.errors import TrainingDiverged, VdgsError
 from vdgs.kernels import native
 from vdgs.kernels.native.module import set_threads, threads
-from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.decoder import Decoder
 from vdgs.model.render import render
 from vdgs.model.start import initial_anchors
@@ -35,7 +35,7 @@ CONFIG = TrainConfig(
 
 
 def stage(config: TrainConfig = CONFIG) -> Stage:
-    return Stage(config, Photographs(), 8, 0.4, 5.0)
+    return Stage(config=config, images=Photographs(), image_count=8, voxel=0.4, camera_height=5.0)
 
 
 def start(config: TrainConfig = CONFIG):
@@ -68,7 +68,7 @@ def unbroken():
 
 def test_training_learns_the_place():
     state = run(start(longer := replace(CONFIG, iterations=400)), stage(longer))
-    model = AnchorModel(state.anchors, state.decoder, 0.4, BLACK, {})
+    model = AnchorModel(anchors=state.anchors, decoder=state.decoder, voxel=0.4, background=BLACK)
     photographs = Photographs()
     errors = []
     for index in range(8):
@@ -248,11 +248,16 @@ def test_a_parameter_that_is_not_a_number_stops_training():
         train_step(state, stage())
 
 
+METADATA = ModelMetadata(version="0.1.0", iterations=20, key="0123", block=2, views=7, decoder="own")
+
+
 def test_a_model_is_loaded_as_it_was_saved(unbroken, tmp_path):
-    model = AnchorModel(unbroken.anchors, unbroken.decoder, 0.4, BLACK, {"place": "checkerboard"})
+    model = AnchorModel(
+        anchors=unbroken.anchors, decoder=unbroken.decoder, voxel=0.4, background=BLACK, metadata=METADATA
+    )
     model.save(tmp_path / "model.safetensors")
     again = AnchorModel.load(tmp_path / "model.safetensors")
-    assert again.facts == {"place": "checkerboard"}
+    assert again.metadata == METADATA
     camera = Photographs().camera(3)
     assert torch.equal(render(again, camera).image, render(model, camera).image)
 
@@ -263,7 +268,7 @@ def test_a_damaged_model_is_refused(unbroken, tmp_path, damage):
     anchors = unbroken.anchors
     if damage == "nan":
         anchors = replace(anchors, features=anchors.features * float("nan"))
-    AnchorModel(anchors, unbroken.decoder, 0.4, BLACK, {}).save(path)
+    AnchorModel(anchors=anchors, decoder=unbroken.decoder, voxel=0.4, background=BLACK).save(path)
     if damage == "truncate":
         path.write_bytes(path.read_bytes()[:1000])
     elif damage == "text":

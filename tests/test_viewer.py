@@ -58,11 +58,27 @@ def photographed(folder: Path, model: AnchorModel, change: Callable[[int, np.nda
         camera, file = camera_at(x, y, 4.0, 8.0, 40.0 * number), folder / f"{number}.png"
         cv2.imwrite(str(file), to_8bit(change(number, render(model, camera).image.numpy()))[..., ::-1])
         mask = file.with_suffix(".mask.png")
-        views.append(View(file.name, camera, file, mask if mask.exists() else None, "test" if number == 8 else "train"))
+        views.append(
+            View(
+                name=file.name,
+                camera=camera,
+                image_path=file,
+                mask_path=mask if mask.exists() else None,
+                split="test" if number == 8 else "train",
+            )
+        )
     points = model.anchors.positions.double().numpy()
-    ground = GroundFrame(1.0, np.eye(3), np.zeros(3), True, "hand-made", PLACE)
-    capture = Capture(folder, "colmap", ".", tuple(views), points, np.full((len(points), 3), 99, np.uint8), ground)
-    run = TrainedRun(RunFolder(folder / "run"), model, folder / "model", "merged", Status(), "key", "", capture)
+    ground = GroundFrame(
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="hand-made", origin_geo=PLACE
+    )
+    capture = Capture(
+        root=folder, source="colmap", images=".", views=tuple(views), points=points,
+        point_colours=np.full((len(points), 3), 99, np.uint8), ground=ground,
+    )  # fmt: skip
+    run = TrainedRun(
+        folder=RunFolder(folder / "run"), model=model, model_path=folder / "model", name="merged", status=Status(),
+        key="key", caution="", capture=capture,
+    )  # fmt: skip
     coarse = replace(run, model=opaque_plane(), name="coarse")
     return Scene(run, lambda name: coarse)
 
@@ -238,7 +254,9 @@ def test_a_photograph_lies_over_the_model_however_the_camera_turns(scene):
     photograph, there = laid_over(scene, 4, taken)
     assert there.all()
     assert np.abs(photograph.astype(int) - to_8bit(render(scene.model("merged"), taken).image.numpy())).max() <= 1
-    turned = Camera(look_down(taken.position, 14.0, 80.0), 90.0, 90.0, 40.0, 30.0, 80, 60)
+    turned = Camera(
+        camera_from_world=look_down(taken.position, 14.0, 80.0), fx=90.0, fy=90.0, cx=40.0, cy=30.0, width=80, height=60
+    )
     photograph, there = laid_over(scene, 4, turned)
     model = to_8bit(render(scene.model("merged"), turned).image.numpy())
     assert 0.2 < there.mean() < 1
@@ -361,7 +379,10 @@ def test_no_canvas_is_larger_than_can_be_drawn():
 
 def test_buttons_lead_where_they_say(scene):
     stand = navigation.whole_scene(scene.capture)
-    whole = Camera(look_at(stand.position, stand.look_at), 500.0, 500.0, 320.0, 240.0, 640, 480)
+    whole = Camera(
+        camera_from_world=look_at(stand.position, stand.look_at), fx=500.0, fy=500.0, cx=320.0, cy=240.0, width=640,
+        height=480,
+    )  # fmt: skip
     assert all(whole.sees(np.array([[x, y, 0.0]]))[0] for x in (-1.5, 1.5) for y in (-1.5, 1.5))
     above = navigation.from_above(stand)
     assert np.allclose(above.look_at, stand.look_at)
@@ -373,12 +394,15 @@ def test_buttons_lead_where_they_say(scene):
     assert near.distance < east.distance
     taken = camera_at(1.0, 2.0, 4.0, 0.0, 30.0)
     there = navigation.stand_of(taken, 4.0)
-    looking = Camera(look_at(there.position, there.look_at), 64.0, 64.0, 32.0, 24.0, 64, 48)
+    looking = Camera(
+        camera_from_world=look_at(there.position, there.look_at), fx=64.0, fy=64.0, cx=32.0, cy=24.0, width=64,
+        height=48,
+    )  # fmt: skip
     assert np.allclose(looking.camera_from_world, taken.camera_from_world, atol=0.02)  # its upper edge stays up
 
 
 def test_all_of_a_photograph_fits_the_canvas():
-    camera = Camera(np.eye(4), 100.0, 100.0, 80.0, 60.0, 160, 120)
+    camera = Camera(camera_from_world=np.eye(4), fx=100.0, fy=100.0, cx=80.0, cy=60.0, width=160, height=120)
     for aspect in (0.5, 1.0, 3.0):
         fov = navigation.fov_for(camera, aspect)
         focal = 0.5 / math.tan(fov / 2)  # of a canvas one high

@@ -78,7 +78,7 @@ def guest(viewer):
 def above(x: float = 0.0, y: float = 0.0, width: int = 320, height: int = 240) -> Camera:
     focal = 0.5 * height / math.tan(math.radians(25))
     pose = look_at(np.array([x, y - 2.0, 9.0]), np.array([x, y, 0.0]))
-    return Camera(pose, focal, focal, width / 2, height / 2, width, height)
+    return Camera(camera_from_world=pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height)
 
 
 def expected(viewer: Viewer, camera: Camera) -> np.ndarray:

@@ -24,7 +24,10 @@ def flight(count: int, model: CameraModel = "pinhole", seed: int = 0) -> list[Ca
     focal = 60.0 if model == "pinhole" else 4.0
     places = generator.uniform(0, 20, (count, 2))
     poses = [look_down(np.array([*at, 8.0]), generator.uniform(0, 80), generator.uniform(0, 360)) for at in places]
-    return [Camera(pose, focal, focal, 31.5, 25.0, 64, 48, model) for pose in poses]
+    return [
+        Camera(camera_from_world=pose, fx=focal, fy=focal, cx=31.5, cy=25.0, width=64, height=48, model=model)
+        for pose in poses
+    ]
 
 
 def cloud(n: int, seed: int = 1) -> np.ndarray:
@@ -54,7 +57,7 @@ def test_v_is_the_number_of_frusta_that_hold_an_anchor(model: CameraModel) -> No
 
 
 def test_the_left_and_upper_border_belong_to_the_image_the_right_and_lower_do_not() -> None:
-    camera = Camera(np.eye(4), 32.0, 32.0, 32.0, 16.0, 64, 32)
+    camera = Camera(camera_from_world=np.eye(4), fx=32.0, fy=32.0, cx=32.0, cy=16.0, width=64, height=32)
     places = [[-1, 0, 1], [1, 0, 1], [0, -0.5, 1], [0, 0.5, 1], [0, 0, 1], [0, 0, -1], [0, 0, NEAR / 2]]
     points = np.array(places, np.float64)
     assert visibility_of(torch.from_numpy(points).float(), [camera]).tolist() == [1, 0, 1, 0, 1, 0, 0]
@@ -124,7 +127,16 @@ def test_photographs_used_alike_are_worth_their_number_and_one_that_outweighs_al
 @pytest.mark.parametrize(("sampling", "ratio"), [("even", None), ("shares", 9.0), ("roots", 3.0)])
 def test_how_often_a_photograph_with_nine_times_the_votes_is_used(sampling: str, ratio: float | None) -> None:
     cameras = [
-        Camera(look_down(np.array([x, 0.0, 8.0]), 0.0, 0.0), 60.0, 60.0, 32.0, 24.0, 64, 48) for x in (0.0, 100.0)
+        Camera(
+            camera_from_world=look_down(np.array([x, 0.0, 8.0]), 0.0, 0.0),
+            fx=60.0,
+            fy=60.0,
+            cx=32.0,
+            cy=24.0,
+            width=64,
+            height=48,
+        )
+        for x in (0.0, 100.0)
     ]
     positions = torch.tensor([[0.0, 0.0, 0.0]] + [[100.0, 0.0, 0.0]] * 9)
     anchors = Anchors(positions, torch.zeros(10, 32), torch.zeros(10, 1, 3), torch.zeros(10, 6))
@@ -134,7 +146,10 @@ def test_how_often_a_photograph_with_nine_times_the_votes_is_used(sampling: str,
 
 def test_a_camera_alone_over_a_place_has_the_votes_of_all_its_anchors() -> None:
     def above(x: float) -> Camera:
-        return Camera(look_down(np.array([x, 0.0, 8.0]), 0.0, 0.0), 60.0, 60.0, 32.0, 24.0, 64, 48)
+        return Camera(
+            camera_from_world=look_down(np.array([x, 0.0, 8.0]), 0.0, 0.0), fx=60.0, fy=60.0, cx=32.0, cy=24.0,
+            width=64, height=48,
+        )  # fmt: skip
 
     crowd, lonely = [above(0.0)] * 9, above(100.0)
     points = torch.tensor([[0.0, 0.0, 0.0]] * 9 + [[100.0, 0.0, 0.0]] * 9)

@@ -26,7 +26,10 @@ def make_camera(generator: np.random.Generator, spread: float, model: str = "pin
     matrix[:3, 3] = -matrix[:3, :3] @ generator.uniform(-spread, spread, 3)
     width, height = (int(v) for v in generator.integers(1, 2000, 2))
     focal = generator.uniform(0.3, 2.0) * width / (1 if model == "pinhole" else spread)
-    return Camera(matrix, focal, focal * 1.1, width * 0.45, height * 0.55, width, height, model)
+    return Camera(
+        camera_from_world=matrix, fx=focal, fy=focal * 1.1, cx=width * 0.45, cy=height * 0.55, width=width,
+        height=height, model=model,
+    )  # fmt: skip
 
 
 def flight(count: int, height_m: float = 100.0, extent_m: float = 1000.0, seed: int = 0) -> list[Camera]:
@@ -36,7 +39,7 @@ def flight(count: int, height_m: float = 100.0, extent_m: float = 1000.0, seed: 
     for _ in range(count):
         matrix = np.diag([1.0, -1.0, -1.0, 1.0])
         matrix[:3, 3] = -matrix[:3, :3] @ [*generator.uniform(0, extent_m, 2), height_m]
-        cameras.append(Camera(matrix, 900.0, 900.0, 600.0, 400.0, 1200, 800))
+        cameras.append(Camera(camera_from_world=matrix, fx=900.0, fy=900.0, cx=600.0, cy=400.0, width=1200, height=800))
     return cameras
 
 
@@ -98,7 +101,7 @@ def test_points_at_the_border_of_the_image_are_decided_in_float64(model, offset_
 
 
 def test_points_about_the_camera_and_on_the_near_plane():
-    camera = Camera(np.eye(4), 100.0, 100.0, 50.0, 50.0, 100, 100)
+    camera = Camera(camera_from_world=np.eye(4), fx=100.0, fy=100.0, cx=50.0, cy=50.0, width=100, height=100)
     points = torch.tensor([[0, 0, 0], [0, 0, NEAR], [0, 0, NEAR * 1.01], [0, 0, -1], [0, 0, 1.0]], dtype=torch.float64)
     for implementation in (reference, native):
         assert implementation.mark_visible(points, camera).tolist() == [False, False, True, False, True]
@@ -118,7 +121,7 @@ class TestMeaning:
     @pytest.mark.parametrize("repeats", [3, 30])
     def test_points_that_are_not_finite_are_in_no_view(self, implementation, repeats):
         points = torch.tensor([[0.0, 0, 5], [0, 0, torch.nan], [0, torch.inf, 5], [0, 0, torch.inf], [1, 1, 5]])
-        camera = Camera(np.eye(4), 10.0, 10.0, 50.0, 50.0, 100, 100)
+        camera = Camera(camera_from_world=np.eye(4), fx=10.0, fy=10.0, cx=50.0, cy=50.0, width=100, height=100)
         assert implementation.count_visibility(points, [camera] * repeats).tolist() == [repeats, 0, 0, 0, repeats]
 
     def test_nothing_to_count(self, implementation):

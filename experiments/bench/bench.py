@@ -116,7 +116,7 @@ def _captures(plan: Plan, settings: BenchSettings, console: Console) -> tuple[di
             found[scene.name] = _capture(scene, settings, console)
         except VdgsError as error:
             names = [run.name for run in plan.coarse + plan.runs if run.scene == scene.name]
-            lost |= {name: Outcome(name, "failed", why=str(error)) for name in names}
+            lost |= {name: Outcome(name=name, state="failed", why=str(error)) for name in names}
     if lost and not found:
         raise VdgsError(next(iter(lost.values())).why)
     return found, lost
@@ -157,7 +157,7 @@ def _train(
     for run in wanted:
         job = _job(run, plan, captures[run.scene], keys[run.name], settings, threads)
         if _is_done(settings.output, run, job.key):
-            done[run.name] = Outcome(run.name, "done")
+            done[run.name] = Outcome(name=run.name, state="done")
             continue
         _check_renders(run, plan, captures[run.scene], settings)
         stem = settings.output / "jobs" / run.name.replace("/", "__")
@@ -165,7 +165,7 @@ def _train(
         after = None if run.coarse_from is None else str(run.coarse_from.relative_to("runs"))
         command = [sys.executable, "-m", "experiments.bench.worker", str(stem.with_name(stem.name + ".json"))]
         output = stem.with_name(stem.name + ".log")
-        tasks.append(Task(run.name, command, output, _environment(), after=after))
+        tasks.append(Task(name=run.name, command=command, output=output, environment=_environment(), after=after))
     if done:
         console.print(f"{len(done)} of {len(wanted)} runs are finished already", highlight=False)
     outcomes = LocalExecutor(settings.jobs).run(tasks, _Teller(len(tasks), console))
@@ -214,7 +214,7 @@ def _refuse_other_settings(settings: BenchSettings, run: PlannedRun) -> None:
     folder = RunFolder(settings.output / run.folder)
     if settings.redo or not folder.config_file.exists():
         return
-    wanted, held = to_dict(run.config), folder.settings()
+    wanted, held = to_dict(run.config), folder.settings().to_dict()
     if "blocks" not in run.stages:  # no other section matters to it
         wanted = {"training": wanted["training"]}
     before, after = ({name: counted(name, each[name]) for name in wanted} for each in (held, wanted))
@@ -289,7 +289,7 @@ def _measure(
                 for folder in folders:
                     (folder / FRUSTA_FILE).unlink(missing_ok=True)
         except VdgsError as error:
-            failed |= {run.name: Outcome(run.name, "failed", why=str(error)) for run in done}
+            failed |= {run.name: Outcome(name=run.name, state="failed", why=str(error)) for run in done}
     return failed
 
 

@@ -19,7 +19,7 @@ TableName = Literal[
 ]  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BenchArguments:
     """Train methods on scenes with several seeds and write tables, a figure and a verdict.
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vdgs.errors import Stopped, VdgsError
+from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.method import MethodConfig
 from vdgs.settings.plain import from_dict
 from vdgs.storage.files import read_json, write_json
@@ -98,7 +99,11 @@ def _merge(at: _Working) -> None:
 def _evaluate(at: _Working) -> None:
     from vdgs.stages.evaluate import Measuring, evaluate_stage
 
-    evaluate_stage(at.context, Measuring(at.context.run.path, "best", at.job.lpips_weights, at.job.bins), at.console)
+    evaluate_stage(
+        at.context,
+        Measuring(path=at.context.run.path, which="best", lpips_weights=at.job.lpips_weights, bins=at.job.bins),
+        at.console,
+    )
 
 
 def _gaussians(at: _Working) -> None:
@@ -176,10 +181,9 @@ def _opened(job: Job) -> Iterator[RunContext]:
     from vdgs.captures.loading import load_capture
     from vdgs.runs.beginning import driven_run
     from vdgs.runs.folder import RunFolder
-    from vdgs.runs.opening import options_from
     from vdgs.runs.run_context import RunContext
 
-    options = options_from(job.options, job.output)
+    options: CaptureOptions = from_dict(CaptureOptions, job.options, "capture")
     if job.renders is not None:
         yield RunContext(RunFolder(job.output), load_capture(job.capture, options))
         return

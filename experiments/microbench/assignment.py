@@ -62,8 +62,23 @@ def strip(visible: int, blocks: int, cameras: int) -> tuple[AnchorModel, list[Ca
     for x in rng.uniform(width / 2, length - width / 2, cameras):
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
         pose[:3, 3] = -pose[:3, :3] @ [x, height / 2, ALTITUDE]
-        views.append(Camera(pose, focal, focal, SIZE[0] / 2, SIZE[1] / 2, *SIZE))
-    return AnchorModel(anchors, Decoder.initial(10, False, 0, 1, g), spacing, (0.5, 0.5, 0.5), {}), views
+        views.append(
+            Camera(
+                camera_from_world=pose,
+                fx=focal,
+                fy=focal,
+                cx=SIZE[0] / 2,
+                cy=SIZE[1] / 2,
+                width=SIZE[0],
+                height=SIZE[1],
+            )
+        )
+    return AnchorModel(
+        anchors=anchors,
+        decoder=Decoder.initial(10, False, 0, 1, g),
+        voxel=spacing,
+        background=(0.5, 0.5, 0.5),
+    ), views
 
 
 def slices(model: AnchorModel, count: int) -> Blocks:

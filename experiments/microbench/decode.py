@@ -29,7 +29,7 @@ from vdgs.kernels.types import AnchorSplats, DecoderWeights
 def overhead_camera() -> Camera:
     """800 x 600 from ten units above the ground."""
     camera_from_world = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 10], [0, 0, 0, 1]])
-    return Camera(camera_from_world, 800.0, 800.0, 400.0, 300.0, 800, 600)
+    return Camera(camera_from_world=camera_from_world, fx=800.0, fy=800.0, cx=400.0, cy=300.0, width=800, height=600)
 
 
 def scene(v: int, k: int, frozen: bool = False) -> tuple:

@@ -60,9 +60,9 @@ def made_up(anchors: int) -> tuple[AnchorModel, list[Camera]]:
     tensors["opacity_w2"].zero_()
     tensors["opacity_b2"].fill_(0.2)
     model = AnchorModel(
-        Anchors(positions, torch.randn(anchors, FEATURE_SIZE, generator=generator),
+        anchors=Anchors(positions, torch.randn(anchors, FEATURE_SIZE, generator=generator),
                 0.4 * torch.randn(anchors, OFFSETS, 3, generator=generator), log_scales),
-        Decoder.from_tensors(tensors), SPACING, (0.5, 0.5, 0.5), {},
+        decoder=Decoder.from_tensors(tensors), voxel=SPACING, background=(0.5, 0.5, 0.5),
     )  # fmt: skip
     count = max(4, anchors // ANCHORS_PER_VIEW)
     # A picture holds SEEN_BY / count of the ground: its width at 4 to 3, from one focal length of 400 pixels.
@@ -75,7 +75,11 @@ def made_up(anchors: int) -> tuple[AnchorModel, list[Camera]]:
         rotation = np.diag([1.0, -1.0, -1.0])
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ np.array([x, y, width])
-        cameras.append(Camera(matrix, WIDTH, WIDTH, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT))
+        cameras.append(
+            Camera(
+                camera_from_world=matrix, fx=WIDTH, fy=WIDTH, cx=WIDTH / 2, cy=HEIGHT / 2, width=WIDTH, height=HEIGHT
+            )
+        )
     return model, cameras
 
 
@@ -86,18 +90,32 @@ def one(anchors: int, folder: Path, names: list[str], measure: bool) -> None:
     Image.new("RGB", (WIDTH, HEIGHT), (128, 128, 128)).save(photograph)
     every = max(4, len(cameras) // TESTED)
     views = tuple(
-        View(f"{i:05d}.png", camera, photograph, None, "test" if i % every == 0 else "train")
+        View(
+            name=f"{i:05d}.png",
+            camera=camera,
+            image_path=photograph,
+            mask_path=None,
+            split="test" if i % every == 0 else "train",
+        )
         for i, camera in enumerate(cameras)
     )
-    ground = GroundFrame(1.0, np.eye(3), np.zeros(3), True, "made up", None)
-    capture = Capture(folder, "made up", ".", views, np.zeros((1, 3)), np.zeros((1, 3), np.uint8), ground)
+    ground = GroundFrame(
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="made up", origin_geo=None
+    )
+    capture = Capture(
+        root=folder, source="made up", images=".", views=views, points=np.zeros((1, 3)),
+        point_colours=np.zeros((1, 3), np.uint8), ground=ground,
+    )  # fmt: skip
     file = folder / "run" / "coarse" / "model.safetensors"
     model.save(file)
-    run = TrainedRun(RunFolder(folder / "run"), model, file, "coarse", Status(), "key", "", capture)
+    run = TrainedRun(
+        folder=RunFolder(folder / "run"), model=model, model_path=file, name="coarse", status=Status(), key="key",
+        caution="", capture=capture,
+    )  # fmt: skip
     exporting.open_run = lambda *_: run
     set_threads(threads())
     began, before = time.monotonic(), time.process_time()
-    asked = ExportRequest(folder / "run", tuple(folder / name for name in names), measure=measure, device="cpu")
+    asked = ExportRequest(run=folder / "run", to=tuple(folder / name for name in names), measure=measure, device="cpu")
     record = exporting.export_run(asked, Console(quiet=True))
     print(json.dumps({
         "anchors": anchors, "gaussians": record["gaussians"], "views": len(cameras),

@@ -127,8 +127,9 @@ def decode_backward_adam(kernels: Operations, place: Place) -> Results:
     drawn = rows[splats.source.long() // k] * k + splats.source.long() % k
     count = len(a) * k
     gradients = SplatGradients(
-        0.01 * place.random(count, 2)[drawn], place.random(count, 3)[drawn], place.random(count, 3)[drawn],
-        place.random(count)[drawn], 0.1, splats.source, splats.colours, splats.opacities,
+        means_px=0.01 * place.random(count, 2)[drawn], conics=place.random(count, 3)[drawn],
+        colours=place.random(count, 3)[drawn], opacities=place.random(count)[drawn], volume=0.1, source=splats.source,
+        colour_values=splats.colours, opacity_values=splats.opacities,
     )  # fmt: skip
     states = [
         AdamState(t.clone(), torch.zeros_like(t), torch.zeros_like(t), 1e-3)

@@ -58,7 +58,10 @@ def _looking(x: float, y: float, heading: float, tilt_deg: float, width: int, he
     rigid = np.eye(4)
     rigid[:3, :3] = lean @ np.diag([1.0, -1.0, -1.0]) @ turn
     rigid[:3, 3] = -rigid[:3, :3] @ [x, y, HEIGHT_M]
-    return Camera(rigid, FOCAL * width, FOCAL * width, width / 2, height / 2, width, height)
+    return Camera(
+        camera_from_world=rigid, fx=FOCAL * width, fy=FOCAL * width, cx=width / 2, cy=height / 2, width=width,
+        height=height,
+    )  # fmt: skip
 
 
 def places(count: int, extent_m: float, seed: int = 1) -> np.ndarray:
@@ -85,7 +88,12 @@ def model(positions: np.ndarray, extent_m: float) -> AnchorModel:
         offsets=0.5 * torch.randn(n, OFFSETS, 3, generator=g),
         log_scales=torch.full((n, 6), float(np.log(spacing))),
     )
-    return AnchorModel(anchors, Decoder.initial(OFFSETS, False, 0, 1, g), spacing, (0.5, 0.5, 0.5), {})
+    return AnchorModel(
+        anchors=anchors,
+        decoder=Decoder.initial(OFFSETS, False, 0, 1, g),
+        voxel=spacing,
+        background=(0.5, 0.5, 0.5),
+    )
 
 
 def slices(extent_m: float, count: int) -> Blocks:

@@ -186,8 +186,11 @@ def _merge(case: Case, folder: Path) -> Work:
         owner = torch.from_numpy(blocks.owner(places_of(whole.anchors.positions)))
         for index, file in enumerate(files):
             AnchorModel(
-                whole.anchors.select(owner == index), whole.decoder, whole.voxel, whole.background, {}
-            ).save(file)  # fmt: skip
+                anchors=whole.anchors.select(owner == index),
+                decoder=whole.decoder,
+                voxel=whole.voxel,
+                background=whole.background,
+            ).save(file)
         whole.save(folder / "coarse.safetensors")
 
     _elsewhere(write)

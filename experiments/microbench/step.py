@@ -67,7 +67,9 @@ def scene(visible: int, width: int, height: int, hidden: int = 0) -> tuple[Ancho
     )
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = altitude
-    return anchors, Camera(pose, focal, focal, width / 2, height / 2, width, height)
+    return anchors, Camera(
+        camera_from_world=pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height
+    )
 
 
 def timed_phase(
@@ -134,7 +136,9 @@ def prepare(
     anchors = anchors.to(device)
     decoder = Decoder.initial(10, False, 0, 1, torch.Generator().manual_seed(0)).to(device)
     nothing: Any = None  # no photographs: a random target instead
-    state = start_state(anchors, decoder, Stage(TrainConfig(), nothing, 1, 1.0, 1.0))
+    state = start_state(
+        anchors, decoder, Stage(config=TrainConfig(), images=nothing, image_count=1, voxel=1.0, camera_height=1.0)
+    )
     target = torch.randint(0, 256, (height, width, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
     return state, camera, target.to(device)
 
@@ -144,7 +148,11 @@ def cut(state: Any, own: float) -> tuple[Any, Surroundings]:
     x = state.anchors.positions[:, 0]
     left = x < torch.quantile(x, own)
     nothing: Any = None
-    block = start_state(state.anchors.select(left), state.decoder, Stage(TrainConfig(), nothing, 1, 1.0, 1.0))
+    block = start_state(
+        state.anchors.select(left),
+        state.decoder,
+        Stage(config=TrainConfig(), images=nothing, image_count=1, voxel=1.0, camera_height=1.0),
+    )
     return block, Surroundings(state.anchors.select(~left), state.decoder.copy())
 
 

@@ -48,7 +48,9 @@ def around(run: Path, width: int, height: int):
     def camera(angle: float) -> Camera:
         turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1.0]])
         pose = look_at(stand.look_at + turn @ away, stand.look_at)
-        return Camera(pose, focal, focal, width / 2, height / 2, width, height)
+        return Camera(
+            camera_from_world=pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height
+        )
 
     return camera
 

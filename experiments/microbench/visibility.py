@@ -38,7 +38,7 @@ def flight(count: int, extent_m: float, height_m: float, tilt_deg: float) -> lis
         rigid = np.eye(4)
         rigid[:3, :3] = lean @ np.diag([1.0, -1.0, -1.0]) @ turn
         rigid[:3, 3] = -rigid[:3, :3] @ [*generator.uniform(0, extent_m, 2), height_m]
-        cameras.append(Camera(rigid, 900.0, 900.0, 600.0, 400.0, 1200, 800))
+        cameras.append(Camera(camera_from_world=rigid, fx=900.0, fy=900.0, cx=600.0, cy=400.0, width=1200, height=800))
     return cameras
 
 

@@ -18,7 +18,7 @@ CameraModel = Literal["pinhole", "orthographic"]
 NEAR = 0.01
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Camera:
     """One view: pose and intrinsics at a given image size.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from rich.console import Console
 from rich.markup import escape
@@ -31,6 +31,7 @@ from vdgs.stages.merge import merge_run
 from vdgs.stages.partition import partition_run
 from vdgs.stages.train import train_blocks
 from vdgs.stages.visibility import measure_visibility
+from vdgs.storage.documents import EvaluationMetrics
 from vdgs.storage.files import read_json
 from vdgs.watching.interrupts import stop_if_asked
 
@@ -104,7 +105,7 @@ def _map(context: RunContext, asked: RunRequest, console: Console) -> None:
         console.print(f"{run.path / 'maps'}: already drawn; nothing to do", highlight=False)
     else:
         try:
-            map_run(context, MapRequest(run.path, device=asked.device), console, _wish(asked))
+            map_run(context, MapRequest(run=run.path, device=asked.device), console, _wish(asked))
         except Stopped:
             raise
         except VdgsError as error:
@@ -124,7 +125,9 @@ def _measure(context: RunContext, which: Literal["coarse", "merged"], asked: Run
     if is_measured(run, which, asked.lpips_weights, asked.bins):
         console.print(f"{evaluation_folder(run, which)}: already measured; nothing to do", highlight=False)
         return
-    measuring = Measuring(run.path, which, asked.lpips_weights, asked.bins, device=asked.device)
+    measuring = Measuring(
+        path=run.path, which=which, lpips_weights=asked.lpips_weights, bins=asked.bins, device=asked.device
+    )
     evaluate_stage(context, measuring, console, _wish(asked))
 
 
@@ -136,14 +139,16 @@ def _wish(asked: RunRequest) -> Wish:
 def _verdict(run: RunFolder, console: Console) -> None:
     """One line: what the blocks brought."""
     coarse, merged = (_metrics(folder) for folder in (run.coarse.path / "evaluation", run.evaluation))
-    if coarse.get("psnr") is None or merged.get("psnr") is None:
+    before, after = coarse.get("psnr"), merged.get("psnr")
+    if before is None or after is None:
         return
     console.print(
-        f"coarse {coarse['psnr']:.2f} dB → merged {merged['psnr']:.2f} dB "
-        f"({merged['psnr'] - coarse['psnr']:+.2f}); SSIM {coarse['ssim']:.3f} → {merged['ssim']:.3f}",
+        f"coarse {before:.2f} dB → merged {after:.2f} dB ({after - before:+.2f}); "
+        f"SSIM {coarse['ssim']:.3f} → {merged['ssim']:.3f}",
         style="bold", highlight=False,
     )  # fmt: skip
 
 
-def _metrics(folder: Path) -> dict[str, Any]:
-    return read_json(folder / "metrics.json")
+def _metrics(folder: Path) -> EvaluationMetrics:
+    metrics: EvaluationMetrics = read_json(folder / "metrics.json")
+    return metrics

@@ -46,7 +46,7 @@ from vdgs.watching.memory_notes import need_of
 TIMED_STEPS, TIMED_SECONDS = 4, 2.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Plan:
     """What a run takes by estimate. Seconds are pairs: anchors as many as at the start, and, with all that stereo may
     add, grown all the while."""
@@ -142,15 +142,22 @@ def _plan(capture: Capture, method: MethodConfig, asked: RunRequest) -> Plan:
     each = estimate(need_of_block(method, -(-need.grown // blocks), need.grown, pixels)).total
     whole = estimate(need).total
     photographs = decoded_bytes(cameras)
-    work = Work(blocks, each, asked.jobs, asked.watching.image_memory_gb, photographs_bytes=photographs)
+    work = Work(
+        pieces=blocks,
+        piece_bytes=each,
+        jobs=asked.jobs,
+        image_gb=asked.watching.image_memory_gb,
+        photographs_bytes=photographs,
+    )
     share = on_this_machine(work, threads_available(), free)
     block = block_training(method, max(1, round(views * min(1.0, 1.5 / blocks))))
     coarse = _seconds(config, timed)
     return Plan(
-        len(anchors), dense, blocks, config.iterations, block.iterations, share.at_once, free, whole, each,
-        min(photographs, round(1e9 * share.image_gb)), whole > free or exceeds(work, share.at_once, free),
-        (coarse, coarse * (1 + more) / 2),
-        (blocks * _seconds(block, timed), blocks * _seconds(block, timed) * more),
+        anchors=len(anchors), dense_points=dense, blocks=blocks, coarse_iterations=config.iterations,
+        block_iterations=block.iterations, jobs=share.at_once, free_bytes=free, coarse_bytes=whole, block_bytes=each,
+        photographs_bytes=min(photographs, round(1e9 * share.image_gb)),
+        is_short=whole > free or exceeds(work, share.at_once, free), coarse_seconds=(coarse, coarse * (1 + more) / 2),
+        blocks_seconds=(blocks * _seconds(block, timed), blocks * _seconds(block, timed) * more),
     )  # fmt: skip
 
 

@@ -148,22 +148,18 @@ def evaluate_gaussians(
         return model.render(camera, depth=True)
 
     measured = MeasuredModel(
-        model.render,
-        visibility_map,
-        _facts(trained),
-        background=model.background,
+        render=model.render, visibility_map=visibility_map, facts=_facts(trained), background=model.background,
         seen_map=seen_map(render_depth, [view.camera for view in capture.train_views]),
-        true_depth=true_depth(capture, capture.test_views),
-        render_depth=render_depth,
+        true_depth=true_depth(capture, capture.test_views), render_depth=render_depth,
         camera_height=camera_height(capture),
-    )
+    )  # fmt: skip
     with cached_photographs(capture.test_views) as photographs:
         result = evaluate(
             photographs, measured, output, lpips=lpips, lpips_note=note, settings=settings, console=console
         )
-    result = {**result, "n_gaussians": len(model.gaussians)}
-    write_json(output / "metrics.json", result)
-    return result
+    of_gaussians = {**dict(result), "n_gaussians": len(model.gaussians)}
+    write_json(output / "metrics.json", of_gaussians)
+    return of_gaussians
 
 
 def _facts(trained: StageFolder | None) -> ModelFacts:

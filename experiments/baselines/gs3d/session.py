@@ -55,7 +55,7 @@ def train_watched(
     """Train to the end, showing, logging and saving on the way. Raises what `watch` raises."""
     journal = _Journal(folder, stage.config, console)
     training = Watched(
-        folder, state,
+        folder=folder, state=state,
         to_saved=lambda: to_saved(state),
         status=lambda: journal.status(state),
         size=lambda: f"{len(state.gaussians):,} Gaussians",
@@ -99,7 +99,7 @@ class _Journal:
     def status(self, state: GaussiansState) -> Status:
         """Where training stands."""
         return Status(
-            "running", iteration=state.iteration, iterations=self._config.iterations,
+            state="running", iteration=state.iteration, iterations=self._config.iterations,
             psnr_training=_number(state.psnr), seconds=round(state.seconds, 1),
             peak_memory_bytes=state.peak_memory_bytes,
         )  # fmt: skip
@@ -122,7 +122,7 @@ def finish(folder: StageFolder, state: GaussiansState, model: GaussiansModel, co
     save_state(folder.checkpoints, to_saved(state))
     model.save(folder.model)
     status = Status(
-        "done", iteration=state.iteration, iterations=state.iteration,
+        state="done", iteration=state.iteration, iterations=state.iteration,
         seconds=state.seconds, psnr_training=_number(state.psnr), peak_memory_bytes=state.peak_memory_bytes,
     )  # fmt: skip
     folder.set_status(status)

@@ -15,7 +15,7 @@ from vdgs.captures.sightings import Sightings
 Split = Literal["train", "test"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class GroundFrame(Similarity):
     """The similarity that brings the capture's own world into the ground frame (z up)."""
 
@@ -52,7 +52,7 @@ class GroundFrame(Similarity):
         return self.apply(points)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class View:
     """One photograph: its camera in the ground frame, at the size at which it is used."""
 
@@ -65,7 +65,7 @@ class View:
     sightings: Sightings | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Capture:
     """A folder of photographs with cameras and sparse points, checked, in the ground frame."""
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from vdgs.captures.capture import Capture, View
 from vdgs.errors import RunError
+from vdgs.storage.documents import CaptureMetadata
 
 
-def capture_facts(capture: Capture) -> dict[str, Any]:
+def capture_facts(capture: Capture) -> CaptureMetadata:
     """What capture.json and a model say about where they come from."""
     ground = capture.ground
     return {
@@ -41,9 +42,9 @@ def fingerprint(capture: Capture) -> dict[str, int]:
     }
 
 
-def refuse_another_capture(source: Path, before: Mapping[str, Any], capture: Capture) -> None:
+def refuse_another_capture(source: Path, before: CaptureMetadata | Mapping[str, Any] | None, capture: Capture) -> None:
     """Raise RunError, naming what changed, unless `capture` is the one that `before` (capture_facts) describes."""
-    known = before.get("fingerprint")
+    known = (before or {}).get("fingerprint")
     if not isinstance(known, Mapping):
         raise RunError(f"{source}: does not say which capture the run belongs to. It is damaged; start a new --output.")
     changed = [part for part, crc in fingerprint(capture).items() if known.get(part) != crc]

@@ -113,7 +113,7 @@ def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFram
     shift = np.where(np.abs(middle) > FAR_FROM_ORIGIN_M, -np.round(middle), 0.0)
     if shift.any():
         how = f"{how}, origin moved by {np.abs(shift).max():.0f} m"
-    frame = GroundFrame(1.0, np.eye(3), np.zeros(3), True, how, origin)
+    frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how=how, origin_geo=origin)
     if np.linalg.norm(middle) > FARTHEST_ENU_M:
         warnings.append(
             f"{file.name}: the cameras are {np.linalg.norm(middle) / 1000:,.0f} km away from the origin, where its "
@@ -162,7 +162,10 @@ def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | N
         warnings.append(f"{file.name}: {(~inliers).sum()} GPS positions left out as outliers ({names}).")
     rms = float(np.sqrt((residuals[inliers] ** 2).sum(axis=1).mean()))
     how = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m"
-    frame = GroundFrame(similarity.scale, similarity.rotation, similarity.translation, True, how, origin)
+    frame = GroundFrame(
+        scale=similarity.scale, rotation=similarity.rotation, translation=similarity.translation, metric=True, how=how,
+        origin_geo=origin,
+    )  # fmt: skip
     frame = _shifted(frame, -_middle(frame.to_ground(scene.points)), how)
     _compare_up(scene, frame, warnings)
     return frame
@@ -216,7 +219,7 @@ def _promised(scene: _Scene, world: KnownWorld, warnings: list[str]) -> GroundFr
 
 def _centred(scene: _Scene, rotation: np.ndarray, scale: float, metric: bool, how: str) -> GroundFrame:
     middle = _middle(scale * scene.points @ rotation.T)
-    return GroundFrame(scale, rotation, -middle, metric, how)
+    return GroundFrame(scale=scale, rotation=rotation, translation=-middle, metric=metric, how=how)
 
 
 def _middle(points: np.ndarray) -> np.ndarray:

@@ -149,10 +149,13 @@ def _view(photo: FoundView, options: CaptureOptions, ground: GroundFrame) -> Vie
     (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.principal_point
     width, height = intrinsics.width, intrinsics.height
     pose = transform_pose(photo.view.camera_from_world, ground)
-    camera = Camera(pose, fx, fy, cx, cy, width, height)
+    camera = Camera(camera_from_world=pose, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
     if options.downscale != 1:
         width, height = int(width / options.downscale), int(height / options.downscale)
         camera = camera.resized(width, height)
     seen = photo.view.sightings
     sightings = None if seen is None else Sightings(ground.to_ground(seen.points), seen.rays, seen.numbers)
-    return View(photo.view.name, camera, photo.file.path, photo.file.mask, "train", sightings)
+    return View(
+        name=photo.view.name, camera=camera, image_path=photo.file.path, mask_path=photo.file.mask, split="train",
+        sightings=sightings,
+    )  # fmt: skip

@@ -17,7 +17,7 @@ WORK = "work"
 STEPS = "steps.json"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CameraFacts:
     """One camera before and after; the focal length in pixels of its longer side's size."""
 
@@ -55,7 +55,7 @@ class SurveyFacts:
     """RMS distance from where photographs show it to where the model puts it there."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReconstructionFacts:
     """What a person should know about a reconstruction."""
 

@@ -26,13 +26,13 @@ def block_inputs(opened: TrainedRun, coarse: TrainedRun, photographs: ReferenceV
     """Where the pictures of a run's blocks come from; the merged model is the one that was opened."""
     run = opened.folder
     return BlockInputs(
-        photographs,
+        photographs=photographs,
         render_coarse=lambda camera: render(coarse.model, camera, depth=True),
         render_merged=lambda camera: render(opened.model, camera, depth=True),
         render_block=BlocksAlone(run, coarse.model).render,
         blocks=blocks_of(run),
         exposure=exposures_of(opened.model, opened.capture),
-    )
+    )  # fmt: skip
 
 
 class BlocksAlone:

@@ -9,7 +9,7 @@ pass, memory bounded whatever the number of test views.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from vdgs.cameras import Camera
 from vdgs.evaluation.metrics import psnr_of
 from vdgs.kernels.types import Raster
 from vdgs.partition.blocks import Blocks
+from vdgs.storage.documents import JsonObject
 
 #: Pixels this near to a change of label belong to the border.
 BORDER_PX = 10.0
@@ -139,15 +140,15 @@ class BlockMetrics(_Pooled):
         for name, total in self._sums.items():
             total += np.bincount(keys, weights=squared_errors[name][counted], minlength=len(total))
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> list[dict[str, float]]:
         """For each block: block, pixels, and `psnr_NAME` in dB of each render, NaN where it has none."""
         return [{"block": index, **self._figures([index])} for index in range(len(self._pixels))]
 
-    def everywhere(self) -> dict[str, Any]:
+    def everywhere(self) -> dict[str, float]:
         """The same over the pixels of all blocks."""
         return self._figures(list(range(len(self._pixels))))
 
-    def _figures(self, chosen: list[int]) -> dict[str, Any]:
+    def _figures(self, chosen: list[int]) -> dict[str, float]:
         pixels = int(self._pixels[chosen].sum())
         means = {name: float(sums[chosen].sum()) / pixels if pixels else np.nan for name, sums in self._sums.items()}
         return {"pixels": pixels, **{f"psnr_{name}": psnr_of(mean) for name, mean in means.items()}}
@@ -176,10 +177,10 @@ class SeamMetrics(_Pooled):
             for name, sums in self._sums.items():
                 sums[place] += errors[name][where].sum()
 
-    def figures(self) -> dict[str, Any]:
+    def figures(self) -> JsonObject:
         """Means at the border and elsewhere, their ratio for each render, and `seam_mae`, `seam_mse`: the ratio of the
         merged render over that of the coarse one. Above 1, merging left seams; NaN where there are no borders."""
-        result: dict[str, Any] = {"border_pixels": int(self._pixels[0]), "other_pixels": int(self._pixels[1])}
+        result: JsonObject = {"border_pixels": int(self._pixels[0]), "other_pixels": int(self._pixels[1])}
         for name, sums in self._sums.items():
             border, elsewhere = (_ratio(float(sums[place]), float(self._pixels[place])) for place in (0, 1))
             result[name] = {"border": border, "elsewhere": elsewhere, "ratio": _ratio(border, elsewhere)}

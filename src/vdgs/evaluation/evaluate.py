@@ -33,6 +33,7 @@ from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.solidity import largest_splats_of_all, solidity_of_all
 from vdgs.evaluation.tables import metrics_table
 from vdgs.evaluation.view import AFFINE, CORRECTED, NEUTRAL, RAW, ViewFigures, ViewInputs, measure_view
+from vdgs.storage.documents import EvaluationMetrics, JsonObject
 from vdgs.storage.files import jsonable, write_json
 from vdgs.watching.interrupts import stop_if_asked
 
@@ -41,7 +42,7 @@ from vdgs.watching.interrupts import stop_if_asked
 class _Gathered:
     """What accumulates over the views."""
 
-    rows: list[dict[str, Any]] = field(default_factory=list)
+    rows: list[JsonObject] = field(default_factory=list)
     cells: list[pictures.Thumbnail] = field(default_factory=list)
     histogram: VisibilityHistogram | None = None
     depth_errors: dict[str, DepthErrors] = field(default_factory=dict)
@@ -66,7 +67,7 @@ def evaluate(
     lpips_note: str = "",
     settings: EvaluationSettings | None = None,
     console: Console | None = None,
-) -> dict[str, Any]:
+) -> EvaluationMetrics:
     """Render and measure every view, write `output`, and return what `metrics.json` holds.
 
     `lpips_note` says why LPIPS is null. A table is printed to `console` if there is one. fps is one over the median
@@ -107,7 +108,7 @@ def conclude(
     settings: EvaluationSettings,
     timed: bool,
     console: Console | None,
-) -> dict[str, Any]:
+) -> EvaluationMetrics:
     """Gather views, in their order, into the figures of all of them; otherwise as `evaluate`. One is held at a time."""
     gathered = _Gathered()
     for figures in measured:
@@ -121,7 +122,7 @@ def conclude(
 
 def _summary(
     gathered: _Gathered, facts: ModelFacts, lpips_note: str, settings: EvaluationSettings, timed: bool
-) -> dict[str, Any]:
+) -> EvaluationMetrics:
     rows = gathered.rows
     means = {name: mean_or_none([row[name] for row in rows]) for name in RAW + CORRECTED + AFFINE}
     pixel_bins = gathered.histogram.bins(settings.visibility_bins) if gathered.histogram else None
@@ -144,7 +145,8 @@ def _summary(
         settings.title.replace(" ", "_"): len(rows),
         "notes": notes,
     }
-    return jsonable(result)
+    measured: EvaluationMetrics = jsonable(result)
+    return measured
 
 
 def _exposure_note(rows: Sequence[Mapping[str, Any]], settings: EvaluationSettings) -> str:

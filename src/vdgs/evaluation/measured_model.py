@@ -24,7 +24,7 @@ class RenderedView(Protocol):
     def image(self) -> Float[Tensor, "h w 3"]: ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ModelFacts:
     """What the evaluation reports of the model but cannot measure itself; None is unknown."""
 
@@ -39,7 +39,7 @@ class ModelFacts:
     key: str | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class MeasuredModel:
     """A model as the evaluation sees it. Whatever is None is not known, and so are the figures that need it."""
 
@@ -70,7 +70,7 @@ class MeasuredModel:
             raise ValueError("true_depth needs render_depth and a camera_height above 0")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EvaluationSettings:
     """What to measure and draw."""
 

@@ -90,17 +90,12 @@ def measured_model(run: TrainedRun, coarse: TrainedRun, views: Views) -> Measure
         key=run.key,
     )
     return MeasuredModel(
-        lambda camera: render(run.model, camera),
-        visibility_map(coarse),
-        facts,
-        background=run.model.background,
-        seen_map=seen_by_run(coarse),
+        render=lambda camera: render(run.model, camera), visibility_map=visibility_map(coarse), facts=facts,
+        background=run.model.background, seen_map=seen_by_run(coarse),
         true_depth=true_depth(run.capture, views_of(run.capture, views)),
-        render_depth=lambda camera: render(run.model, camera, depth=True),
-        camera_height=camera_height(run.capture),
-        splats_of=lambda camera: decode_view(run.model, camera)[1],
-        exposure=exposures_of(run.model, run.capture),
-    )
+        render_depth=lambda camera: render(run.model, camera, depth=True), camera_height=camera_height(run.capture),
+        splats_of=lambda camera: decode_view(run.model, camera)[1], exposure=exposures_of(run.model, run.capture),
+    )  # fmt: skip
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from vdgs.evaluation.depth_errors import DepthErrors
 from vdgs.evaluation.pictures import Thumbnail
 from vdgs.evaluation.seams import BlockFigures
 from vdgs.evaluation.view import ViewFigures
+from vdgs.storage.documents import JsonObject
 from vdgs.storage.files import write_bytes
 
 FORMAT = "vdgs-view-1"
@@ -82,5 +83,5 @@ def _text(row: Mapping[str, Any]) -> np.ndarray:
     return np.array(json.dumps(row, ensure_ascii=False))
 
 
-def _row(part: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def _row(part: Mapping[str, np.ndarray]) -> JsonObject:
     return dict(json.loads(str(part["row"])))

@@ -40,6 +40,7 @@ from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.tables import shown
 from vdgs.kernels.types import Raster
 from vdgs.partition.blocks import Blocks
+from vdgs.storage.documents import BlockMetricsDocument, JsonObject
 from vdgs.storage.files import jsonable, write_json
 from vdgs.watching.interrupts import stop_if_asked
 
@@ -51,7 +52,7 @@ SEAM_VIEWS = 6
 LINE_COLOUR, RIM_COLOUR = (255, 236, 64), (20, 20, 20)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SeamView:
     """What the picture of a view shows: renders and photograph in 8 bits, the label of each pixel."""
 
@@ -70,7 +71,7 @@ class SeamView:
         return int(np.count_nonzero(self.border))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class BlockInputs:
     """Where the images of a view come from. `render_merged` draws depth; the labels follow from the median one.
     `render_block(index, camera)` is the image of a block as it was trained, among its frozen surroundings; None where
@@ -93,12 +94,12 @@ class BlockInputs:
 class BlockFigures:
     """What one view says of the blocks."""
 
-    row: dict[str, Any]
+    row: JsonObject
     by_block: BlockMetrics
     seams: SeamMetrics
 
 
-def evaluate_blocks(inputs: BlockInputs, output: Path) -> dict[str, Any]:
+def evaluate_blocks(inputs: BlockInputs, output: Path) -> BlockMetricsDocument:
     """Measure every test view, write `output`, and return what `by_block.json` holds. One view is in memory at a time,
     and those that are drawn.
 
@@ -129,14 +130,14 @@ def save_picture(path: Path, view: SeamView) -> None:
     saving.write_png(path, np.asarray(seam_picture(view)))
 
 
-def conclude(measured: Iterable[BlockFigures], blocks: int, output: Path) -> dict[str, Any]:
+def conclude(measured: Iterable[BlockFigures], blocks: int, output: Path) -> BlockMetricsDocument:
     """Gather views, in their order, into what `by_block.json` holds, and write it: once its pictures are complete."""
-    by_block, seams, rows = BlockMetrics(blocks, RENDERS), SeamMetrics(), list[dict[str, Any]]()
+    by_block, seams, rows = BlockMetrics(blocks, RENDERS), SeamMetrics(), list[JsonObject]()
     for figures in measured:
         by_block.merge(figures.by_block)
         seams.merge(figures.seams)
         rows.append(figures.row)
-    result: dict[str, Any] = jsonable(
+    result: BlockMetricsDocument = jsonable(
         {
             "blocks": by_block.rows(),
             "all": by_block.everywhere(),
@@ -163,7 +164,10 @@ def measure_view(view: View, stem: str, inputs: BlockInputs) -> tuple[BlockFigur
     errors["mae_merged"] = pictures.absolute_error(merged, reference)
     seams.add(labels, errors, mask)
     kept = border_pixels(labels) if mask is None else border_pixels(labels) & mask
-    seen = SeamView(view.name, stem, coarse, merged, reference, mask, labels, kept)
+    seen = SeamView(
+        name=view.name, stem=stem, coarse=coarse, merged=merged, reference=reference, mask=mask, labels=labels,
+        border=kept,
+    )  # fmt: skip
     row = {
         "name": view.name,
         "border_pixels": seen.border_pixels,

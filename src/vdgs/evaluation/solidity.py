@@ -62,16 +62,16 @@ class Rendered:
 
 def solidity_of_view(
     rendered: Rendered, reference: UInt8[np.ndarray, "h w 3"], seen: Bool[np.ndarray, "h w"] | None
-) -> dict[str, Any]:
+) -> dict[str, float | None]:
     """The figures of one view; None where alpha, the background or the seen pixels are not known, or there are none."""
-    row: dict[str, Any] = {"seen_pixels": None, "solid_pixels": None, "solid_share": None}
+    row: dict[str, float | None] = {"seen_pixels": None, "solid_pixels": None, "solid_share": None}
     row |= dict.fromkeys(PSNRS_SEEN)
     if seen is None:
         return row
     count = row["seen_pixels"] = int(np.count_nonzero(seen))
     if rendered.alpha is not None:
-        row["solid_pixels"] = int(np.count_nonzero(rendered.alpha[seen] >= SOLID_ALPHA))
-        row["solid_share"] = row["solid_pixels"] / count if count else None
+        solid = row["solid_pixels"] = int(np.count_nonzero(rendered.alpha[seen] >= SOLID_ALPHA))
+        row["solid_share"] = solid / count if count else None
     pictures = to_8bit(rendered.image), rendered.before(_BLACK), rendered.before(_WHITE)
     for name, picture in zip(PSNRS_SEEN, pictures, strict=True):
         if picture is not None and count:
@@ -79,7 +79,7 @@ def solidity_of_view(
     return row
 
 
-def solidity_of_all(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def solidity_of_all(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
     """The figures of all views, from the rows of each: shares of all seen pixels, means of PSNR over the views."""
     known = [row for row in rows if row["solid_pixels"] is not None]
     seen = sum(row["seen_pixels"] for row in known)
@@ -109,7 +109,7 @@ def larger_than_picture(splats: Splats, width: int, height: int) -> int:
     return int((drawn & touching & (diameter > max(width, height))).sum())
 
 
-def largest_splats_of_all(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def largest_splats_of_all(rows: Sequence[Mapping[str, Any]]) -> dict[str, int | str | None]:
     """Splats larger than the picture over all views, and the view with most of them, from `largest_splats` of each."""
     known = [row for row in rows if row["largest_splats"] is not None]
     worst = max(known, key=lambda row: row["largest_splats"], default=None)

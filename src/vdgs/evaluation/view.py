@@ -28,6 +28,7 @@ from vdgs.evaluation.lpips import MIN_SIDE_PX, Lpips
 from vdgs.evaluation.measured_model import EvaluationSettings, MeasuredModel
 from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.evaluation.solidity import Rendered, larger_than_picture, solidity_of_view
+from vdgs.storage.documents import JsonObject
 
 RAW = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")
 CORRECTED = tuple(f"{name}_cc" for name in RAW)
@@ -63,7 +64,7 @@ class ViewInputs:
 class ViewFigures:
     """What a view comes to."""
 
-    row: dict[str, Any]
+    row: JsonObject
     """Its figures, plain values: an entry of per_view.json."""
     by_visibility: VisibilityHistogram | None = None
     """Of its pixels alone; None where V is not known."""
@@ -97,7 +98,7 @@ def measure_view(index: int, inputs: ViewInputs) -> ViewFigures:
     saving.write_png(inputs.output / "renders" / f"{stem}.png", image)
     raw = _Pair(image, reference, mask)
     maps = _maps(raw, "")
-    row: dict[str, Any] = {
+    row: JsonObject = {
         "name": view.name,
         "render": f"renders/{stem}.png",
         "alpha": _write_alpha(inputs.output, stem, rendered),

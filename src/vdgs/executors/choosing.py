@@ -126,7 +126,7 @@ def _slurm(asked: ExecutorOptions, work: Work, question: Question) -> Chosen:
     share = by_queue(work, asked)
     options = asked.slurm
     executor = SlurmExecutor(
-        share.at_once, poll_seconds=options.poll_seconds, patience_seconds=PATIENCE_SECONDS, question=question,
+        at_once=share.at_once, poll_seconds=options.poll_seconds, patience_seconds=PATIENCE_SECONDS, question=question,
         options=options,
     )  # fmt: skip
     return Chosen(executor, share, f"as jobs of SLURM, {_needs(share)} each")

@@ -259,7 +259,9 @@ class _Crew:
     def _end(self, work: _Work, state: EndState, why: str = "") -> None:
         seconds = time.monotonic() - work.began if work.attempts and work.began else 0.0
         lines = tuple(last_lines(work.task.output, work.output_from)) if state == "failed" and work.told else ()
-        work.outcome = Outcome(work.task.name, state, work.attempts, seconds, why, lines)
+        work.outcome = Outcome(
+            name=work.task.name, state=state, attempts=work.attempts, seconds=seconds, why=why, last_lines=lines
+        )
         self._listener.ended(work.task, work.outcome)
 
 

@@ -29,7 +29,7 @@ class Needs:
     """Shares of one are possible where the engine knows them."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Task:
     """A command that can be repeated."""
 
@@ -46,7 +46,7 @@ class Task:
     needs: Needs = field(default_factory=Needs)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Outcome:
     """How a task ended."""
 

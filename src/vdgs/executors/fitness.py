@@ -9,17 +9,17 @@ import hashlib
 import os
 import platform
 import socket
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 from uuid import uuid4
 
 from vdgs import __version__
 from vdgs.captures.capture import View
 from vdgs.runs.locks import hold, is_locked
+from vdgs.storage.documents import FitnessAnswer, FitnessQuestion
 from vdgs.storage.files import write_text
 
 #: Files that are looked for by their size, at most (the first, the last and some between).
@@ -37,17 +37,17 @@ class Question:
     files: Sequence[Path]
     """Photographs and models that must be there, of the size that they have here."""
 
-    def plain(self, held: Path | None = None) -> dict[str, Any]:
+    def plain(self, held: Path | None = None) -> FitnessQuestion:
         """The question as plain values; `held` is a folder that this process holds."""
         step = max(1, -(-len(self.files) // MOST_FILES))
         chosen = [*self.files[::step], *self.files[-1:]]
         return {
-            "folder": str(self.folder), "files": [[str(file), _size(file)] for file in chosen],
+            "folder": str(self.folder), "files": [(str(file), _size(file)) for file in chosen],
             "code": code_identity(), "version": __version__, "held": None if held is None else str(held),
         }  # fmt: skip
 
     @contextmanager
-    def asked(self) -> Iterator[dict[str, Any]]:
+    def asked(self) -> Iterator[FitnessQuestion]:
         """The question while this process holds a folder in the run folder, so that others can be asked to see that."""
         held = self.folder / f".fitness-{uuid4().hex}"
         try:
@@ -65,7 +65,7 @@ def photographs_of(views: Sequence[View]) -> list[Path]:
     return [path for view in views for path in (view.image_path, view.mask_path) if path is not None]
 
 
-def examine(question: Mapping[str, Any]) -> dict[str, Any]:
+def examine(question: FitnessQuestion) -> FitnessAnswer:
     """This machine's answer: its `node`, the `processor`'s instructions, and the `problems` that it sees, in words."""
     problems = [*_folder(question), *_files(question["files"]), *_code(question)]
     return {"node": socket.gethostname(), "processor": instructions(), "problems": problems}
@@ -81,7 +81,7 @@ def code_identity() -> str:
     return digest.hexdigest()[:16]
 
 
-def _folder(question: Mapping[str, Any]) -> list[str]:
+def _folder(question: FitnessQuestion) -> list[str]:
     folder, held = Path(question["folder"]), question["held"]
     if not folder.is_dir():
         return [f"there is no {folder}. All nodes must share the file system that it lies on"]
@@ -112,7 +112,7 @@ def _files(files: Sequence[tuple[str, int]]) -> list[str]:
     return []
 
 
-def _code(question: Mapping[str, Any]) -> list[str]:
+def _code(question: FitnessQuestion) -> list[str]:
     if question["version"] != __version__:
         return [f"it has vdgs {__version__}, this machine {question['version']}. Install the same on all"]
     if question["code"] != code_identity():

@@ -13,17 +13,17 @@ import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from vdgs.executors.engine import Begun, End
 from vdgs.executors.fitness import examine
 from vdgs.executors.process import Process, out_of_memory_kills
+from vdgs.storage.documents import FitnessQuestion
 
 #: Seconds that the end of a command waits for a driver.
 COLLECT_SECONDS = 300.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Order:
     """What a keeper is to run, in plain values."""
 
@@ -33,7 +33,7 @@ class Order:
     attempt: int
     python: str
     """The driver's interpreter; a node takes its own instead."""
-    question: Mapping[str, Any]
+    question: FitnessQuestion
     """What the node must see (`fitness`): nodes join late."""
 
 

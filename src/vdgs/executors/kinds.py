@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Kind:
     """The words for the shards of a stage."""
 
@@ -26,11 +26,11 @@ class Kind:
 
 
 BLOCKS = Kind(
-    "block", "blocks", "train", "training", "iteration", "it/s", trains=True,
+    one="block", many="blocks", work="train", doing="training", steps="iteration", pace="it/s", trains=True,
     smaller=("more --blocks", "--block.growth.max-anchors"),
 )  # fmt: skip
 
 
 def shard_kind(work: str, steps: str) -> Kind:
     """The words for shards that do something (`measure`) with items (`views`)."""
-    return Kind("shard", "shards", work, "at work", steps, f"{steps}/s")
+    return Kind(one="shard", many="shards", work=work, doing="at work", steps=steps, pace=f"{steps}/s")

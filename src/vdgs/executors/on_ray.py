@@ -26,6 +26,7 @@ from vdgs.executors.executor import Listener, Outcome, Task
 from vdgs.executors.fitness import Question
 from vdgs.executors.keeper import Keeper, Order, Unfit
 from vdgs.executors.parent import PARENT
+from vdgs.storage.documents import FitnessAnswer, FitnessQuestion
 
 NAMESPACE = "vdgs"
 #: Memory for Ray's own objects, of which there are none: the least that it takes.
@@ -149,7 +150,7 @@ def nodes() -> list[Node]:
     return found
 
 
-def ask_nodes(question: Question, there: Sequence[Node]) -> list[dict[str, Any]]:
+def ask_nodes(question: Question, there: Sequence[Node]) -> list[FitnessAnswer]:
     """Every node's answer (`fitness.examine`), but for nodes that are gone meanwhile.
 
     Raises VdgsError, naming nodes and what is wrong, if one is unfit.
@@ -158,7 +159,7 @@ def ask_nodes(question: Question, there: Sequence[Node]) -> list[dict[str, Any]]
 
     with question.asked() as plain:
         asked = {node: _visit(node.identity, plain) for node in there}
-        answers, problems = list[dict[str, Any]](), list[str]()
+        answers, problems = list[FitnessAnswer](), list[str]()
         for node, answer in asked.items():
             try:
                 answers.append(ray.get(answer, timeout=ANSWER_SECONDS))
@@ -172,12 +173,12 @@ def ask_nodes(question: Question, there: Sequence[Node]) -> list[dict[str, Any]]
     return answers
 
 
-def _visit(node: str, question: Mapping[str, Any]) -> Any:
+def _visit(node: str, question: FitnessQuestion) -> Any:
     """Ask one node. The function travels whole, for a node may have no vdgs."""
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    def look() -> dict[str, Any]:
+    def look() -> FitnessAnswer:
         import socket
 
         try:
@@ -224,8 +225,8 @@ class _Cluster:
         import ray
 
         order = Order(
-            tuple(task.command), str(task.output), _environment() | dict(task.environment), attempt, sys.executable,
-            self._question,
+            command=tuple(task.command), output=str(task.output), environment=_environment() | dict(task.environment),
+            attempt=attempt, python=sys.executable, question=self._question,
         )  # fmt: skip
         needs = task.needs
         options: dict[str, Any] = {"num_cpus": needs.processors, "num_gpus": needs.gpus}

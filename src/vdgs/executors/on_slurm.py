@@ -16,7 +16,6 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from vdgs.errors import VdgsError
 from vdgs.executors.crew import Policy, run_crew
@@ -37,6 +36,7 @@ from vdgs.executors.slurm_commands import (
 )
 from vdgs.executors.slurm_job import Record, read
 from vdgs.settings.executors import SlurmOptions
+from vdgs.storage.documents import JsonObject
 from vdgs.storage.files import read_record, write_json, write_text
 
 __all__ = ["SlurmExecutor", "refuse_without_slurm"]
@@ -54,7 +54,7 @@ ENDS = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SlurmExecutor(Policy):
     """Runs tasks as jobs of SLURM."""
 
@@ -240,7 +240,7 @@ class _SlurmAttempt:
         return End(None, f"{how}{where}", state == "OUT_OF_MEMORY")
 
 
-def _plain(task: Task, attempt: int) -> dict[str, Any]:
+def _plain(task: Task, attempt: int) -> JsonObject:
     own = {name: value for name, value in os.environ.items() if name.startswith("VDGS_") and name != PARENT}
     return {
         "name": task.name, "command": list(task.command), "output": str(task.output), "attempt": attempt,

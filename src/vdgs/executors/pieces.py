@@ -41,7 +41,7 @@ class Piece:
         return self.folder.path / "output.log"
 
     def task(self) -> Task:
-        return Task(self.name, self.command, self.output, folder=self.folder.path, needs=self.needs)
+        return Task(name=self.name, command=self.command, output=self.output, folder=self.folder.path, needs=self.needs)
 
 
 def default_jobs(pieces: int, cores: int, memory_available: int, memory_each: int) -> tuple[int, int]:

@@ -31,7 +31,7 @@ class Place(Protocol):
         """0 where it does not say."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Work:
     """What is to be shared out."""
 

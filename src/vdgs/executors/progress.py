@@ -15,7 +15,7 @@ WINDOW = 20
 LARGEST = 1e12
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Figures:
     """What a status file says; None where it says nothing that can be used."""
 

@@ -107,7 +107,7 @@ def shard_session(folder: StageFolder, done: int, total: int) -> Iterator[Callab
         taken = time.monotonic() - began
         left = round((total - done) * taken / (done - before)) if done > before else None
         return Status(
-            state, why, iteration=done, iterations=total, seconds=taken, seconds_left=left,
+            state=state, why=why, iteration=done, iterations=total, seconds=taken, seconds_left=left,
             peak_memory_bytes=peak_memory_bytes(),
         )  # fmt: skip
 

@@ -170,7 +170,10 @@ class ShardedJob:
         VdgsError where a machine of a cluster cannot do the work, before anything starts.
         """
         kind = self.kind
-        work = Work(len(left), needs.memory_bytes, wish.jobs, wish.image_gb, kind, needs.photographs_bytes)
+        work = Work(
+            pieces=len(left), piece_bytes=needs.memory_bytes, jobs=wish.jobs, image_gb=wish.image_gb, kind=kind,
+            photographs_bytes=needs.photographs_bytes,
+        )  # fmt: skip
         machine = Machine(threads_available(), available_bytes())
         with choose(wish.where, work, machine, needs.question) as chosen:
             line = f"{len(left)} of {of} {kind.many} to {kind.work}, {chosen.line}"
@@ -198,7 +201,7 @@ class ShardedJob:
             folder = self.shard(index)
             with suppress(RunError), folder.locked():
                 if not self.is_done(index):
-                    folder.set_status(Status("queued"))
+                    folder.set_status(Status(state="queued"))
 
     def _command(self, index: int, share: Share, device: str) -> list[str]:
         # A GPU that a shard is given is not this machine's.

@@ -21,10 +21,11 @@ from vdgs.executors.engine import EXPLAINED, STOPPED
 from vdgs.executors.fitness import examine
 from vdgs.executors.process import Process, out_of_memory_kills
 from vdgs.executors.slurm_commands import Element, requeue
+from vdgs.storage.documents import JsonObject
 from vdgs.storage.files import read_json, write_json
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Record:
     """How far an element is, in FOLDER/n.json."""
 
@@ -63,7 +64,10 @@ def main(arguments: list[str]) -> int:
     written = read_json(folder / "tasks.json")
     task, before = written["tasks"][str(element.index)], read(folder, element.index)
     answer = examine(written["question"])
-    tell = _teller(record_file(folder, element.index), Record(socket.gethostname(), _size(task["output"]), turn))
+    tell = _teller(
+        record_file(folder, element.index),
+        Record(node=socket.gethostname(), output_from=_size(task["output"]), turn=turn),
+    )
     if answer["problems"]:
         tell(code=EXPLAINED[0], unfit=answer["problems"][0])
         return EXPLAINED[0]
@@ -98,7 +102,7 @@ def _pass_on(process: Process) -> list[int]:
 
 def _teller(file: Path, record: Record) -> Callable[..., None]:
     """A function that adds to the record of this element."""
-    known: dict[str, Any] = asdict(record)
+    known: JsonObject = asdict(record)
 
     def tell(**facts: Any) -> None:
         known.update(facts)

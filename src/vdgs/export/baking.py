@@ -130,7 +130,7 @@ def bake(
         after_part(done)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Pairs:
     """p pairs of a Gaussian and a camera that shows it, sorted by Gaussian."""
 
@@ -163,7 +163,11 @@ def _gathered(seen: Seen, wanted: Int[np.ndarray, " m"]) -> _Pairs:
     place, *rest = (torch.cat(column) for column in zip(*columns, strict=True))
     order, counts = sorted_runs(place, 0, len(wanted))
     starts = (counts.cumsum(0) - counts).numpy()
-    return _Pairs(starts, *(column.index_select(0, order) for column in rest))
+    pixels, directions, colours, opacities, log_scales, quaternions = (each.index_select(0, order) for each in rest)
+    return _Pairs(
+        starts=starts, pixels=pixels, directions=directions, colours=colours, opacities=opacities,
+        log_scales=log_scales, quaternions=quaternions,
+    )  # fmt: skip
 
 
 def _seen_from(model: AnchorModel, gaussians: Tensor, camera: Camera) -> tuple[Tensor, ...]:

@@ -111,7 +111,7 @@ class BakedElsewhere:
 
         def write(file: Path) -> None:
             if number == 0:
-                spooled(Scene(self._parts(), count, self._asked.sh_degree), file)
+                spooled(Scene(chunks=self._parts(), count=count, degree=self._asked.sh_degree), file)
                 return
             shutil.copyfile(self._work.spool_file(number - 1), file)
             spool = opened(file, self._asked.sh_degree, writable=True)

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -37,6 +36,7 @@ from vdgs.model.gaussians import Gaussians
 from vdgs.runs.folder import REPORT
 from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.settings.requests import ExportRequest
+from vdgs.storage.documents import ExportedFile, ExportMetadata, JsonObject
 from vdgs.storage.files import jsonable, write_json
 from vdgs.watching.interrupts import stop_if_asked
 
@@ -57,7 +57,7 @@ class _Baked:
         """What a writer is given: the Gaussians of these rows."""
         chunks = (frame.place(piece) for piece in self.pieces(rows))
         bounds, page = bounds_of(frame, self.spool.means[rows]), _placed(self.page, frame)
-        return Scene(chunks, len(rows), self.degree, frame.facts, bounds, page)
+        return Scene(chunks=chunks, count=len(rows), degree=self.degree, facts=frame.facts, bounds=bounds, page=page)
 
     def pieces(self, rows: Int[np.ndarray, " r"]) -> Iterator[Gaussians]:
         """These Gaussians, some thousand at a time."""
@@ -87,7 +87,7 @@ def _point(place: np.ndarray) -> tuple[float, float, float]:
     return x, y, z
 
 
-def export_run(asked: ExportRequest, console: Console, wish: Wish | None = None) -> dict[str, Any]:
+def export_run(asked: ExportRequest, console: Console, wish: Wish | None = None) -> ExportMetadata:
     """Write what was asked for, on a device that is chosen already; returns what RUN/export.json holds.
 
     The scene is baked in this process, or in shards where a `wish` sends them: the files are the same. Raises
@@ -123,7 +123,7 @@ def export_run(asked: ExportRequest, console: Console, wish: Wish | None = None)
             console.print(f"baked in {seconds:.1f} s, colours fitted again in {rounds} rounds", highlight=False)
             files = [_write(path, baked.scene(frames[path], rows[path]), console) for path in asked.to]
             losses = _losses(run, frames, baked, asked, console)
-    record = jsonable({
+    record: ExportMetadata = jsonable({
         "model": run.name, "key": run.key, "gaussians": len(kept), "sh_degree": asked.sh_degree, "rounds": rounds,
         "seconds_to_bake": seconds, "seconds_to_refine": asked.refine, "files": files, "losses": losses,
     })  # fmt: skip
@@ -171,7 +171,7 @@ def _check_names(run: Path, paths: tuple[Path, ...]) -> None:
         raise VdgsError(f"--to {twice[0]}: is given twice.")
 
 
-def _write(path: Path, scene: Scene, console: Console) -> dict[str, Any]:
+def _write(path: Path, scene: Scene, console: Console) -> ExportedFile:
     began = time.monotonic()
     lost = registry.write(path, scene)
     seconds, size = time.monotonic() - began, _size(path)
@@ -190,7 +190,7 @@ def _size(path: Path) -> int:
 
 def _losses(
     run: TrainedRun, frames: dict[Path, Frame], baked: _Baked, asked: ExportRequest, console: Console
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """What each file that can be read back loses, or, where none can, the Gaussians that were written."""
     if not asked.measure:
         return []

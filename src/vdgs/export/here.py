@@ -75,7 +75,7 @@ class BakedHere:
             stop_if_asked()
             bar.update(task, completed=done)
 
-        return spooled(Scene(bake(seen, kept, degree, after_part), len(kept), degree), file)
+        return spooled(Scene(chunks=bake(seen, kept, degree, after_part), count=len(kept), degree=degree), file)
 
     def _improve(self, baked: Baked, bar: Progress) -> None:
         """Fit the colours again to what pictures lack."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.captures.capture import View
-from vdgs.evaluation.by_visibility import VisibilityHistogram
+from vdgs.evaluation.by_visibility import Bin, VisibilityHistogram
 from vdgs.evaluation.colour import correct_colours
 from vdgs.evaluation.exposures import as_photographed, exposures_of
 from vdgs.evaluation.metrics import masked_mean, psnr_of, squared_error, ssim_map, to_8bit
@@ -29,7 +28,7 @@ BINS = 4
 MOST_VIEWS = 40
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Loss:
     """Means over the views, of the model and of the file; `by_visibility` as in metrics.json, with both."""
 
@@ -45,7 +44,7 @@ class Loss:
     psnr_cc_baked: float
     ssim: float
     ssim_baked: float
-    by_visibility: list[dict[str, Any]]
+    by_visibility: list[Bin]
 
 
 def measured_views(run: TrainedRun) -> list[View]:
@@ -80,8 +79,9 @@ def loss_of(run: TrainedRun, pieces: Iterable[Gaussians], after_view: Callable[[
     there_are, of = (len(tested), "test") if tested else (len(run.capture.train_views), "training")
     psnr, psnr_baked, psnr_cc, psnr_cc_baked, ssim, ssim_baked = np.mean(rows, axis=0).tolist()
     return Loss(
-        len(views), there_are, of, psnr, psnr_baked, psnr_cc, psnr_cc_baked, ssim, ssim_baked,
-        [dict(each) for each in histogram.bins(BINS)],
+        views=len(views), views_there_are=there_are, of=of, psnr=psnr, psnr_baked=psnr_baked, psnr_cc=psnr_cc,
+        psnr_cc_baked=psnr_cc_baked, ssim=ssim, ssim_baked=ssim_baked,
+        by_visibility=[dict(each) for each in histogram.bins(BINS)],
     )  # fmt: skip
 
 

@@ -99,7 +99,16 @@ def rows_for(
                 highlight=False,
             )
         rows[path] = np.flatnonzero(~beyond)
-        registry.check(path, Scene((), len(rows[path]), degree, frame.facts, bounds_of(frame, means[rows[path]])))
+        registry.check(
+            path,
+            Scene(
+                chunks=(),
+                count=len(rows[path]),
+                degree=degree,
+                facts=frame.facts,
+                bounds=bounds_of(frame, means[rows[path]]),
+            ),
+        )
     return rows
 
 

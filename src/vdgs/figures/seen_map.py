@@ -41,7 +41,7 @@ class CameraMarks:
     size: float = 30.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SeenMap:
     """What a map of V shows: points coloured by V, marked cameras, and (pale) V on level ground."""
 

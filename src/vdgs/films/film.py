@@ -151,12 +151,12 @@ def _facts(asked: RenderRequest, run: OpenedModel, drawn: Map | None) -> dict[st
 
 def _flight(asked: RenderRequest, run: OpenedModel) -> Flight:
     """The cameras of the run: as it keeps them, else of its capture, which is asked too where it is named."""
-    facts = run.model.facts.get("capture", {})
-    kept = kept_flight(run.folder, facts) if asked.capture is None else None
+    described = run.model.metadata.capture
+    kept = kept_flight(run.folder, described) if asked.capture is None else None
     if kept is not None:
         return kept
     capture = open_capture(run.folder, asked.capture)
-    refuse_another_capture(run.model_path, facts, capture)
+    refuse_another_capture(run.model_path, described, capture)
     return flight_of(capture)
 
 

@@ -29,7 +29,7 @@ NOTHING = (208, 211, 215)
 _PREVIEWS, _PREVIEW_PX = 24, 160
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Scale:
     """How numbers become colours: the same for all frames."""
 
@@ -109,9 +109,12 @@ def depth_scale(span: tuple[float, float], unit: str) -> Scale:
     words = [f"{number:g}" for number in np.round(numbers, 9)]
     words[0], words[-1] = f"≤ {words[0]}" if numbers[0] > 0 else words[0], f"≥ {words[-1]}"
     return Scale(
-        (f"depth along the view ({unit})", f"depth ({unit})", unit), float(numbers[0]), float(numbers[-1]),
-        tuple(zip(map(float, numbers), words, strict=True)), lambda values: np.asarray(colours(norm(values))),
-    )  # fmt: skip
+        titles=(f"depth along the view ({unit})", f"depth ({unit})", unit),
+        low=float(numbers[0]),
+        high=float(numbers[-1]),
+        ticks=tuple(zip(map(float, numbers), words, strict=True)),
+        paint=lambda values: np.asarray(colours(norm(values))),
+    )
 
 
 def _visibility(run: OpenedModel, flight: Flight, cameras: Sequence[Camera]) -> Map:
@@ -135,9 +138,12 @@ def seen_scale(counts: Shaped[np.ndarray, " n"]) -> Scale:
     levels = [level for level in range(0, top + 1, every) if level == 0 or top - level >= every] + [top]
     ticks = [(float(level), f"≥ {level}" if more and level == top else str(level)) for level in dict.fromkeys(levels)]
     return Scale(
-        ("training cameras that see the place, V", "training cameras, V", "V"), -0.5, top + 0.5, tuple(ticks),
-        lambda values: np.asarray(SEEN(norm(np.clip(np.rint(values), 0, top)))),
-    )  # fmt: skip
+        titles=("training cameras that see the place, V", "training cameras, V", "V"),
+        low=-0.5,
+        high=top + 0.5,
+        ticks=tuple(ticks),
+        paint=lambda values: np.asarray(SEEN(norm(np.clip(np.rint(values), 0, top)))),
+    )
 
 
 def _alpha(run: OpenedModel, flight: Flight, cameras: Sequence[Camera]) -> Map:
@@ -152,4 +158,6 @@ def alpha_scale() -> Scale:
     ticks = tuple((number / 4, f"{number / 4:g}") for number in range(5))
     grey = mpl.colormaps["gray"]
     titles = ("alpha: 0 nothing, 1 opaque", "alpha")
-    return Scale(titles, 0.0, 1.0, ticks, lambda values: np.asarray(grey(values)), gaps=False)
+    return Scale(
+        titles=titles, low=0.0, high=1.0, ticks=ticks, paint=lambda values: np.asarray(grey(values)), gaps=False
+    )

@@ -23,9 +23,10 @@ def draw_map(capture: Capture, report: CaptureReport, points: np.ndarray, visibi
         CameraMarks("training camera", [view.camera for view in capture.train_views], INK, "white"),
         CameraMarks("test camera", [view.camera for view in capture.test_views], "white", INK),
     )
+    x_label, y_label = capture.ground.axis_names
     seen = SeenMap(
-        points, visibility, low, high, float(np.median(capture.points[:, 2])), marks,
-        *capture.ground.axis_names, "a point", _titles(capture, report),
+        points=points, visibility=visibility, low=low, high=high, ground=float(np.median(capture.points[:, 2])),
+        marks=marks, x_label=x_label, y_label=y_label, noun="a point", titles=_titles(capture, report),
     )  # fmt: skip
     draw_seen_map(file, seen)
 

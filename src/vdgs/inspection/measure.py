@@ -20,7 +20,7 @@ from vdgs.inspection.soundness import Soundness
 from vdgs.model.visibility import LIMITS, imbalance, visibility_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CaptureReport:
     """Numbers about a capture; lengths are in `unit` of the ground frame."""
 

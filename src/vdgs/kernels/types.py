@@ -127,7 +127,7 @@ class Splats:
         return self.means_px, self.conics, self.colours, self.opacities, self.depths
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class AnchorSplats(Splats):
     """What an anchor model looks like from one camera.
 
@@ -139,7 +139,7 @@ class AnchorSplats(Splats):
     source: Int32[Tensor, "m"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class OrderedSplats(Splats):
     """Splats that need not stand in the order in which equal depths are blended."""
 
@@ -155,7 +155,7 @@ class OrderedSplats(Splats):
         return OrderedSplats(**both, runs=runs)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TrainingSplats(OrderedSplats):
     """What a training step needs to know of an anchor model as one camera sees it: no more than that."""
 
@@ -169,11 +169,12 @@ class TrainingSplats(OrderedSplats):
         """The same splats."""
         s = splats
         return TrainingSplats(
-            s.means_px, s.conics, s.depths, s.colours, s.opacities, None, s.source, s.volumes.mean()
+            means_px=s.means_px, conics=s.conics, depths=s.depths, colours=s.colours, opacities=s.opacities, runs=None,
+            source=s.source, volume=s.volumes.mean(),
         )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SplatGradients:
     """Derivatives of a loss by the splats of a view, and what decoding needs to know of these."""
 

@@ -18,7 +18,7 @@ from vdgs.placing.placement import Placement
 CACHE_BYTES = 128 << 20
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Layer:
     """One file of a map: what its bands are called, their type, unit and what stands for nothing."""
 

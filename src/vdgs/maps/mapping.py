@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -39,6 +38,7 @@ from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import find_model
 from vdgs.runs.run_context import RunContext
 from vdgs.settings.requests import MapRequest
+from vdgs.storage.documents import MapMetadata
 from vdgs.storage.files import jsonable, read_record, write_json
 from vdgs.units import data_size
 from vdgs.watching.interrupts import stop_if_asked
@@ -69,7 +69,7 @@ def map_run(context: RunContext, asked: MapRequest, console: Console, wish: Wish
     return folder
 
 
-def _map_here(context: RunContext, asked: MapRequest, console: Console) -> tuple[dict[str, Any], Path]:
+def _map_here(context: RunContext, asked: MapRequest, console: Console) -> tuple[MapMetadata, Path]:
     """Draw in this process; what came out, and where."""
     run = context.open_model(asked.model, asked.device)
     plan = Plan.of(asked, run.folder.path, run.name, run.status.model, run.capture)
@@ -79,7 +79,7 @@ def _map_here(context: RunContext, asked: MapRequest, console: Console) -> tuple
         return _write(plan, (surveyor.tile(part) for _, _, part in plan.grid.tiles()), console), plan.folder
 
 
-def _map_in_pieces(context: RunContext, asked: MapRequest, wish: Wish, console: Console) -> tuple[dict[str, Any], Path]:
+def _map_in_pieces(context: RunContext, asked: MapRequest, wish: Wish, console: Console) -> tuple[MapMetadata, Path]:
     """Let shards of the tiles be drawn elsewhere, and gather them one at a time. No model is in the memory of this
     process."""
     context.release_models()
@@ -91,7 +91,7 @@ def _map_in_pieces(context: RunContext, asked: MapRequest, wish: Wish, console: 
         return _write(plan, tiles, console), plan.folder
 
 
-def _write(plan: Plan, tiles: Iterable[Tile], console: Console) -> dict[str, Any]:
+def _write(plan: Plan, tiles: Iterable[Tile], console: Console) -> MapMetadata:
     """Make maps of all tiles, which come in their order: files that come to stand in the folder together. Returns
     what map.json says."""
     layers = layers_of(plan.placement)
@@ -128,13 +128,33 @@ def can_map() -> bool:
 def layers_of(placement: Placement) -> tuple[Layer, Layer, Layer]:
     """The files of a map."""
     return (
-        Layer(ORTHOPHOTO, "orthophoto: colours seen from straight above", ("red", "green", "blue", "alpha"), "uint8",
-              None, "average"),
-        Layer(DSM, f"surface model: {placement.heights}", (f"height, {placement.heights}",), "float32", NO_HEIGHT,
-              "nearest", placement.unit),
-        Layer(VISIBILITY, "V: training cameras whose picture holds the place", ("training cameras",), "uint16",
-              NO_COUNT, "nearest", "cameras"),
-    )  # fmt: skip
+        Layer(
+            name=ORTHOPHOTO,
+            title="orthophoto: colours seen from straight above",
+            bands=("red", "green", "blue", "alpha"),
+            dtype="uint8",
+            nodata=None,
+            overviews="average",
+        ),
+        Layer(
+            name=DSM,
+            title=f"surface model: {placement.heights}",
+            bands=(f"height, {placement.heights}",),
+            dtype="float32",
+            nodata=NO_HEIGHT,
+            overviews="nearest",
+            unit=placement.unit,
+        ),
+        Layer(
+            name=VISIBILITY,
+            title="V: training cameras whose picture holds the place",
+            bands=("training cameras",),
+            dtype="uint16",
+            nodata=NO_COUNT,
+            overviews="nearest",
+            unit="cameras",
+        ),
+    )
 
 
 def _announce(plan: Plan, console: Console, in_pieces: bool = False) -> None:
@@ -162,9 +182,9 @@ def _announce(plan: Plan, console: Console, in_pieces: bool = False) -> None:
 
 
 def _draw(
-    plan: Plan, tiles: Iterable[Tile], layers: tuple[Layer, ...], staging: Path, facts: dict[str, Any],
+    plan: Plan, tiles: Iterable[Tile], layers: tuple[Layer, ...], staging: Path, facts: MapMetadata,
     console: Console,
-) -> dict[str, Any]:  # fmt: skip
+) -> MapMetadata:  # fmt: skip
     """Put all tiles into files beside the final ones; what came out. One tile is in memory at a time."""
     grid = plan.grid
     tags = {"CRS_NAME": facts["crs_name"], "HEIGHTS": facts["heights"], "MODEL": facts["model"],
@@ -200,7 +220,7 @@ def _bands(tile: Tile) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.moveaxis(coloured, -1, 0), tile.heights[None], tile.visibility[None]
 
 
-def _facts(plan: Plan) -> dict[str, Any]:
+def _facts(plan: Plan) -> MapMetadata:
     grid, placement, capture = plan.grid, plan.placement, plan.above.capture
     return {
         "software": software(), "model": plan.model, "model_identity": plan.model_identity,

@@ -82,8 +82,9 @@ class Overhead:
         pose[:3, 3] = -pose[:3, :3] @ above
         per_unit = similarity.scale / grid.gsd
         return Camera(
-            pose, per_unit, per_unit, grid.width / 2, grid.height / 2, grid.width, grid.height, "orthographic"
-        )
+            camera_from_world=pose, fx=per_unit, fy=per_unit, cx=grid.width / 2, cy=grid.height / 2, width=grid.width,
+            height=grid.height, model="orthographic",
+        )  # fmt: skip
 
     def _similarity(self, grid: Grid) -> tuple[Similarity, Float[np.ndarray, "3"]]:
         """The similarity about the middle of the grid, and that place on the ground."""

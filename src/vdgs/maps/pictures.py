@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import matplotlib
@@ -23,6 +22,7 @@ from vdgs.maps.geotiff import read_small
 from vdgs.maps.grid import Grid
 from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT
 from vdgs.placing.placement import Placement
+from vdgs.storage.documents import MapMetadata
 
 #: The sun of a hillshade: from the north-west, half way up, as on printed maps.
 AZIMUTH_DEG, ALTITUDE_DEG = 315.0, 45.0
@@ -39,7 +39,7 @@ class Sheet:
     name: str
     grid: Grid
     placement: Placement
-    facts: dict[str, Any]
+    facts: MapMetadata
 
 
 def hillshade(heights: Float[np.ndarray, "h w"], pixel: float) -> Float[np.ndarray, "h w"]:

@@ -23,7 +23,7 @@ def folder_of(asked: MapRequest, run: Path) -> Path:
     return asked.output or run / "maps"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Plan:
     """A map that is to be drawn."""
 
@@ -53,7 +53,10 @@ class Plan:
         refuse_elsewhere(grid, shown, placement)
         above = Overhead.of(capture, placement)
         above.camera(grid.part(0, 0, 1, 1))  # a system that makes no map is refused here
-        return Plan(folder, run.name, model, model_identity, above, grid, samples_for(grid.gsd, finest), asked.sharp)
+        return Plan(
+            folder=folder, run_name=run.name, model=model, model_identity=model_identity, above=above, grid=grid,
+            samples=samples_for(grid.gsd, finest), sharp=asked.sharp,
+        )  # fmt: skip
 
     @property
     def placement(self) -> Placement:

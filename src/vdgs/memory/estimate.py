@@ -37,7 +37,7 @@ PLAIN_FLOATS = 3 + 32 + 6
 PLACE_FLOATS = 3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Need:
     """What training works on, as far as memory is concerned."""
 

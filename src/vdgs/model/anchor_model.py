@@ -21,6 +21,7 @@ from vdgs.errors import VdgsError
 from vdgs.kernels.types import FEATURE_SIZE
 from vdgs.model.anchors import TRAINED, Anchors
 from vdgs.model.decoder import Decoder
+from vdgs.storage.documents import CaptureMetadata
 from vdgs.storage.files import write_atomically
 from vdgs.storage.tensors import REBUILD, checksum, read_tensors, write_tensors
 
@@ -39,7 +40,45 @@ class Part:
     decoder: Decoder
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
+class ModelMetadata:
+    """What travels with a model: where it comes from. None: not known, or nothing of this kind of model."""
+
+    capture: CaptureMetadata | None = None
+    #: The version of vdgs that wrote it.
+    version: str | None = None
+    #: Steps of training that the model has seen.
+    iterations: int | None = None
+    #: Of the settings that it was made with (`runs.keys`).
+    key: str | None = None
+    #: Of a block: its number, how many photographs trained it, and its setting `decoder`.
+    block: int | None = None
+    views: int | None = None
+    decoder: str | None = None
+
+    def to_dict(self) -> dict[str, object]:
+        """Ready for JSON, without what is None, in the order in which the stages have always written it."""
+        names = ORDER if self.block is None else ORDER_OF_BLOCK
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> ModelMetadata:
+        """The inverse; keys that a newer version wrote are left out. Raises ValueError for a value of another kind."""
+        if not isinstance(values, Mapping):
+            raise ValueError("its metadata are not an object")
+        kinds = {"capture": Mapping, "iterations": int, "block": int, "views": int}
+        known = {name: values[name] for name in ORDER if values.get(name) is not None}
+        for name, value in known.items():
+            if not isinstance(value, kinds.get(name, str)):
+                raise ValueError(f"{name} of its metadata is {value!r}")
+        return ModelMetadata(**known)
+
+
+ORDER = ("capture", "version", "iterations", "key", "block", "views", "decoder")
+ORDER_OF_BLOCK = ("capture", "version", "block", "views", "key", "iterations", "decoder")
+
+
+@dataclass(frozen=True, kw_only=True)
 class AnchorModel:
     """A scene: anchors, what decodes them, and what is needed to use them again."""
 
@@ -50,8 +89,7 @@ class AnchorModel:
     voxel: float
     #: Colour drawn where nothing is, RGB in [0, 1].
     background: tuple[float, float, float]
-    #: JSON-able facts that travel with the file: ground frame, capture, version.
-    facts: Mapping[str, Any]
+    metadata: ModelMetadata = ModelMetadata()
     #: A merged scene whose blocks trained decoders of their own: all anchors, block by block. Else empty.
     parts: tuple[Part, ...] = ()
 
@@ -71,13 +109,16 @@ class AnchorModel:
         tensors = {f"anchors.{k}": v for k, v in self.anchors.tensors().items()}
         for prefix, decoder in self._decoders():
             tensors |= {prefix + name: tensor for name, tensor in decoder.tensors().items()}
-        facts: dict[str, Any] = {
-            "voxel": self.voxel, "background": self.background, "facts": dict(self.facts), "crc32": checksum(tensors),
-        }  # fmt: skip
+        content: dict[str, object] = {
+            "voxel": self.voxel,
+            "background": self.background,
+            "facts": self.metadata.to_dict(),
+            "crc32": checksum(tensors),
+        }
         if self.parts:
-            facts["parts"] = [part.count for part in self.parts]
+            content["parts"] = [part.count for part in self.parts]
         # A single key: several would be written in an order that varies.
-        header = {FORMAT_OF_PARTS if self.parts else FORMAT: json.dumps(facts)}
+        header = {FORMAT_OF_PARTS if self.parts else FORMAT: json.dumps(content)}
         write_atomically(path, lambda temporary: write_tensors(temporary, tensors, header))
 
     @staticmethod
@@ -96,7 +137,10 @@ class AnchorModel:
             if known["crc32"] != checksum(tensors):
                 raise ValueError("its checksum does not agree")
             red, green, blue = (float(value) for value in known["background"])
-            model = AnchorModel(anchors, decoder, float(known["voxel"]), (red, green, blue), known["facts"], parts)
+            model = AnchorModel(
+                anchors=anchors, decoder=decoder, voxel=float(known["voxel"]), background=(red, green, blue),
+                metadata=ModelMetadata.from_dict(known["facts"]), parts=parts,
+            )  # fmt: skip
             model.check()
         except (KeyError, ValueError, TypeError) as error:
             raise VdgsError(f"{path}: is damaged or incomplete ({error}). {REBUILD}") from error

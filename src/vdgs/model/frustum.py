@@ -26,7 +26,7 @@ class Projection(NamedTuple):
     inside: Bool[Tensor, "*c n"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Frusta:
     """c pinhole cameras side by side, all asked at once: what one asks of thousands, one after the other, costs more
     than what they answer."""
@@ -44,11 +44,13 @@ class Frusta:
         """O(c)."""
         rigid = np.stack([camera.camera_from_world for camera in cameras])
         inner = np.array([[c.fx, c.fy, c.cx, c.cy, c.width, c.height] for c in cameras], np.float64)
-        return Frusta(torch.from_numpy(rigid).to(device), *torch.from_numpy(inner).to(device).T.contiguous())
+        fx, fy, cx, cy, width, height = torch.from_numpy(inner).to(device).T.contiguous()
+        rigid_there = torch.from_numpy(rigid).to(device)
+        return Frusta(camera_from_world=rigid_there, fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height)
 
     def take(self, chosen: Int64[Tensor, " some"]) -> Frusta:
         """Those of these numbers."""
-        return Frusta(*(getattr(self, field.name)[chosen] for field in fields(self)))
+        return Frusta(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
     @property
     def span(self) -> Float64[Tensor, " c"]:

@@ -26,7 +26,7 @@ from vdgs.kernels.types import Raster, Splats
 REACH = math.sqrt(-2 * math.log(ALPHA_MIN))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Gaussians:
     """Gaussians by their parameters, as 3DGS trains them. Tensors share their first dimension."""
 

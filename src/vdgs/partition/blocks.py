@@ -22,6 +22,7 @@ from vdgs.captures.capture import GroundFrame
 from vdgs.captures.geodesy import geodetic_from_enu
 from vdgs.errors import RunError
 from vdgs.partition.nearest import Cores
+from vdgs.storage.documents import JsonObject
 from vdgs.storage.files import write_json
 
 
@@ -73,7 +74,7 @@ class Blocks:
 
 
 def save_blocks(
-    path: Path, blocks: Blocks, facts: Sequence[dict[str, Any]], of_all: Mapping[str, Any] | None = None
+    path: Path, blocks: Blocks, facts: Sequence[Mapping[str, object]], of_all: Mapping[str, Any] | None = None
 ) -> None:
     """Write cores and widened boundaries as a FeatureCollection, atomically, with `facts` of each block and `of_all`.
 
@@ -82,7 +83,7 @@ def save_blocks(
     write_json(path, _collection(blocks, facts) | dict(of_all or {}))
 
 
-def save_blocks_wgs84(path: Path, blocks: Blocks, facts: Sequence[dict[str, Any]], ground: GroundFrame) -> None:
+def save_blocks_wgs84(path: Path, blocks: Blocks, facts: Sequence[Mapping[str, object]], ground: GroundFrame) -> None:
     """The same in longitude, latitude (RFC 7946), for maps: every corner at the height of the ground frame's origin.
 
     Longitudes run on past 180 degrees where a scene lies across the antimeridian.
@@ -110,7 +111,7 @@ def _longitude_latitude(
     return np.column_stack([longitude + 360 * np.round((origin[1] - longitude) / 360), geodetic[:, 0]])
 
 
-def _collection(blocks: Blocks, facts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _collection(blocks: Blocks, facts: Sequence[Mapping[str, object]]) -> JsonObject:
     """The FeatureCollection of cores and widened boundaries."""
     features = [
         {
@@ -139,7 +140,7 @@ def load_blocks(path: Path) -> Blocks:
         raise RunError(f"{path}: is damaged ({error}). Cut the scene again: vdgs partition RUN") from error
 
 
-def _polygon(feature: dict[str, Any]) -> shapely.Polygon:
+def _polygon(feature: JsonObject) -> shapely.Polygon:
     """The polygon of a feature. Raises ValueError if it is another shape, empty, or holds numbers that are none."""
     shape = shapely.geometry.shape(feature["geometry"])
     if (

@@ -70,13 +70,22 @@ def merge(
         # A copy: a tensor of a file keeps all of the file in memory.
         pieces.append(Part(len(piece), coarse.decoder if model is None else model.decoder.copy()))
         selected.append(piece.tensors())
-        became.append(MergedBlock(index, trained_here, kept, trained_here - kept, from_coarse, unseen))
+        became.append(
+            MergedBlock(
+                block=index,
+                trained=trained_here,
+                kept=kept,
+                dropped=trained_here - kept,
+                from_coarse=from_coarse,
+                unseen=unseen,
+            )
+        )
     return replace(coarse, anchors=_joined(selected), parts=tuple(pieces) if own else ()), became
 
 
 def has_own_decoder(model: AnchorModel) -> bool:
     """Whether a block moved the decoder too, rather than anchors alone."""
-    return model.facts.get("decoder") == "own"
+    return model.metadata.decoder == "own"
 
 
 def giver_of_places(

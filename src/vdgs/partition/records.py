@@ -18,7 +18,7 @@ class CutBlock:
     std_v: float | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AssignedBlock:
     """A block of a cut with its cameras, by the reason that brought them, and the anchors of core and widened block.
 
@@ -42,7 +42,7 @@ class AssignedBlock:
         return self.best_block + self.topped_up
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PartitionRecord:
     """partition.json: how a scene was cut. None and nothing of one that is not cut yet."""
 
@@ -59,7 +59,7 @@ class PartitionRecord:
     peak_memory_bytes: int | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MergedBlock:
     """What became of the anchors of a block when the scene was merged."""
 

@@ -28,7 +28,7 @@ CHOICES = "EPSG:n (such as EPSG:25832), enu, source or local"
 _STEP = 20.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Placement:
     """Coordinates of a target system for points of a ground frame. Made by `Placement.of`."""
 
@@ -112,14 +112,20 @@ def _local(ground: GroundFrame) -> Placement:
     else:
         name, heights = "ground frame, local units without known size", "units above the origin of the ground frame"
         axes = ""
-    return Placement("local", name + axes, ground.unit, 1.0 if ground.metric else None, None, heights, (), _same, _same)
+    return Placement(
+        crs="local", name=name + axes, unit=ground.unit, metres=1.0 if ground.metric else None, wkt=None,
+        heights=heights, notes=(), _forward=_same, _backward=_same,
+    )  # fmt: skip
 
 
 def _source(ground: GroundFrame) -> Placement:
     metres = ground.scale if ground.metric else None
     unit = "m" if metres is not None and abs(metres - 1) < 1e-9 else "units"
     name, heights = "the capture's own coordinates", "the third coordinate of the capture's own world"
-    return Placement("source", name, unit, metres, None, heights, (), ground.apply_inverse, ground.to_ground)
+    return Placement(
+        crs="source", name=name, unit=unit, metres=metres, wkt=None, heights=heights, notes=(),
+        _forward=ground.apply_inverse, _backward=ground.to_ground,
+    )  # fmt: skip
 
 
 def _enu(ground: GroundFrame) -> Placement:
@@ -130,8 +136,8 @@ def _enu(ground: GroundFrame) -> Placement:
     name = f"east, north, up about latitude {latitude:.7f}, longitude {longitude:.7f}, height {altitude:.2f} m"
     heights = f"metres above the horizon plane of the origin, which has the height {altitude:.2f} m"
     return Placement(
-        "enu", name, "m", 1.0, None, heights, (),
-        lambda points: points @ turned.T, lambda places: places @ turned,
+        crs="enu", name=name, unit="m", metres=1.0, wkt=None, heights=heights, notes=(),
+        _forward=lambda points: points @ turned.T, _backward=lambda places: places @ turned,
     )  # fmt: skip
 
 
@@ -146,8 +152,9 @@ def _projected(ground: GroundFrame, projection: Projection) -> Placement:
         return enu_from_geodetic(projection.to_geodetic(places), origin, level_at)
 
     return Placement(
-        projection.code, f"{projection.name} ({projection.code})", projection.unit, projection.metres, projection.wkt,
-        projection.heights, projection.notes, forward, backward,
+        crs=projection.code, name=f"{projection.name} ({projection.code})", unit=projection.unit,
+        metres=projection.metres, wkt=projection.wkt, heights=projection.heights, notes=projection.notes,
+        _forward=forward, _backward=backward,
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ ELLIPSOIDAL = "ellipsoidal (WGS 84), if the altitudes of the georeference are"
 _AREA_DEG = 0.05
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Projection:
     """One system of the catalogue and the one operation that leads to it from WGS 84."""
 
@@ -91,8 +91,9 @@ def open_projection(code: str, origin: tuple[float, float, float]) -> Projection
     unit = "m" if metres == 1.0 else axes[0].unit_name
     heights = "from the middle of the Earth" if crs.is_geocentric else axes[2].name if own_heights else ELLIPSOIDAL
     return Projection(
-        code, crs.name, unit, metres, crs.to_wkt(), heights if unit == "m" else f"{heights}; in {unit}", notes,
-        1.0 if own_heights else 1 / metres, transformer,
+        code=code, name=crs.name, unit=unit, metres=metres, wkt=crs.to_wkt(),
+        heights=heights if unit == "m" else f"{heights}; in {unit}", notes=notes,
+        _height_factor=1.0 if own_heights else 1 / metres, _transformer=transformer,
     )  # fmt: skip
 
 

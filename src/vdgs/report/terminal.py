@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from collections import Counter
 from dataclasses import replace
-from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -14,6 +13,7 @@ from vdgs.report.write import report_standing
 from vdgs.runs.folder import REPORT, RunFolder
 from vdgs.runs.standing import RunStanding, Standing, standing_of
 from vdgs.runs.status import Status
+from vdgs.storage.documents import RunStatus, StageStatus
 
 #: Exit code of `vdgs status` for a run that is not whole: something of it is missing, runs, failed or is out of date.
 NOT_WHOLE = 3
@@ -44,7 +44,7 @@ def print_status(run: RunFolder, console: Console) -> int:
     return 0 if standing.whole else NOT_WHOLE
 
 
-def status_facts(run: RunFolder) -> dict[str, Any]:
+def status_facts(run: RunFolder) -> RunStatus:
     """The same for programs."""
     standing = whole_standing(run)
     return {
@@ -83,7 +83,7 @@ def progress_of(status: Status | None) -> str:
     return ", ".join(parts)
 
 
-def _facts(stage: Standing) -> dict[str, Any]:
+def _facts(stage: Standing) -> StageStatus:
     status = stage.status or Status()
     return {
         "stage": stage.name, "state": stage.state, "why": stage.why or None, "folder": stage.folder,

@@ -67,10 +67,10 @@ def report_standing(run: RunFolder, standing: RunStanding) -> Standing:
         with path.open(encoding="utf-8", errors="replace") as file:
             head = file.read(HEAD_CHARACTERS)
     except OSError:
-        return Standing("report", "missing", REPORT)
+        return Standing(name="report", state="missing", folder=REPORT)
     if f'<meta name="{STANDING}" content="{standing.digest}">' in head:
-        return Standing("report", "done", REPORT)
-    return Standing("report", "stale", REPORT, "the run went on since it was written")
+        return Standing(name="report", state="done", folder=REPORT)
+    return Standing(name="report", state="stale", folder=REPORT, why="the run went on since it was written")
 
 
 def _header(shown: Shown) -> tuple[Html, str]:

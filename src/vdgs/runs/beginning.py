@@ -17,12 +17,11 @@ from vdgs.captures.reconstruction import FILE as RECONSTRUCTION
 from vdgs.errors import VdgsError
 from vdgs.inspection.soundness import refuse_unsound
 from vdgs.runs.folder import RunFolder
-from vdgs.runs.keys import counted
 from vdgs.runs.run_context import RunContext
+from vdgs.runs.run_settings import RunSettings
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.checks import validate
 from vdgs.settings.method import MethodConfig, with_iterations
-from vdgs.settings.plain import to_dict
 from vdgs.storage.files import read_json, write_bytes
 
 
@@ -77,7 +76,7 @@ def driven_run(
 
 
 def _take_up(
-    run: RunFolder, capture: Capture, capture_path: Path, settings: dict[str, Any], redo: bool | None,
+    run: RunFolder, capture: Capture, capture_path: Path, settings: RunSettings, redo: bool | None,
     command: str | None,
 ) -> None:  # fmt: skip
     """Write down the settings of a run that this process drives, new ones or others; what they make useless goes."""
@@ -95,16 +94,15 @@ def _take_up(
         _keep_reconstruction(capture.root, run.path)
 
 
-def _goes_on(run: RunFolder, settings: dict[str, Any]) -> bool:
+def _goes_on(run: RunFolder, settings: RunSettings) -> bool:
     """Whether the run that is there has the very settings: nothing of it changes, and its blocks may be at work, begun
     by a driver that died."""
     return run.config_file.exists() and run.capture_file.exists() and run.settings() == settings
 
 
-def reads_otherwise(run: RunFolder, settings: dict[str, Any]) -> bool:
+def reads_otherwise(run: RunFolder, settings: RunSettings) -> bool:
     """Whether the run reads its capture with other options: it is their change then that has to be spoken of."""
-    before, now = (counted("capture", each["capture"]) for each in (run.settings(), settings))
-    return before != now
+    return run.settings().capture != settings.capture
 
 
 def _keep_reconstruction(root: Path, run: Path) -> None:
@@ -116,10 +114,9 @@ def _keep_reconstruction(root: Path, run: Path) -> None:
                 write_bytes(run / name, content)
 
 
-def run_settings(capture_path: Path, capture_options: CaptureOptions, method: MethodConfig) -> dict[str, Any]:
+def run_settings(capture_path: Path, capture_options: CaptureOptions, method: MethodConfig) -> RunSettings:
     """What config.yaml holds: everything that the result depends on."""
-    capture = {"path": str(capture_path.resolve())} | to_dict(_with_whole_paths(capture_options))
-    return {"capture": capture} | to_dict(method)
+    return RunSettings.of(capture_path.resolve(), _with_whole_paths(capture_options), method)
 
 
 def _with_whole_paths(options: CaptureOptions) -> CaptureOptions:

@@ -5,24 +5,21 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
-from copy import deepcopy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from vdgs import __version__
 from vdgs.errors import RunError
-from vdgs.settings.method import MethodConfig
-from vdgs.settings.plain import differences, from_dict, to_dict
-from vdgs.settings.ranges import option, outside
+from vdgs.runs.run_settings import SECTIONS, RunSettings
+from vdgs.settings.plain import differences
+from vdgs.settings.ranges import option
 from vdgs.storage.files import write_text
 
-#: The parts of config.yaml.
-SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
 #: Those whose options have no prefix on the command line.
 PLAIN_SECTIONS = ("capture", "training", "partition")
 
@@ -33,9 +30,10 @@ def option_of(setting: str) -> str:
     return option((name,) if section in PLAIN_SECTIONS else (section, name))
 
 
-def changed_options(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+def changed_options(old: RunSettings, new: RunSettings, sections: Sequence[str] = SECTIONS) -> list[str]:
     """Lines that say which options differ between the settings of two runs; where the capture lies is none."""
-    paths = [line.partition(": ") for line in differences(old, new) if not line.startswith("capture.path: ")]
+    before, after = ({name: each.to_dict()[name] for name in sections} for each in (old, new))
+    paths = [line.partition(": ") for line in differences(before, after) if not line.startswith("capture.path: ")]
     return [f"{option_of(path)}: {values}" for path, _, values in paths]
 
 
@@ -45,9 +43,9 @@ class ConfigFile:
 
     path: Path
 
-    def write(self, settings: dict[str, Any], command: str | None = None) -> None:
+    def write(self, settings: RunSettings, command: str | None = None) -> None:
         header = {"vdgs": {"version": __version__, "commit": commit()} | ({"command": command} if command else {})}
-        write_text(self.path, yaml.safe_dump(header | settings, sort_keys=False, allow_unicode=True))
+        write_text(self.path, yaml.safe_dump(header | settings.to_dict(), sort_keys=False, allow_unicode=True))
 
     def command(self) -> str | None:
         """The command that gave the run the settings that it has; None where several did, nothing says it, or the
@@ -59,8 +57,8 @@ class ConfigFile:
         command = header.get("command") if isinstance(header, dict) else None
         return command if isinstance(command, str) and not _makes_another(command, self.path.parent) else None
 
-    def settings(self) -> dict[str, Any]:
-        """The settings of the run, every section whole, without the header that says which version wrote them."""
+    def settings(self) -> RunSettings:
+        """The settings of the run."""
         if not self.path.exists():
             raise RunError(
                 f"{self.path.parent}: is not a run folder (no config.yaml). Train first: vdgs run CAPTURE --output RUN"
@@ -69,11 +67,11 @@ class ConfigFile:
             text = self.path.read_text(encoding="utf-8-sig")
         except UnicodeDecodeError as error:
             raise RunError(f"{self.path}: is damaged, not valid YAML ({error})") from error
-        return deepcopy(_settings(self.path, text))
+        return _settings(self.path, text)
 
 
 @lru_cache(maxsize=4)
-def _settings(path: Path, text: str) -> dict[str, Any]:
+def _settings(path: Path, text: str) -> RunSettings:
     """What the text of a file means. A command asks for its settings many times, and PyYAML takes tens of milliseconds
     for each (its quick parser, in C, is no way out: brackets that are nested deeply end the process)."""
     try:
@@ -83,24 +81,12 @@ def _settings(path: Path, text: str) -> dict[str, Any]:
     if not isinstance(settings, dict) or not {"capture", "training"} <= settings.keys():
         raise RunError(f"{path}: is damaged or not of a vdgs run (no `capture` and `training`)")
     settings.pop("vdgs", None)
-    capture = settings.pop("capture")
-    if not isinstance(capture, dict) or not isinstance(capture.get("path"), str):
-        raise RunError(f"{path}: is damaged: `capture` must be a group of settings with a path")
     try:
-        return {"capture": capture} | to_dict(_method(settings))
+        return RunSettings.from_dict(settings)
     except (ValueError, TypeError) as error:
         raise RunError(
             f"{path}: {error}. Write it as it was, or start a new --output: runs of another version do not go on."
         ) from error
-
-
-def _method(settings: dict[str, Any]) -> MethodConfig:
-    """Raises ValueError for a setting that there is not, of another kind or out of its range."""
-    method = from_dict(MethodConfig, settings, "")
-    for section in SECTIONS[1:]:
-        for each in outside(getattr(method, section), (section,)):
-            raise ValueError(f"{'.'.join(each.path)} is {each.value}; it must be {each.range}")
-    return method
 
 
 def _makes_another(command: str, folder: Path) -> bool:

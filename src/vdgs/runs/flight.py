@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -19,10 +18,11 @@ from vdgs.captures.heights import camera_height
 from vdgs.captures.outputs import folders_of_inputs
 from vdgs.errors import RunError
 from vdgs.runs.folder import RunFolder
+from vdgs.storage.documents import CaptureMetadata, JsonObject
 from vdgs.storage.files import read_json, write_json
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Flight:
     """The cameras of a capture by the names of their photographs, in the ground frame."""
 
@@ -46,14 +46,11 @@ class Flight:
 def flight_of(capture: Capture) -> Flight:
     """The flight of a capture that is there."""
     return Flight(
-        tuple((view.name, view.camera) for view in capture.train_views),
-        tuple((view.name, view.camera) for view in capture.test_views),
-        capture.ground,
-        np.median(capture.points, axis=0),
-        camera_height(capture),
-        capture.root,
-        tuple(folders_of_inputs(capture)),
-    )
+        train=tuple((view.name, view.camera) for view in capture.train_views),
+        test=tuple((view.name, view.camera) for view in capture.test_views), ground=capture.ground,
+        middle=np.median(capture.points, axis=0), height=camera_height(capture), root=capture.root,
+        inputs=tuple(folders_of_inputs(capture)),
+    )  # fmt: skip
 
 
 def keep_flight(run: RunFolder, capture: Capture) -> None:
@@ -75,32 +72,30 @@ def keep_flight(run: RunFolder, capture: Capture) -> None:
     )  # fmt: skip
 
 
-def kept_flight(run: RunFolder, facts: dict[str, Any]) -> Flight | None:
-    """The flight that the run keeps, if it is that of the capture described by `facts` (`capture_facts`, as a model
-    holds them); None where the file is gone or is of another capture. RunError if it is damaged."""
+def kept_flight(run: RunFolder, capture: CaptureMetadata | None) -> Flight | None:
+    """The flight that the run keeps, if it is that of the capture that a model describes; None for a run of a version
+    that kept none. RunError if the file is damaged."""
     if not run.cameras_file.exists():
         return None
     record = read_json(run.cameras_file)
-    root = Path(run.settings()["capture"]["path"])
+    root = Path(run.settings().capture_path)
     try:
-        if record["fingerprint"] != facts.get("fingerprint"):
+        if record["fingerprint"] != (capture or {}).get("fingerprint"):
             return None
         frame = record["ground_frame"]
         geo = frame["origin_geo"]
         ground = GroundFrame(
-            float(frame["scale"]), np.array(frame["rotation"], np.float64), np.array(frame["translation"], np.float64),
-            bool(frame["metric"]), str(frame["how"]), None if geo is None else tuple(geo),
+            scale=float(frame["scale"]), rotation=np.array(frame["rotation"], np.float64),
+            translation=np.array(frame["translation"], np.float64), metric=bool(frame["metric"]), how=str(frame["how"]),
+            origin_geo=None if geo is None else tuple(geo),
         )  # fmt: skip
         views = [(each["split"], _view(each)) for each in record["views"]]
         return Flight(
-            tuple(view for split, view in views if split == "train"),
-            tuple(view for split, view in views if split == "test"),
-            ground,
-            np.array(record["middle"], np.float64),
-            float(record["camera_height"]),
-            root,
-            tuple(root / str(folder) for folder in record["input_folders"]),
-        )
+            train=tuple(view for split, view in views if split == "train"),
+            test=tuple(view for split, view in views if split == "test"), ground=ground,
+            middle=np.array(record["middle"], np.float64), height=float(record["camera_height"]), root=root,
+            inputs=tuple(root / str(folder) for folder in record["input_folders"]),
+        )  # fmt: skip
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise RunError(
             f"{run.cameras_file}: is damaged ({error}). Delete it; the cameras are then read from the capture."
@@ -117,7 +112,7 @@ def _within(root: Path, folder: Path) -> str:
     return str(whole)
 
 
-def _plain(view: View) -> dict[str, Any]:
+def _plain(view: View) -> JsonObject:
     camera = view.camera
     return {
         "name": view.name, "split": view.split, "camera_from_world": camera.camera_from_world.tolist(),
@@ -126,7 +121,9 @@ def _plain(view: View) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _view(record: dict[str, Any]) -> tuple[str, Camera]:
+def _view(record: JsonObject) -> tuple[str, Camera]:
     pose = np.array(record["camera_from_world"], np.float64).reshape(4, 4)
     fx, fy, cx, cy = (float(record[key]) for key in ("fx", "fy", "cx", "cy"))
-    return str(record["name"]), Camera(pose, fx, fy, cx, cy, int(record["width"]), int(record["height"]))
+    return str(record["name"]), Camera(
+        camera_from_world=pose, fx=fx, fy=fy, cx=cx, cy=cy, width=int(record["width"]), height=int(record["height"])
+    )

@@ -5,19 +5,18 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from vdgs.captures.reconstruction import is_reconstruction
 from vdgs.errors import RunError, VdgsError
 from vdgs.partition.records import PartitionRecord
-from vdgs.runs.config_file import SECTIONS, ConfigFile, changed_options
+from vdgs.runs.config_file import ConfigFile, changed_options
 from vdgs.runs.keys import StageKeys, stage_keys
 from vdgs.runs.locks import hold, seems_locked
+from vdgs.runs.run_settings import SECTIONS, RunSettings
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.settings.method import MethodConfig
-from vdgs.settings.plain import from_dict
 from vdgs.storage.files import read_json
 from vdgs.storage.records import record_of
 
@@ -88,7 +87,7 @@ class RunFolder:
     def evaluation(self) -> Path:
         return self.path / "evaluation"
 
-    def begin(self, settings: dict[str, Any], checked: Sequence[str] = SECTIONS, command: str | None = None) -> None:
+    def begin(self, settings: RunSettings, checked: Sequence[str] = SECTIONS, command: str | None = None) -> None:
         """Write the settings of a new run, or check that those of the run that is there are the same.
 
         `command` is the one that begins it, kept so that people can be told how to continue.
@@ -97,8 +96,7 @@ class RunFolder:
         same, and if the folder holds something else.
         """
         if self.config_file.exists():
-            old = self.settings()
-            changed = changed_options({s: old[s] for s in checked}, {s: settings[s] for s in checked})
+            changed = changed_options(self.settings(), settings, checked)
             if changed:
                 raise RunError(
                     f"{self.config_file}: this run was started with other settings:\n  "
@@ -127,7 +125,7 @@ class RunFolder:
                 "Choose an empty or a new folder for --output."
             )
 
-    def change_settings(self, settings: dict[str, Any], redo: bool, command: str | None = None) -> list[str]:
+    def change_settings(self, settings: RunSettings, redo: bool, command: str | None = None) -> list[str]:
         """Give a run other settings; returns what changed, one line each. `command` as in `begin`.
 
         Raises RunError, with the differences, if trained work depends on what changed, unless `redo` allows to
@@ -158,23 +156,20 @@ class RunFolder:
     def move_capture(self, to: Path) -> None:
         """Remember that the capture of the run lies elsewhere now. That it is the same one is for the caller to see."""
         settings, command = self.settings(), self.config.command()
-        before, now = settings["capture"]["path"], str(to.resolve())
+        before, now = settings.capture_path, str(to.resolve())
         if before == now:
             return
         words = shlex.split(command) if command else []
         moved = shlex.join([now if word == before else word for word in words]) if before in words else None
-        settings["capture"]["path"] = now
-        self.config.write(settings, moved)
+        self.config.write(replace(settings, capture_path=now), moved)
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> RunSettings:
         """The settings of the run (`ConfigFile.settings`)."""
         return self.config.settings()
 
     def method(self) -> MethodConfig:
         """The settings of the run but for the capture."""
-        settings = self.settings()
-        settings.pop("capture")
-        return from_dict(MethodConfig, settings)
+        return self.settings().method
 
     def keys(self) -> StageKeys:
         """The key of every stage, for the settings that config.yaml holds and the coarse model that is there."""

@@ -11,6 +11,8 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
+from vdgs.runs.run_settings import RunSettings
+
 #: Each stage with the sections of config.yaml that it depends on and the stages it builds on.
 DEPENDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "coarse": (("capture", "training"), ()),
@@ -24,7 +26,7 @@ DEPENDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 NEEDS: dict[tuple[str, ...], str] = {("training", "exposure_spread"): "exposure"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StageKeys:
     """The key of every stage of a run."""
 
@@ -36,13 +38,13 @@ class StageKeys:
     merge: str
 
 
-def stage_keys(settings: dict[str, Any], coarse_model: str | None = None) -> StageKeys:
+def stage_keys(settings: RunSettings, coarse_model: str | None = None) -> StageKeys:
     """Keys from the sections of config.yaml. What builds on the coarse stage also depends on the very model
     (`coarse_model`): trained again on another machine it may differ in its last bits."""
-    keys: dict[str, str] = {}
+    keys, plain = dict[str, str](), settings.to_dict()
     for stage, (sections, before) in DEPENDS.items():
         # Where the capture lies is not what it is: a capture that moved keeps its results.
-        own = {name: counted(name, settings[name]) for name in sections}
+        own = {name: counted(name, plain[name]) for name in sections}
         content = [own, *(keys[name] for name in before), *([coarse_model] if before == ("coarse",) else [])]
         keys[stage] = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
     return StageKeys(**keys)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -19,13 +18,11 @@ from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.standing import standing_of
 from vdgs.runs.status import Status
 from vdgs.runs.vouching import load_vouched
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.plain import from_dict
 from vdgs.settings.requests import ModelName
 from vdgs.storage.files import read_json
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class OpenedModel:
     """One of the models of a run."""
 
@@ -51,7 +48,7 @@ class OpenedModel:
         return self.model.anchors.positions.device
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrainedRun(OpenedModel):
     """A run opened for looking at it: one of its models, and its capture as it was trained on."""
 
@@ -70,7 +67,7 @@ def open_run(path: Path, which: ModelName = "best", device: torch.device | str =
 
 def with_capture(opened: OpenedModel, capture: Capture) -> TrainedRun:
     """An opened model and the capture of its run. Raises RunError where it was made from another one."""
-    refuse_another_capture(opened.model_path, opened.model.facts.get("capture", {}), capture)
+    refuse_another_capture(opened.model_path, opened.model.metadata.capture, capture)
     return TrainedRun(**vars(opened), capture=capture)
 
 
@@ -108,7 +105,10 @@ class FoundModel:
 
     def opened(self, folder: RunFolder, model: AnchorModel) -> OpenedModel:
         """The same with the model that was read of it."""
-        return OpenedModel(folder, model, self.stage.model, self.name, self.stage.status(), self.key, self.caution)
+        return OpenedModel(
+            folder=folder, model=model, model_path=self.stage.model, name=self.name, status=self.stage.status(),
+            key=self.key, caution=self.caution,
+        )  # fmt: skip
 
 
 def _model_line(name: str, anchors: int, file: Path) -> str:
@@ -155,14 +155,14 @@ def open_capture(folder: RunFolder, at: Path | None = None) -> Capture:
 
     Raises CaptureError if it is gone or changed its form.
     """
-    settings = dict(folder.settings()["capture"])
-    written = Path(settings.pop("path"))
+    settings = folder.settings()
+    written = Path(settings.capture_path)
     if at is None and not written.is_dir():
         raise CaptureError(
             f"{written}: the capture of {folder.path} is not there. If it was moved, say where it lies now: "
             "--capture PATH."
         )
-    return load_capture(at or written, options_from(settings, folder.config_file))
+    return load_capture(at or written, settings.capture)
 
 
 def remember_capture(folder: RunFolder, at: Path) -> Capture:
@@ -174,11 +174,3 @@ def remember_capture(folder: RunFolder, at: Path) -> Capture:
             refuse_another_capture(folder.capture_file, read_json(folder.capture_file), capture)
         folder.move_capture(at)
     return capture
-
-
-def options_from(settings: dict[str, Any], source: Path) -> CaptureOptions:
-    """CaptureOptions from the plain values of config.yaml. Raises RunError on settings that are none."""
-    try:
-        return from_dict(CaptureOptions, settings, "capture")
-    except ValueError as error:
-        raise RunError(f"{source}: {error}. Write it as it was, or start a new --output.") from error

@@ -11,13 +11,14 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from vdgs.errors import VdgsError
 from vdgs.partition.records import PartitionRecord
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.keys import StageKeys, stage_keys
 from vdgs.runs.locks import seems_locked
+from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
 from vdgs.runs.vouching import foreign, to_delete
@@ -34,7 +35,7 @@ OTHER_BLOCKS = "its blocks are not those that it was merged from"
 OTHER_MODEL = "measured with another model than the run has now"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Standing:
     """How far one stage of a run, or one of its blocks, is."""
 
@@ -122,7 +123,7 @@ class RunStanding:
         return f"vdgs {verbs.get(stage, f'train {run}')}"
 
 
-def standing_of(run: RunFolder, settings: dict[str, Any] | None = None) -> RunStanding:
+def standing_of(run: RunFolder, settings: RunSettings | None = None) -> RunStanding:
     """How far a run is, for its settings or for others. Reads only, and never fails on what it reads: what is damaged
     is `unknown`, and says why."""
     try:
@@ -174,7 +175,7 @@ class _Survey:
             state = "stale"
         else:
             state, why = "done", ""
-        return Standing(name, state, self._inside(folder), why, made=made)
+        return Standing(name=name, state=state, folder=self._inside(folder), why=why, made=made)
 
     def _inside(self, folder: Path) -> str:
         return folder.relative_to(self.run.path).as_posix()
@@ -214,12 +215,15 @@ class _Survey:
         try:
             status = folder.status()
         except VdgsError as error:
-            return Standing(name, "unknown", inside, _first_line(str(error)))
+            return Standing(name=name, state="unknown", folder=inside, why=_first_line(str(error)))
         state, why = self._state_of(folder, status, key, other, locked)
         if state == "done" and (wrong := foreign(folder, key or "", _number(name))):
             remedy = f"delete {to_delete(folder)}, then "
-            return Standing(name, "stale", inside, f"model.safetensors is {wrong}", status, remedy=remedy)
-        return Standing(name, state, inside, why, status, status.model or "")
+            return Standing(
+                name=name, state="stale", folder=inside, why=f"model.safetensors is {wrong}", status=status,
+                remedy=remedy,
+            )  # fmt: skip
+        return Standing(name=name, state=state, folder=inside, why=why, status=status, made=status.model or "")
 
     def _state_of(
         self, folder: StageFolder, status: Status, key: str | None, other: str, locked: Path
@@ -246,9 +250,11 @@ class _Survey:
         models = tuple((b.status.model if b.status else None) if b.state == "done" else None for b in blocks)
         stands_in = [block.name for block, model in zip(blocks, models, strict=True) if model is None]
         if found.status.block_models != models:
-            return Standing("merge", "stale", found.folder, OTHER_BLOCKS, found.status, found.made)
+            return Standing(
+                name="merge", state="stale", folder=found.folder, why=OTHER_BLOCKS, status=found.status, made=found.made
+            )
         why = f"the coarse model stands in for {', '.join(stands_in)}" if stands_in else ""
-        return Standing("merge", "done", found.folder, why, found.status, found.made)
+        return Standing(name="merge", state="done", folder=found.folder, why=why, status=found.status, made=found.made)
 
     def _measured(self, name: str, folder: Path, model: Standing) -> Standing:
         """Figures of a model: they are worth what the model is."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from vdgs.partition.records import MergedBlock
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Status:
     """status.json; None for what a stage does not say."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from safetensors import SafetensorError, safe_open
 
 from vdgs.errors import RunError
-from vdgs.model.anchor_model import FORMAT, FORMAT_OF_PARTS, AnchorModel
+from vdgs.model.anchor_model import FORMAT, FORMAT_OF_PARTS, AnchorModel, ModelMetadata
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.storage.tensors import identity
 
@@ -24,13 +24,12 @@ def foreign(stage: StageFolder, key: str, block: int | None = None) -> str:
     try:
         with safe_open(stage.model, framework="pt") as file:
             header = dict(file.metadata() or {})
-        told = json.loads(header.get(FORMAT) or header[FORMAT_OF_PARTS])["facts"]
-        of_block, made_with = told.get("block"), told["key"]
+        told = ModelMetadata.from_dict(json.loads(header.get(FORMAT) or header[FORMAT_OF_PARTS])["facts"])
     except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError):
         return "not a model that can be read"
-    if of_block != block:
-        return "a model of the whole scene" if of_block is None else f"the model of block {of_block}"
-    if made_with != key:
+    if told.block != block:
+        return "a model of the whole scene" if told.block is None else f"the model of block {told.block}"
+    if told.key != key:
         return "a model of other settings or of another run"
     return "" if _size_agrees(stage) else NOT_VOUCHED
 

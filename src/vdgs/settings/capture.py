@@ -13,7 +13,7 @@ SplitMode = Literal["auto", "explicit", "every"]
 Format = Literal["auto", "colmap", "transforms", "mega-nerf", "matrixcity"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CaptureOptions:
     """How to read a folder of photographs with cameras."""
 

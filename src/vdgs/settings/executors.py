@@ -14,7 +14,7 @@ from vdgs.settings.ranges import LARGE, WORKERS, Range, refuse
 ExecutorName = Literal["local", "ray", "slurm"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SlurmOptions:
     """How jobs are asked of SLURM."""
 
@@ -35,7 +35,7 @@ class SlurmOptions:
     """More options for sbatch, each a word (`--slurm.options --qos=long --constraint=avx512`)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ExecutorOptions:
     """Where blocks are trained and shards of other stages done, and what each asks of the place."""
 

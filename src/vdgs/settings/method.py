@@ -20,7 +20,7 @@ RATE = Range(0, 100, above=True)
 FACTOR = Range(0, 1000, above=True)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AnchorConfig:
     """The anchor model (Scaffold-GS, section III-B of the paper)."""
 
@@ -49,7 +49,7 @@ class AnchorConfig:
     """Start the features from the colours of the sparse points instead of zeros."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RateConfig:
     """Learning rates of Adam; pairs decay exponentially from the first to the second value."""
 
@@ -71,7 +71,7 @@ class RateConfig:
     """Exposure of the photographs, where one is fitted."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class GrowthConfig:
     """Where anchors are added and removed (Scaffold-GS, section 4.2 there)."""
 
@@ -99,7 +99,7 @@ class GrowthConfig:
     """No growth beyond this many anchors; 0 for no limit. Nothing is removed to keep to it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CompensationConfig:
     """Compensated anchor growth: gradients of places that few cameras see are remembered and added (eqs. 8-10)."""
 
@@ -142,7 +142,7 @@ class LossConfig:
     were left transparent could not borrow a colour from it (choice; the paper is silent on its background)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """Training of the coarse stage."""
 
@@ -190,7 +190,7 @@ class TrainConfig:
     """Compensated growth already in this stage (choice: only blocks have it; the ablation without blocks needs it)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PartitionConfig:
     """How the scene is cut into blocks (eq. 5 and what follows it)."""
 
@@ -214,7 +214,7 @@ class PartitionConfig:
     (fifty) each."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AssignmentConfig:
     """Which cameras train which block (eqs. 6-7)."""
 
@@ -238,7 +238,7 @@ class AssignmentConfig:
     """Size at which the renders are compared."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BlockConfig:
     """Training of each block from the coarse anchors of its place. Loss and seed are those of the coarse stage."""
 

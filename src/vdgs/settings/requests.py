@@ -32,7 +32,7 @@ PLACE = Range(-1e9, 1e9)
 ModelName = Literal["best", "coarse", "merged"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunRequest:
     """Everything from a capture to a report (`vdgs run`)."""
 
@@ -79,7 +79,7 @@ class RunRequest:
         return MethodConfig(self.training, self.partition, self.assignment, self.block, self.merge)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RenderRequest:
     """Views of a run, or a camera path, as PNG files or a film (`vdgs render`)."""
 
@@ -121,7 +121,7 @@ class RenderRequest:
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MapRequest:
     """Maps of a run as GeoTIFFs and pictures (`vdgs map`)."""
 
@@ -147,7 +147,7 @@ class MapRequest:
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ExportRequest:
     """A scene as files of Gaussians or points for other programs (`vdgs export`)."""
 
@@ -188,7 +188,7 @@ class ExportRequest:
     """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ViewRequest:
     """A scene in a browser (`vdgs view`)."""
 

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from vdgs.settings.ranges import MANY, WORKERS, Named, Range
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SfmOptions:
     """How photographs become a capture (structure from motion)."""
 
@@ -38,7 +38,7 @@ class SfmOptions:
     in XMP; GPSHPositioningError in EXIF, with heights as much worse as here)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SfmRequest:
     """Photographs to a capture (`vdgs sfm`)."""
 

@@ -25,7 +25,7 @@ TURNED_DEG = 3.0
 MARK_WRONG_PX = 8.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Outcome:
     """What the steps of a reconstruction left beside the model, which lies where it belongs."""
 
@@ -139,12 +139,18 @@ def _height(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) ->
 def _cameras(model: pycolmap.Reconstruction, kinds: Sequence[Kind]) -> tuple[CameraFacts, ...]:
     return tuple(
         CameraFacts(
-            kind.camera, len(kind.photographs), kind.width, kind.height, float(kind.focal_px), kind.source,
-            float(after.mean_focal_length()), float(after.params[3]),
+            name=kind.camera,
+            photographs=len(kind.photographs),
+            width=kind.width,
+            height=kind.height,
+            focal_before_px=float(kind.focal_px),
+            focal_source=kind.source,
+            focal_after_px=float(after.mean_focal_length()),
+            radial_distortion=float(after.params[3]),
         )
         for kind, after in zip(kinds, kinds_after(model, kinds), strict=True)
         if after is not None
-    )  # fmt: skip
+    )
 
 
 def _photographs(

@@ -30,7 +30,7 @@ FEW_FEATURES = 100
 _UPRIGHT_QUALITY = 97
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Kind:
     """Photographs that one camera took: the same maker, serial number, size and focal length."""
 
@@ -56,7 +56,17 @@ def kinds_of(photographs: Sequence[Photograph]) -> list[Kind]:
         lens, longer = first.lens, max(first.width, first.height)
         focal = (lens.focal if lens else GUESSED_FOCAL) * longer
         source = lens.source if lens else "a guess"
-        kinds.append(Kind(first.camera, first.width, first.height, focal, bool(lens), source, tuple(members)))
+        kinds.append(
+            Kind(
+                camera=first.camera,
+                width=first.width,
+                height=first.height,
+                focal_px=focal,
+                known=bool(lens),
+                source=source,
+                photographs=tuple(members),
+            )
+        )
     return kinds
 
 

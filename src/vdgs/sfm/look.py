@@ -33,7 +33,7 @@ FEATURE_SECONDS, PAIR_SECONDS, MAPPING_SECONDS, WRITING_SECONDS = 0.25, 0.0055, 
 FEATURES_A_MEGAPIXEL = 2500
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Look:
     """What the heads of the photographs tell."""
 

@@ -32,7 +32,7 @@ class Unusable(Exception):
     """A file that cannot be used as a photograph; the message says why."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Photograph:
     """One photograph; sizes are those after it was turned upright."""
 
@@ -121,10 +121,11 @@ def read_photograph(path: Path, name: str) -> Photograph:
     altitude, altitude_type = _altitude(gps, xmp)
     attitude = _attitude(xmp) if orientation == 1 else None
     return Photograph(
-        name, path, width, height, orientation, _camera(tags, details, xmp), lens,
-        _text(details.get(0x9003)) or _text(tags.get(0x0132)), _place(gps), altitude, altitude_type, _deviations(xmp),
-        _error(gps), number(xmp, "drone-dji:RelativeAltitude", "sensefly:Height"), attitude, size,
-        transparent,
+        name=name, path=path, width=width, height=height, orientation=orientation, camera=_camera(tags, details, xmp),
+        lens=lens, taken=_text(details.get(0x9003)) or _text(tags.get(0x0132)), place=_place(gps), altitude=altitude,
+        altitude_type=altitude_type, deviations=_deviations(xmp), error_m=_error(gps),
+        above_takeoff=number(xmp, "drone-dji:RelativeAltitude", "sensefly:Height"), attitude=attitude, bytes=size,
+        may_be_transparent=transparent,
     )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ LEAST_POSITIONS = 3
 LEAST_DEVIATION_M = 0.01
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Positions:
     """Positions in metres east, north, up of an origin, for those photographs that have one."""
 
@@ -97,7 +97,10 @@ def find_positions(
     )
     if len(kinds) > 1:
         notes.append(f"altitudes are of several kinds ({'; '.join(kinds)}): heights may not fit together.")
-    return Positions(index, enu, deviations, origin, "; ".join(kinds), source, tuple(notes))
+    return Positions(
+        index=index, enu=enu, deviations=deviations, origin=origin, altitude_reference="; ".join(kinds), source=source,
+        notes=tuple(notes),
+    )  # fmt: skip
 
 
 def _recorded(photographs: Sequence[Photograph], table: Path | None) -> tuple[np.ndarray, str, list[str]]:

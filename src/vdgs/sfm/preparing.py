@@ -25,7 +25,7 @@ from vdgs.units import data_size, rough_duration
 FEATURE_BYTES, PIXEL_BYTES = 250, 0.9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Prepared:
     """What is known before the work."""
 
@@ -55,7 +55,10 @@ def prepare(request: SfmRequest) -> Prepared:
     threads = request.threads or default_threads()
     pairs = matching.expected_pairs(collection.photographs, positions, request.options)
     takes = seconds(collection.photographs, pairs, request.options, threads)
-    return Prepared(request, collection, positions, look, threads, takes, control)
+    return Prepared(
+        request=request, collection=collection, positions=positions, look=look, threads=threads, seconds=takes,
+        control=control,
+    )  # fmt: skip
 
 
 def _control(options: SfmOptions, collection: Collection, positions: Positions) -> Control | None:

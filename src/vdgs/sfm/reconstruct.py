@@ -35,6 +35,7 @@ from vdgs.sfm.figures import draw_positions, draw_residuals
 from vdgs.sfm.preparing import Prepared, check_disk, in_time, prepare, tell
 from vdgs.sfm.telling import tell_facts
 from vdgs.sfm.work import Work, key_of, quiet_colmap
+from vdgs.storage.documents import JsonObject
 from vdgs.storage.files import jsonable, write_json
 from vdgs.storage.records import plain
 
@@ -132,8 +133,9 @@ def _steps(prepared: Prepared, work: Work, keys: dict[str, str], console: Consol
     placed, origin, surveyed = _place(models[0], prepared, held[0])
     _write(prepared, work, models[0], keys["capture"], threads, console)
     outcome = Outcome(
-        kinds, placed, origin, surveyed, left_out, [model.num_reg_images() for model in models], pairs, held,
-        time.monotonic() - began,
+        kinds=kinds, placed=placed, origin=origin, survey=surveyed, left_out=left_out,
+        components=[model.num_reg_images() for model in models], pairs=pairs, held=held,
+        seconds=time.monotonic() - began,
     )  # fmt: skip
     facts = facts_of(models[0], prepared, outcome)
     points = aligning.points_of(models[0])
@@ -245,7 +247,7 @@ def _write(
     writing.write_images(output, work, names, _lenses(model, prepared.request.options.max_size), threads, console)
 
 
-def _georef(facts: ReconstructionFacts, origin: tuple[float, float, float]) -> dict[str, Any]:
+def _georef(facts: ReconstructionFacts, origin: tuple[float, float, float]) -> JsonObject:
     latitude, longitude, altitude = origin
     return {
         "frame": "ENU, metres, x east y north z up",

@@ -36,5 +36,9 @@ def sfm_request(asked: RunRequest) -> SfmRequest:
     run = RunFolder(asked.output)
     run.refuse_strangers()
     return SfmRequest(
-        (asked.capture, *asked.photographs), run.own_capture, options.gps, asked.threads, options=asked.sfm
+        photographs=(asked.capture, *asked.photographs),
+        output=run.own_capture,
+        gps=options.gps,
+        threads=asked.threads,
+        options=asked.sfm,
     )

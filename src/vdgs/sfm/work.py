@@ -84,7 +84,7 @@ class Work:
     def remove(self) -> None:
         shutil.rmtree(self.path, ignore_errors=True)
 
-    def _steps(self, which: str) -> dict[str, Any]:
+    def _steps(self, which: str) -> dict[str, str]:
         steps = read_record(self.path / STEPS).get(which)
         return steps if isinstance(steps, dict) else {}
 

@@ -20,7 +20,7 @@ from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
 from vdgs.errors import RunError
 from vdgs.executors.shard import Shard
-from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.sizes import largest_log_scales
 from vdgs.model.visibility import effective_count
 from vdgs.partition.blocks import Blocks
@@ -74,13 +74,14 @@ def _train(
     capture, coarse = opened.capture, opened.model
     chosen = views_of_block(run, capture, index)
     views = [capture.train_views[i] for i in chosen]
-    facts = {"capture": capture_facts(capture), "version": __version__, "block": index, "views": len(views)}
-    facts["key"] = run.keys().blocks
+    metadata = ModelMetadata(
+        capture=capture_facts(capture), version=__version__, block=index, views=len(views), key=run.keys().blocks
+    )
     own, around = split_anchors(coarse.anchors, blocks, index, method.block)
     around &= drawn_by(coarse.anchors, [view.camera for view in views])
     anchors, surroundings = coarse.anchors.select(own), coarse.anchors.select(around)
     if not views or not len(anchors):
-        _keep_coarse(folder, replace(coarse, anchors=anchors, facts=facts), len(views), console)
+        _keep_coarse(folder, replace(coarse, anchors=anchors, metadata=metadata), len(views), console)
         return
     owned = [each.anchors_core for each in run.partition_record().blocks]
     config = block_training(method, len(views))
@@ -101,9 +102,9 @@ def _train(
     flown = [view.camera for view in capture.train_views]
     with ImageCache(views, image_budget(options), downscales=factors) as images:
         stage = Stage(
-            config, images, len(views), coarse.voxel, camera_height(capture), kind="block",
-            background=coarse.background, device=device, frozen_decoder=method.block.decoder == "frozen",
-            surroundings=Surroundings(surroundings, coarse.decoder),
+            config=config, images=images, image_count=len(views), voxel=coarse.voxel,
+            camera_height=camera_height(capture), kind="block", background=coarse.background, device=device,
+            frozen_decoder=method.block.decoder == "frozen", surroundings=Surroundings(surroundings, coarse.decoder),
             may_hold=holds(blocks, index, method.block), mobility=ramp(blocks, index, method.block),
             appearance_of=chosen, shares=shares, crops=crops,
             largest=(lambda positions: largest_log_scales(positions, flown)) if config.anchors.bound_sizes else None,
@@ -117,13 +118,8 @@ def _train(
             highlight=False,
         )
         train_watched(folder, state, stage, options, console)
-    model = AnchorModel(
-        *state.result(),
-        coarse.voxel,
-        coarse.background,
-        facts | {"iterations": state.iteration, "decoder": method.block.decoder},
-    )
-    finish(folder, state, model, console, area)
+    metadata = replace(metadata, iterations=state.iteration, decoder=method.block.decoder)
+    finish(folder, state, state.model(coarse.voxel, coarse.background, metadata), console, area)
 
 
 def _views_served(count: int, of: int, shares: Sequence[float] | None) -> str:
@@ -137,7 +133,7 @@ def _keep_coarse(folder: StageFolder, model: AnchorModel, views: int, console: C
     why = "no camera sees it" if not views else "it holds no anchor"
     model.save(folder.model)
     status = Status(
-        "done", iteration=0, iterations=0, anchors=len(model.anchors), seconds=0.0, why=why,
+        state="done", iteration=0, iterations=0, anchors=len(model.anchors), seconds=0.0, why=why,
         model=identity(folder.model),
     )  # fmt: skip
     folder.set_status(status)

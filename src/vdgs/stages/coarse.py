@@ -15,7 +15,7 @@ from vdgs.captures.facts import capture_facts
 from vdgs.captures.heights import camera_height
 from vdgs.captures.images import ImageCache
 from vdgs.inspection.starting import refuse_unworkable
-from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchor_model import ModelMetadata
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.model.exposure import neutral_exposures
@@ -83,11 +83,10 @@ def _train(
         _announce(capture, state, config, console)
         train_watched(folder, state, stage, options, console)
     _refuse_empty(run, state)
-    facts = {
-        "capture": capture_facts(capture), "version": __version__, "iterations": state.iteration,
-        "key": run.keys().coarse,
-    }  # fmt: skip
-    finish(folder, state, AnchorModel(*state.result(), stage.voxel, stage.background, facts), console)
+    metadata = ModelMetadata(
+        capture=capture_facts(capture), version=__version__, iterations=state.iteration, key=run.keys().coarse
+    )
+    finish(folder, state, state.model(stage.voxel, stage.background, metadata), console)
 
 
 def _refuse_empty(run: RunFolder, state: TrainingState) -> None:
@@ -95,7 +94,7 @@ def _refuse_empty(run: RunFolder, state: TrainingState) -> None:
     would not help."""
     if not len(state.anchors):
         save_state(run.coarse.checkpoints, to_saved(state))
-        run.coarse.set_status(Status("failed", iteration=state.iteration, why="training has removed all anchors"))
+        run.coarse.set_status(Status(state="failed", iteration=state.iteration, why="training has removed all anchors"))
     refuse_empty(run, len(state.anchors))
 
 
@@ -165,8 +164,8 @@ def open_stage(
         smallest = max(factor for _, factor in config.resolutions)
         background = mean_colour(images, len(cameras), smallest)
     stage = Stage(
-        config, images, len(cameras), voxel, camera_height(capture), background=background,
-        shares=shares_for(config, anchors, cameras), device=torch.device(device),
+        config=config, images=images, image_count=len(cameras), voxel=voxel, camera_height=camera_height(capture),
+        background=background, shares=shares_for(config, anchors, cameras), device=torch.device(device),
         largest=(lambda positions: largest_log_scales(positions, cameras)) if config.anchors.bound_sizes else None,
     )  # fmt: skip
     return stage, anchors

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -48,6 +47,7 @@ from vdgs.runs.locks import hold
 from vdgs.runs.opening import FoundModel, find_model
 from vdgs.runs.run_context import RunContext
 from vdgs.settings.requests import ModelName
+from vdgs.storage.documents import MeasuredAs
 from vdgs.storage.files import read_json, read_record, write_bytes, write_json
 from vdgs.storage.records import plain, record_of
 
@@ -57,7 +57,7 @@ VIEWS_OF_SHARD = 3, 25, 16
 VIEWS = shard_kind("measure", "views")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Measuring:
     """Which figures are wanted."""
 
@@ -232,7 +232,7 @@ def is_measured(run: RunFolder, name: str, lpips_weights: Path | None, bins: int
     return {key: record.get(key) for key in wanted} == wanted
 
 
-def _record_of(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> dict[str, Any]:
+def _record_of(run: RunFolder, name: str, lpips_weights: Path | None, bins: int) -> MeasuredAs:
     stage = run.merged if name == "merged" else run.coarse
     keys = run.keys()
     key = keys.merge if name == "merged" else keys.coarse

@@ -47,12 +47,12 @@ def merge_run(context: RunContext, incomplete: bool, console: Console) -> None:
         ]
         merged, became = merge(coarse, trained, blocks, cameras, run.method().merge, allow_missing=incomplete)
         run.merged.discard_unless(key)
-        merged = replace(merged, facts={**merged.facts, "key": key})
+        merged = replace(merged, metadata=replace(merged.metadata, key=key))
         merged.save(run.merged.model)
         trained_in = [run.block(i).status() for i, whole in enumerate(done) if whole]
         stages = [opened.status, *trained_in]
         status = Status(
-            "done", anchors=len(merged.anchors), blocks_trained=sum(done), blocks=tuple(became),
+            state="done", anchors=len(merged.anchors), blocks_trained=sum(done), blocks=tuple(became),
             block_models=tuple(models), model=identity(run.merged.model),
             seconds=sum(each.seconds or 0.0 for each in stages),
             iterations=sum(each.iteration or 0 for each in stages),

@@ -121,7 +121,7 @@ def partition_run(context: RunContext, console: Console, device: str = "cpu", wi
         spatial = _spatial(scene, method.partition, method.training.seed, blocks)
         _draw(run.partition, scene, blocks, scores, assignment, method.partition, spatial)
         record = PartitionRecord(
-            keys.partition, keys.assignment, method.partition.strategy,
+            key=keys.partition, assignment_key=keys.assignment, strategy=method.partition.strategy,
             lambda_vis=method.partition.lambda_vis if method.partition.strategy == "visibility" else None,
             warnings=tuple(warnings), complaints=tuple(assignment.complaints), blocks=tuple(rows),
             spatial=cut_rows(spatial, scene.positions, scene.visibility),

@@ -91,7 +91,7 @@ def _mark_queued(folder: StageFolder, key: str) -> None:
     with suppress(RunError), folder.locked():
         folder.discard_unless(key)
         if not folder.is_done(key):
-            folder.set_status(Status("queued"))
+            folder.set_status(Status(state="queued"))
 
 
 def _remove_beyond(run: RunFolder, count: int, console: Console) -> None:

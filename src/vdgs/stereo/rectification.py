@@ -22,7 +22,7 @@ LARGEST = 4.0
 SMALLEST_SIDE = 16
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Rectified:
     """The common picture plane of two cameras."""
 
@@ -60,7 +60,10 @@ class Rectified:
         width, height = int(np.ceil(max(right_a - left_a, right_b - left_b))), int(np.ceil(low - top))
         if min(width, height) < SMALLEST_SIDE or width * height > LARGEST * first.width * first.height:
             return None
-        return Rectified(rotation, baseline, first.fx, (-left_a, -left_b), -top, width, height)
+        return Rectified(
+            rotation=rotation, baseline=baseline, focal=first.fx, columns=(-left_a, -left_b), row=-top, width=width,
+            height=height,
+        )  # fmt: skip
 
     def to_photograph(self, camera: Camera, which: int) -> Float[np.ndarray, "3 3"]:
         """The homography from pixel indices of the common picture to those of a photograph (0 the first, 1 the

@@ -17,7 +17,7 @@ STOREY = 2.7
 _FOUNDATION = 2.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class House:
     """What makes one house unlike the next (metres; `pitch` is rise over run)."""
 
@@ -37,7 +37,9 @@ class House:
 
 def foundation(builder: MeshBuilder, frame: Frame, shape: Box) -> None:
     """A stone plinth that carries a building down into sloping ground."""
-    plinth = Box(shape.x0 - 0.06, shape.x1 + 0.06, shape.y0 - 0.06, shape.y1 + 0.06, -_FOUNDATION, 0.12)
+    plinth = Box(
+        x0=shape.x0 - 0.06, x1=shape.x1 + 0.06, y0=shape.y0 - 0.06, y1=shape.y1 + 0.06, z0=-_FOUNDATION, z1=0.12
+    )
     stone = Skin(Material.STONE, palette.STONE * 0.75)
     box(builder, frame, plinth, stone, stone)
 
@@ -71,7 +73,7 @@ def pitched_roof(builder: MeshBuilder, frame: Frame, shape: Box, pitch: float, r
         for start, end in edges:
             down = np.array([0, 0, -0.22])
             face(builder, frame, np.array([start + down, end + down, end, start]), trim)
-    cap = Box(r0, r1, middle - 0.16, middle + 0.16, top - 0.12, top + 0.09)
+    cap = Box(x0=r0, x1=r1, y0=middle - 0.16, y1=middle + 0.16, z0=top - 0.12, z1=top + 0.09)
     box(builder, frame, cap, *(Skin(Material.PAINT, roof.colour * 0.8),) * 2)
     return rise
 
@@ -87,7 +89,7 @@ def gables(builder: MeshBuilder, frame: Frame, shape: Box, pitch: float, skin: S
 def house(builder: MeshBuilder, frame: Frame, style: House, rng: np.random.Generator) -> None:
     """A house with windows and a door, its roof, a chimney, and now and then a wing or dormers."""
     w, d = style.width / 2, style.depth / 2
-    body = Box(-w, w, -d, d, 0, style.eaves)
+    body = Box(x0=-w, x1=w, y0=-d, y1=d, z0=0, z1=style.eaves)
     windows = Skin(Material.WINDOWS, style.walls, style.seed)
     plaster = Skin(Material.PLASTER, style.walls, style.seed)
     front = Skin(Material.DOOR, style.walls, style.seed)
@@ -108,11 +110,11 @@ def house(builder: MeshBuilder, frame: Frame, style: House, rng: np.random.Gener
 def _chimney(builder: MeshBuilder, frame: Frame, x: float, y: float, eaves: float, rise: float) -> None:
     brick = Skin(Material.BRICK, palette.BRICK)
     top = eaves + rise + 0.8
-    box(builder, frame, Box(x - 0.4, x + 0.4, y - 0.3, y + 0.3, eaves, top), brick, brick)
+    box(builder, frame, Box(x0=x - 0.4, x1=x + 0.4, y0=y - 0.3, y1=y + 0.3, z0=eaves, z1=top), brick, brick)
     pot = Skin(Material.PAINT, palette.BRICK * 0.7)
     dark = Skin(Material.DARK, palette.DARK)
     for dx in (-0.18, 0.18):
-        pots = Box(x + dx - 0.12, x + dx + 0.12, y - 0.12, y + 0.12, top, top + 0.35)
+        pots = Box(x0=x + dx - 0.12, x1=x + dx + 0.12, y0=y - 0.12, y1=y + 0.12, z0=top, z1=top + 0.35)
         box(builder, frame, pots, pot, dark)
 
 
@@ -121,7 +123,7 @@ def _wing(builder: MeshBuilder, frame: Frame, style: House, rng: np.random.Gener
     side = rng.choice([-1.0, 1.0])
     span, reach = 0.4 * style.width, 1.7
     turned = frame.moved(side * (style.width / 2 - span / 2 - 0.3), -style.depth / 4, turn=-np.pi / 2)
-    body = Box(-style.depth / 4, style.depth / 4 + reach, -span / 2, span / 2, 0, style.eaves - 0.35)
+    body = Box(x0=-style.depth / 4, x1=style.depth / 4 + reach, y0=-span / 2, y1=span / 2, z0=0, z1=style.eaves - 0.35)
     skin = Skin(Material.WINDOWS, style.walls, style.seed)
     foundation(builder, turned, body)
     box(builder, turned, body, skin)
@@ -135,7 +137,7 @@ def _dormers(builder: MeshBuilder, frame: Frame, style: House, plaster: Skin) ->
     z = style.eaves + (style.depth / 2 - run) * style.pitch - 0.1
     for x in (-0.24 * style.width, 0.24 * style.width):
         turned = frame.moved(x, -run, z, turn=-np.pi / 2)
-        body = Box(-1.6, 0.15, -0.7, 0.7, 0, 1.05)
+        body = Box(x0=-1.6, x1=0.15, y0=-0.7, y1=0.7, z0=0, z1=1.05)
         glass = Skin(Material.GLASS, palette.DARK, style.seed)
         box(builder, turned, body, (plaster, glass, plaster, plaster))
         gables(builder, turned, body, 0.7, plaster)
@@ -153,13 +155,13 @@ def flat_block(
     """A town block with shops below and a flat roof with parapet, stair hut, plant and skylights."""
     wall, roof = skins
     w, d, height = size[0] / 2, size[1] / 2, storeys * 3.1 + 0.6
-    body = Box(-w, w, -d, d, 0, height)
+    body = Box(x0=-w, x1=w, y0=-d, y1=d, z0=0, z1=height)
     foundation(builder, frame, body)
     box(builder, frame, body, wall, roof)
     parapet(builder, frame, body, Skin(Material.PAINT, wall.colour * 0.85))
     metal, dark = Skin(Material.PAINT, palette.METAL), Skin(Material.DARK, palette.DARK)
     hx, hy = rng.uniform(-0.5, 0.5) * w, rng.uniform(-0.1, 0.5) * d
-    hut = Box(hx - 1.5, hx + 1.5, hy - 1.3, hy + 1.3, height, height + 2.4)
+    hut = Box(x0=hx - 1.5, x1=hx + 1.5, y0=hy - 1.3, y1=hy + 1.3, z0=height, z1=height + 2.4)
     box(builder, frame, hut, Skin(Material.PLASTER, wall.colour, wall.seed), metal)
     sunny = rng.random() < 0.45
     if sunny:
@@ -169,11 +171,11 @@ def flat_block(
         if (abs(x - hx) < 2.6 and abs(y - hy) < 2.4) or (sunny and abs(y + 0.7 * d) < 1.9):
             continue
         if rng.random() < 0.5:
-            unit = Box(x - 0.8, x + 0.8, y - 0.6, y + 0.6, height, height + 1.0)
+            unit = Box(x0=x - 0.8, x1=x + 0.8, y0=y - 0.6, y1=y + 0.6, z0=height, z1=height + 1.0)
             box(builder, frame, unit, metal, Skin(Material.PAINT, palette.METAL * 0.8))
             frustum(builder, frame.moved(x, y), (0.45, 0.45), (height + 1.0, height + 1.08), dark, dark, 10)
         else:
-            light = Box(x - 0.7, x + 0.7, y - 0.7, y + 0.7, height, height + 0.45)
+            light = Box(x0=x - 0.7, x1=x + 0.7, y0=y - 0.7, y1=y + 0.7, z0=height, z1=height + 0.45)
             skin = Skin(Material.PAINT, palette.TRIM)
             box(builder, frame, light, skin, Skin(Material.GLASS, palette.DARK), inset=(0.15, 0.15))
 
@@ -182,10 +184,10 @@ def parapet(builder: MeshBuilder, frame: Frame, shape: Box, skin: Skin) -> None:
     """A low wall around a flat roof."""
     t, z0, z1 = 0.3, shape.z1 - 0.1, shape.z1 + 0.7
     for part in (
-        Box(shape.x0, shape.x1, shape.y0, shape.y0 + t, z0, z1),
-        Box(shape.x0, shape.x1, shape.y1 - t, shape.y1, z0, z1),
-        Box(shape.x0, shape.x0 + t, shape.y0 + t, shape.y1 - t, z0, z1),
-        Box(shape.x1 - t, shape.x1, shape.y0 + t, shape.y1 - t, z0, z1),
+        Box(x0=shape.x0, x1=shape.x1, y0=shape.y0, y1=shape.y0 + t, z0=z0, z1=z1),
+        Box(x0=shape.x0, x1=shape.x1, y0=shape.y1 - t, y1=shape.y1, z0=z0, z1=z1),
+        Box(x0=shape.x0, x1=shape.x0 + t, y0=shape.y0 + t, y1=shape.y1 - t, z0=z0, z1=z1),
+        Box(x0=shape.x1 - t, x1=shape.x1, y0=shape.y0 + t, y1=shape.y1 - t, z0=z0, z1=z1),
     ):
         box(builder, frame, part, skin, skin)
 
@@ -206,7 +208,7 @@ def church(builder: MeshBuilder, frame: Frame, scale: float) -> None:
     s = scale
     stone = Skin(Material.STONE, palette.PALE_STONE, 0.3)
     slate = Skin(Material.SLATE, palette.SLATE[0], 0.3)
-    nave = Box(-7 * s, 8 * s, -4 * s, 4 * s, 0, 7 * s)
+    nave = Box(x0=-7 * s, x1=8 * s, y0=-4 * s, y1=4 * s, z0=0, z1=7 * s)
     foundation(builder, frame, nave)
     walls = Skin(Material.OFFICE, palette.PALE_STONE, 0.97)
     box(builder, frame, nave, walls)
@@ -215,7 +217,7 @@ def church(builder: MeshBuilder, frame: Frame, scale: float) -> None:
     frustum(builder, frame.moved(8 * s, 0), (3.2 * s, 3.2 * s), (-2, 5 * s), stone, None, 14)
     frustum(builder, frame.moved(8 * s, 0), (3.5 * s, 0), (5 * s, 7.4 * s), slate, None, 14)
     for y in (-5.6 * s, 5.6 * s):  # side aisles under lean-to roofs
-        aisle = Box(-5 * s, 6 * s, min(y, 0.6 * y), max(y, 0.6 * y), 0, 3.4 * s)
+        aisle = Box(x0=-5 * s, x1=6 * s, y0=min(y, 0.6 * y), y1=max(y, 0.6 * y), z0=0, z1=3.4 * s)
         foundation(builder, frame, aisle)
         box(builder, frame, aisle, stone)
         edge = [(-5.3 * s, y * 1.05, 3.3 * s), (6.3 * s, y * 1.05, 3.3 * s)]
@@ -226,23 +228,23 @@ def church(builder: MeshBuilder, frame: Frame, scale: float) -> None:
 
 def _tower(builder: MeshBuilder, frame: Frame, s: float, stone: Skin) -> None:
     r, height = 2.7 * s, 15 * s
-    shaft = Box(-r, r, -r, r, 0, height)
+    shaft = Box(x0=-r, x1=r, y0=-r, y1=r, z0=0, z1=height)
     foundation(builder, frame, shaft)
     box(builder, frame, shaft, Skin(Material.OFFICE, palette.PALE_STONE * 0.95, 0.97), stone)
     for z in (0.5 * height, height - 0.2):
-        band = Box(-r - 0.25, r + 0.25, -r - 0.25, r + 0.25, z, z + 0.5)
+        band = Box(x0=-r - 0.25, x1=r + 0.25, y0=-r - 0.25, y1=r + 0.25, z0=z, z1=z + 0.5)
         box(builder, frame, band, stone, stone)
-    spire = Box(-r, r, -r, r, height + 0.3, height + 9.5 * s)
+    spire = Box(x0=-r, x1=r, y0=-r, y1=r, z0=height + 0.3, z1=height + 9.5 * s)
     box(builder, frame, spire, Skin(Material.TILES, palette.COPPER, 0.2), None, inset=(r - 0.02, r - 0.02))
     gold = Skin(Material.PAINT, palette.GOLD)
     top = height + 9.5 * s
-    box(builder, frame, Box(-0.12, 0.12, -0.12, 0.12, top, top + 1.8), gold, gold)
-    box(builder, frame, Box(-0.6, 0.6, -0.12, 0.12, top + 0.9, top + 1.2), gold, gold)
+    box(builder, frame, Box(x0=-0.12, x1=0.12, y0=-0.12, y1=0.12, z0=top, z1=top + 1.8), gold, gold)
+    box(builder, frame, Box(x0=-0.6, x1=0.6, y0=-0.12, y1=0.12, z0=top + 0.9, z1=top + 1.2), gold, gold)
 
 
 def barn(builder: MeshBuilder, frame: Frame) -> None:
     """A red barn with white trim and a silo."""
-    body = Box(-8, 8, -4.5, 4.5, 0, 4.6)
+    body = Box(x0=-8, x1=8, y0=-4.5, y1=4.5, z0=0, z1=4.6)
     red = Skin(Material.TIMBER, palette.BARN_RED)
     foundation(builder, frame, body)
     box(builder, frame, body, red)
@@ -260,7 +262,7 @@ def barn(builder: MeshBuilder, frame: Frame) -> None:
 def saw_tooth_hall(builder: MeshBuilder, frame: Frame, size: tuple[float, float], colour: np.ndarray) -> None:
     """A workshop with a saw-tooth roof: glazed steps to the back, sheets to the front."""
     w, d, height = size[0] / 2, size[1] / 2, 5.0
-    body = Box(-w, w, -d, d, 0, height)
+    body = Box(x0=-w, x1=w, y0=-d, y1=d, z0=0, z1=height)
     wall = Skin(Material.BRICK, colour)
     foundation(builder, frame, body)
     box(builder, frame, body, wall)

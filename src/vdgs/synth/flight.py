@@ -34,7 +34,10 @@ def look_from(position: np.ndarray, tilt: float, heading: float, roll: float) ->
 def pinhole(rigid: np.ndarray, options: ResolvedOptions) -> Camera:
     """The drone's camera at a pose."""
     focal = FOCAL * options.width
-    return Camera(rigid, focal, focal, options.width / 2, options.height / 2, options.width, options.height)
+    return Camera(
+        camera_from_world=rigid, fx=focal, fy=focal, cx=options.width / 2, cy=options.height / 2, width=options.width,
+        height=options.height,
+    )  # fmt: skip
 
 
 def flight_altitude(options: ResolvedOptions, tallest: float) -> float:
@@ -60,7 +63,11 @@ def fly(options: ResolvedOptions, town: Town) -> list[Camera]:
     rng = np.random.default_rng([options.seed, 2])
     altitude = flight_altitude(options, town.tallest)
     half, phase = options.extent_m / 2, float(rng.uniform(0, 6.28))
-    mission = MISSIONS[options.flight](Ground(half, altitude, options.images, phase, town.plan, town.landmarks))
+    mission = MISSIONS[options.flight](
+        Ground(
+            half=half, altitude=altitude, count=options.images, phase=phase, plan=town.plan, landmarks=town.landmarks
+        )
+    )
     cameras = []
     for (x, y), lean, turn, climb in zip(mission.place, mission.tilt, mission.heading, mission.climb, strict=True):
         x, y = x + rng.normal(0, 0.012 * options.extent_m), y + rng.normal(0, 0.012 * options.extent_m)

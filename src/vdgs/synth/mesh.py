@@ -32,7 +32,7 @@ class Material(IntEnum):
     DARK = 18
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Mesh:
     """A triangle soup with per-corner texture coordinates and normals (float32 unless said).
 

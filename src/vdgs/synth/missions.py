@@ -32,7 +32,7 @@ class Mission:
     climb: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Ground:
     """What a mission is planned over: half the side of the square to cover and the altitude (m), how many photographs,
     an angle to begin at (rad), the streets, and the landmarks [k, 2] m, the chief one first."""

@@ -22,7 +22,7 @@ _SIZES: dict[str, dict[str, float]] = {
 _FLIGHTS = ("uneven", "even", "distant", "orbits", "corridor")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SynthOptions:
     """A generated aerial capture; whatever is None takes the value that belongs to `size`."""
 
@@ -93,7 +93,7 @@ class SynthOptions:
         return ResolvedOptions(**(chosen | {"extent_m": float(chosen["extent_m"])}))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ResolvedOptions:
     """`SynthOptions` with every value known (`overlap` may stay open); the fields mean the same."""
 

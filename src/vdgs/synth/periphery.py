@@ -68,7 +68,7 @@ def _plain_house(site: Site, frame: Frame) -> None:
     """Walls with windows under a gabled roof, and nothing else."""
     rng = site.rng
     w, d, storeys = rng.uniform(4.0, 6.5), rng.uniform(3.4, 4.2), int(rng.integers(1, 3))
-    body = Box(-w, w, -d, d, -1.5, storeys * STOREY + 0.3)
+    body = Box(x0=-w, x1=w, y0=-d, y1=d, z0=-1.5, z1=storeys * STOREY + 0.3)
     colour, seed, pitch = palette.pick(rng, palette.PLASTER), float(rng.random()), rng.uniform(0.65, 0.95)
     roof = Skin(Material.TILES, palette.pick(rng, palette.ROOF_TILES), seed)
     box(site.builder, frame, body, Skin(Material.WINDOWS, colour, seed))

@@ -18,18 +18,18 @@ def car(builder: MeshBuilder, frame: Frame, rng: np.random.Generator) -> None:
     paint = Skin(Material.PAINT, palette.pick(rng, palette.CAR), 0.9)
     glass = Skin(Material.GLASS, palette.DARK, float(rng.random()))
     long, wide = rng.uniform(2.0, 2.3), rng.uniform(0.86, 0.94)
-    box(builder, frame, Box(-long, long, -wide, wide, 0.28, 0.82), paint, paint, inset=(0.12, 0.1))
+    box(builder, frame, Box(x0=-long, x1=long, y0=-wide, y1=wide, z0=0.28, z1=0.82), paint, paint, inset=(0.12, 0.1))
     back, front = (-long + 0.15, 0.35 * long) if rng.random() < 0.4 else (-0.62 * long, 0.4 * long)
-    cabin = Box(back, front, -wide + 0.12, wide - 0.12, 0.8, 1.42)
+    cabin = Box(x0=back, x1=front, y0=-wide + 0.12, y1=wide - 0.12, z0=0.8, z1=1.42)
     box(builder, frame, cabin, glass, paint, inset=(0.42, 0.14))
     for x in (-0.62 * long, 0.62 * long):
         for y in (-wide + 0.06, wide - 0.06):
-            box(builder, frame, Box(x - 0.32, x + 0.32, y - 0.1, y + 0.1, 0, 0.62), _DARK, _DARK)
+            box(builder, frame, Box(x0=x - 0.32, x1=x + 0.32, y0=y - 0.1, y1=y + 0.1, z0=0, z1=0.62), _DARK, _DARK)
     lamp = Skin(Material.PAINT, palette.TRIM * 1.1)
     tail = Skin(Material.PAINT, palette.CAR[0])
     for x, skin in ((long - 0.06, lamp), (-long + 0.06, tail)):
         for y in (-0.6 * wide, 0.6 * wide):
-            box(builder, frame, Box(x - 0.06, x + 0.06, y - 0.17, y + 0.17, 0.55, 0.7), skin, skin)
+            box(builder, frame, Box(x0=x - 0.06, x1=x + 0.06, y0=y - 0.17, y1=y + 0.17, z0=0.55, z1=0.7), skin, skin)
 
 
 def bus(builder: MeshBuilder, frame: Frame, rng: np.random.Generator) -> None:
@@ -37,13 +37,13 @@ def bus(builder: MeshBuilder, frame: Frame, rng: np.random.Generator) -> None:
     colour = palette.pick(rng, palette.CAR[:6])
     paint, roof = Skin(Material.PAINT, colour, 0.9), Skin(Material.PAINT, palette.TRIM)
     glass = Skin(Material.GLASS, palette.DARK, 0.5)
-    box(builder, frame, Box(-5, 5, -1.2, 1.2, 0.35, 1.5), paint)
-    box(builder, frame, Box(-5, 5, -1.2, 1.2, 1.5, 2.5), glass)
-    box(builder, frame, Box(-5, 5, -1.2, 1.2, 2.5, 3.0), paint, roof)
+    box(builder, frame, Box(x0=-5, x1=5, y0=-1.2, y1=1.2, z0=0.35, z1=1.5), paint)
+    box(builder, frame, Box(x0=-5, x1=5, y0=-1.2, y1=1.2, z0=1.5, z1=2.5), glass)
+    box(builder, frame, Box(x0=-5, x1=5, y0=-1.2, y1=1.2, z0=2.5, z1=3.0), paint, roof)
     for x in (-2.5, 1.8):
-        box(builder, frame, Box(x - 0.9, x + 0.9, -0.7, 0.7, 3.0, 3.25), _METAL, _METAL)
+        box(builder, frame, Box(x0=x - 0.9, x1=x + 0.9, y0=-0.7, y1=0.7, z0=3.0, z1=3.25), _METAL, _METAL)
     for x in (-3.4, 3.4):
-        box(builder, frame, Box(x - 0.5, x + 0.5, -1.15, 1.15, 0, 0.9), _DARK)
+        box(builder, frame, Box(x0=x - 0.5, x1=x + 0.5, y0=-1.15, y1=1.15, z0=0, z1=0.9), _DARK)
 
 
 def stall(builder: MeshBuilder, frame: Frame, rng: np.random.Generator) -> None:
@@ -51,7 +51,7 @@ def stall(builder: MeshBuilder, frame: Frame, rng: np.random.Generator) -> None:
     stripes = Skin(Material.AWNING, palette.pick(rng, palette.AWNING))
     for x in (-1.4, 1.4):
         for y in (-1.0, 1.0):
-            box(builder, frame, Box(x - 0.05, x + 0.05, y - 0.05, y + 0.05, 0, 2.3), _WOOD)
+            box(builder, frame, Box(x0=x - 0.05, x1=x + 0.05, y0=y - 0.05, y1=y + 0.05, z0=0, z1=2.3), _WOOD)
     left, right = (-1.7, 1.7)
     for y, order in ((-1.4, 1), (1.4, -1)):
         corners = np.array([(left, y, 2.15), (right, y, 2.15), (right, 0, 2.85), (left, 0, 2.85)])
@@ -59,7 +59,7 @@ def stall(builder: MeshBuilder, frame: Frame, rng: np.random.Generator) -> None:
             corners = corners[[1, 0, 3, 2]]
         face(builder, frame, corners, stripes)
     table = Skin(Material.PAINT, palette.pick(rng, palette.AWNING) * 0.8)
-    box(builder, frame, Box(-1.3, 1.3, -1.7, -0.6, 0, 0.9), _WOOD, table)
+    box(builder, frame, Box(x0=-1.3, x1=1.3, y0=-1.7, y1=-0.6, z0=0, z1=0.9), _WOOD, table)
 
 
 def fountain(builder: MeshBuilder, frame: Frame, radius: float = 3.0) -> None:
@@ -75,16 +75,16 @@ def fountain(builder: MeshBuilder, frame: Frame, radius: float = 3.0) -> None:
 
 def bench(builder: MeshBuilder, frame: Frame) -> None:
     """A bench with its back towards local +y."""
-    box(builder, frame, Box(-0.9, 0.9, -0.25, 0.25, 0.1, 0.45), _WOOD, _WOOD)
-    box(builder, frame, Box(-0.9, 0.9, 0.2, 0.3, 0.45, 0.9), _WOOD, _WOOD)
+    box(builder, frame, Box(x0=-0.9, x1=0.9, y0=-0.25, y1=0.25, z0=0.1, z1=0.45), _WOOD, _WOOD)
+    box(builder, frame, Box(x0=-0.9, x1=0.9, y0=0.2, y1=0.3, z0=0.45, z1=0.9), _WOOD, _WOOD)
 
 
 def lamp(builder: MeshBuilder, frame: Frame) -> None:
     """A street lamp whose arm reaches towards local -y."""
-    box(builder, frame, Box(-0.07, 0.07, -0.07, 0.07, -0.3, 5.2), _METAL)
-    box(builder, frame, Box(-0.06, 0.06, -1.3, 0.07, 5.1, 5.25), _METAL, _METAL)
+    box(builder, frame, Box(x0=-0.07, x1=0.07, y0=-0.07, y1=0.07, z0=-0.3, z1=5.2), _METAL)
+    box(builder, frame, Box(x0=-0.06, x1=0.06, y0=-1.3, y1=0.07, z0=5.1, z1=5.25), _METAL, _METAL)
     head = Skin(Material.PAINT, palette.TRIM)
-    box(builder, frame, Box(-0.13, 0.13, -1.5, -0.95, 5.05, 5.2), head, head)
+    box(builder, frame, Box(x0=-0.13, x1=0.13, y0=-1.5, y1=-0.95, z0=5.05, z1=5.2), head, head)
 
 
 def bandstand(builder: MeshBuilder, frame: Frame) -> None:
@@ -93,7 +93,7 @@ def bandstand(builder: MeshBuilder, frame: Frame) -> None:
     frustum(builder, frame, (3.1, 3.1), (-0.8, 0.7), stone, Skin(Material.TIMBER, palette.TIMBER), 8)
     for k in range(8):
         turned = Frame(frame.x, frame.y, frame.z, frame.angle + k * np.pi / 4 + np.pi / 8)
-        post = Box(2.7, 2.85, -0.08, 0.08, 0.7, 3.2)
+        post = Box(x0=2.7, x1=2.85, y0=-0.08, y1=0.08, z0=0.7, z1=3.2)
         box(builder, turned, post, Skin(Material.PAINT, palette.TRIM))
     frustum(builder, frame, (3.6, 0.3), (3.1, 4.8), Skin(Material.TILES, palette.COPPER, 0.4), None, 8)
     frustum(builder, frame, (0.3, 0.0), (4.8, 5.7), Skin(Material.PAINT, palette.GOLD), None, 8)
@@ -105,12 +105,12 @@ def playground(builder: MeshBuilder, frame: Frame) -> None:
     yellow = Skin(Material.PAINT, palette.CAR[5])
     for x in (-0.8, 0.8):
         for y in (-0.8, 0.8):
-            box(builder, frame, Box(x - 0.08, x + 0.08, y - 0.08, y + 0.08, 0, 2.6), blue)
-    box(builder, frame, Box(-1, 1, -1, 1, 1.3, 1.45), yellow, yellow)
-    box(builder, frame, Box(-1.1, 1.1, -1.1, 1.1, 2.6, 3.6), red, None, inset=(1.08, 1.08))
+            box(builder, frame, Box(x0=x - 0.08, x1=x + 0.08, y0=y - 0.08, y1=y + 0.08, z0=0, z1=2.6), blue)
+    box(builder, frame, Box(x0=-1, x1=1, y0=-1, y1=1, z0=1.3, z1=1.45), yellow, yellow)
+    box(builder, frame, Box(x0=-1.1, x1=1.1, y0=-1.1, y1=1.1, z0=2.6, z1=3.6), red, None, inset=(1.08, 1.08))
     face(builder, frame, np.array([(1, -0.4, 1.4), (3.6, -0.4, 0.2), (3.6, 0.4, 0.2), (1, 0.4, 1.4)]), yellow)
     swing = frame.moved(-4.0, 0)
-    box(builder, swing, Box(-0.06, 0.06, -1.8, 1.8, 2.1, 2.25), red, red)
+    box(builder, swing, Box(x0=-0.06, x1=0.06, y0=-1.8, y1=1.8, z0=2.1, z1=2.25), red, red)
     for y in (-1.8, 1.8):
         for foot in (-0.9, 0.9):
             leg = np.array([(foot, y, 0), (foot + 0.14, y, 0), (0.07, y, 2.2), (-0.07, y, 2.2)])
@@ -136,10 +136,10 @@ def pool(builder: MeshBuilder, frame: Frame, size: tuple[float, float]) -> None:
     w, d = size[0] / 2, size[1] / 2
     rim = Skin(Material.STONE, palette.TRIM)
     for part in (
-        Box(-w - 0.4, w + 0.4, -d - 0.4, -d, -0.5, 0.14),
-        Box(-w - 0.4, w + 0.4, d, d + 0.4, -0.5, 0.14),
-        Box(-w - 0.4, -w, -d, d, -0.5, 0.14),
-        Box(w, w + 0.4, -d, d, -0.5, 0.14),
+        Box(x0=-w - 0.4, x1=w + 0.4, y0=-d - 0.4, y1=-d, z0=-0.5, z1=0.14),
+        Box(x0=-w - 0.4, x1=w + 0.4, y0=d, y1=d + 0.4, z0=-0.5, z1=0.14),
+        Box(x0=-w - 0.4, x1=-w, y0=-d, y1=d, z0=-0.5, z1=0.14),
+        Box(x0=w, x1=w + 0.4, y0=-d, y1=d, z0=-0.5, z1=0.14),
     ):
         box(builder, frame, part, rim, rim)
     water = np.array([(-w, -d, 0.1), (w, -d, 0.1), (w, d, 0.1), (-w, d, 0.1)])

@@ -105,7 +105,7 @@ def _garden(site: Site, lot: Plot, start: float) -> None:
         box(
             site.builder,
             shed,
-            Box(-1.3, 1.3, -1.1, 1.1, -1, 2.2),
+            Box(x0=-1.3, x1=1.3, y0=-1.1, y1=1.1, z0=-1, z1=2.2),
             wood,
             Skin(Material.SLATE, palette.SLATE[1]),
         )

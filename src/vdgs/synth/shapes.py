@@ -31,7 +31,7 @@ class Frame:
         return Frame(float(px), float(py), float(pz), self.angle + turn)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Box:
     """An axis-aligned box in a frame, in metres."""
 

@@ -31,7 +31,7 @@ class Seeds:
     colours: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SparseCloud:
     """True places and noisy points [n, 3] (m), colours [n, 3] uint8, mean reprojection errors [n] (px);
     observations: point index [m], image index [m], pixels [m, 2], sorted by point, then by image;
@@ -155,4 +155,7 @@ def sparse_cloud(
         residual[at] = np.linalg.norm(camera.project(points[point[at]])[0] - observed[at], axis=1)
     errors = np.bincount(point, residual, len(places)) / np.maximum(np.bincount(point, minlength=len(places)), 1)
     wrong = np.zeros(len(places), bool)
-    return SparseCloud(places, points, colours, errors, point, image, observed, visible, wrong)
+    return SparseCloud(
+        places=places, points=points, colours=colours, errors=errors, observed_point=point, observed_image=image,
+        observed_px=observed, visibility=visible, outliers=wrong,
+    )  # fmt: skip

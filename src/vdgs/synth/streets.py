@@ -27,7 +27,7 @@ class Beside:
     ended: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class StreetPlan:
     """Streets along q at each `p`, streets along p at each `q`; half widths are of the carriageway."""
 

@@ -25,7 +25,7 @@ _GRAND = 9
 _TALLEST_HOUSE = 26.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Town:
     """A finished town: its triangles, and what the ground's shader has to know."""
 
@@ -58,7 +58,10 @@ def build_town(seed: int, extent: float) -> Town:
     build_periphery(replace(site, rng=np.random.default_rng([seed, 11])), extent / 2)
     site.terrain.add_to(site.builder)
     tallest = TALLEST if grand else _TALLEST_HOUSE
-    return Town(site.builder.build(), plan, site.terrain, zones, extent / 2, landmarks, tallest)
+    return Town(
+        mesh=site.builder.build(), plan=plan, terrain=site.terrain, zones=zones, half_extent=extent / 2,
+        landmarks=landmarks, tallest=tallest,
+    )  # fmt: skip
 
 
 def _pond(site: Site, plot: Plot) -> Pond:

@@ -158,5 +158,5 @@ def tree(
 def hedge(builder: MeshBuilder, frame: Frame, length: float, height: float = 1.1) -> None:
     """A clipped hedge along local x."""
     leaf = Skin(Material.FOLIAGE, palette.HEDGE, -1.0)
-    shape = Box(-length / 2, length / 2, -0.35, 0.35, -0.6, height)
+    shape = Box(x0=-length / 2, x1=length / 2, y0=-0.35, y1=0.35, z0=-0.6, z1=height)
     box(builder, frame, shape, leaf, leaf, inset=(0.06, 0.08))

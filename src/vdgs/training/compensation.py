@@ -15,7 +15,6 @@ c_k belongs to the source anchor, hence L is a set of anchors; g_k belongs to th
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 import torch
@@ -133,7 +132,7 @@ def cycle_facts(
     threshold: float,
     decision: Decision,
     config: CompensationConfig,
-) -> dict[str, Any]:
+) -> dict[str, float | None]:
     """JSON-able facts of one cycle for the log.
 
     `low_share`: share of the anchors that are of low visibility; `low_share_of_seen`: the same of those that a camera

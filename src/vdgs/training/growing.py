@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypedDict
 
 import torch
 from torch import Tensor
@@ -17,7 +17,15 @@ from vdgs.training.schedule import views_in_cycle
 from vdgs.training.state import Stage, TrainingState
 
 
-def grow(state: TrainingState, stage: Stage) -> dict[str, Any]:
+class Growth(TypedDict):
+    """What a growth decision did, as `StepReport` says it."""
+
+    grown: int
+    pruned: int
+    cycle: dict[str, float | None]
+
+
+def grow(state: TrainingState, stage: Stage) -> Growth:
     """Add and remove anchors with their moments and statistics. Returns what StepReport says of it."""
     config = stage.config
     return_unused()

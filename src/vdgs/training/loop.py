@@ -82,7 +82,7 @@ def train_step(state: TrainingState, stage: Stage) -> StepReport:
             state.statistics, rows, inside, drawn.source, drawn.opacities, gradients.means_px, *camera.whole_size
         )
     state.iteration += 1
-    report = StepReport(value, l1, ssim, len(rows), len(drawn.source))
+    report = StepReport(loss=value, l1=l1, ssim=ssim, visible=len(rows), splats=len(drawn.source))
     if growing and state.iteration >= config.growth.start and state.iteration % config.growth.interval == 0:
         report = replace(report, **grow(state, stage))
     if state.iteration % REORDER_INTERVAL == 0:

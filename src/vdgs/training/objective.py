@@ -16,7 +16,7 @@ from vdgs.training.step import TrainingView
 from vdgs.training.target import Target
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Objective:
     """The loss of a picture without the volume term, and its gradient by the picture."""
 
@@ -48,4 +48,4 @@ def compare(drawn: TrainingView, target: Target, decoder: Decoder, number: int, 
     if target.share != 1.0:
         for each in found:
             each.mul_(target.share)
-    return Objective(loss, photometric.l1, photometric.ssim, shown.detach(), found[0])
+    return Objective(loss=loss, l1=photometric.l1, ssim=photometric.ssim, shown=shown.detach(), image=found[0])

@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from vdgs.cameras import Camera
 from vdgs.kernels.types import Statistics
+from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.settings.method import TrainConfig
@@ -38,7 +39,7 @@ class TrainingImages(Protocol):
     def prefetch(self, indices: Sequence[int], downscale: int = 1) -> None: ...
 
 
-@dataclass
+@dataclass(kw_only=True)
 class TrainingState:
     """All that changes during training. `iteration` steps have been made."""
 
@@ -103,6 +104,15 @@ class TrainingState:
             Decoder.from_tensors(self.average.decoder),
         )
 
+    def model(
+        self, voxel: float, background: tuple[float, float, float], metadata: ModelMetadata | None = None
+    ) -> AnchorModel:
+        """The model of `result`."""
+        anchors, decoder = self.result()
+        return AnchorModel(
+            anchors=anchors, decoder=decoder, voxel=voxel, background=background, metadata=metadata or ModelMetadata()
+        )
+
 
 @dataclass(frozen=True)
 class Surroundings:
@@ -112,7 +122,7 @@ class Surroundings:
     decoder: Decoder
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Stage:
     """What training works on: the same for all iterations."""
 
@@ -151,7 +161,7 @@ class Stage:
         return torch.full_like(positions[:, 0], math.inf) if self.largest is None else self.largest(positions)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StepReport:
     """What one step did, for the log."""
 
@@ -163,7 +173,7 @@ class StepReport:
     grown: int | None = None
     pruned: int | None = None
     #: What a growth decision saw and did.
-    cycle: dict[str, Any] = field(default_factory=dict)
+    cycle: dict[str, float | None] = field(default_factory=dict)
 
 
 def start_state(anchors: Anchors, decoder: Decoder, stage: Stage) -> TrainingState:
@@ -178,7 +188,10 @@ def start_state(anchors: Anchors, decoder: Decoder, stage: Stage) -> TrainingSta
     optimiser = Optimiser.start(anchors, decoder)
     largest = stage.largest_at(anchors.positions)
     statistics = Statistics.zeros(n, k, device)
-    return TrainingState(0, anchors, decoder, statistics, optimiser, largest, compensation)
+    return TrainingState(
+        iteration=0, anchors=anchors, decoder=decoder, statistics=statistics, optimiser=optimiser, largest=largest,
+        compensation=compensation,
+    )  # fmt: skip
 
 
 def to_saved(state: TrainingState) -> SavedState:

@@ -30,7 +30,7 @@ from vdgs.kernels.types import (
 from vdgs.model.anchors import TRAINED, Anchors
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class TrainingView:
     """A picture for training, and what the backward pass needs of the m splats of the anchors that are trained."""
 
@@ -52,8 +52,8 @@ class TrainingView:
         # In float32, as autograd divides.
         volume = float(torch.tensor(volume_weight) / m) if m else 0.0
         return SplatGradients(
-            found.means_px, found.conics, found.colours, found.opacities, volume, self.source, self.colours,
-            self.opacities,
+            means_px=found.means_px, conics=found.conics, colours=found.colours, opacities=found.opacities,
+            volume=volume, source=self.source, colour_values=self.colours, opacity_values=self.opacities,
         )  # fmt: skip
 
 
@@ -70,8 +70,8 @@ def draw_view(
     kernels = choose(drawn.means_px.device)
     raster, pullback = kernels.rasterise_vjp(drawn, background, camera.width, camera.height)
     return TrainingView(
-        raster.image, splats.source, splats.colours, splats.opacities, splats.volume,
-        pullback, (drawn.means_px[:m], drawn.conics[:m]),
+        image=raster.image, source=splats.source, colours=splats.colours, opacities=splats.opacities,
+        volume=splats.volume, pullback=pullback, room=(drawn.means_px[:m], drawn.conics[:m]),
     )  # fmt: skip
 
 

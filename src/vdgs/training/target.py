@@ -13,7 +13,7 @@ from vdgs.training.crops import Box, crop_at
 from vdgs.training.state import Stage
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Target:
     """A photograph or a part of it."""
 
@@ -43,7 +43,7 @@ def target_at(stage: Stage, view: int, downscale: int, box: Box) -> Target:
     mask = None if mask is None else mask[inside]
     share = 1.0 if camera is whole else counted_in(mask, camera) / max(of_whole, 1)
     image = upload(image[inside], stage.device)
-    return Target(image, None if mask is None else upload(mask, stage.device), camera, share)
+    return Target(image=image, mask=None if mask is None else upload(mask, stage.device), camera=camera, share=share)
 
 
 def part_of(whole: Camera, box: Box) -> Camera:

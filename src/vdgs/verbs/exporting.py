@@ -15,7 +15,7 @@ from vdgs.settings.requests import ExportRequest
 from vdgs.verbs.shared import open_console, parse, use_device
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ExportArguments(ExportRequest):
     """Write the scene of a run as standard files of Gaussians or points, and say what is lost by it."""
 

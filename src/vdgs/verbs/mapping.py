@@ -15,7 +15,7 @@ from vdgs.settings.requests import MapRequest
 from vdgs.verbs.shared import open_console, parse, use_device
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MapArguments(MapRequest):
     """Make maps of a run: orthophoto, surface model and visibility as GeoTIFFs, hillshade and preview as PNG.
 

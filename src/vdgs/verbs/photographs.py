@@ -13,7 +13,7 @@ from vdgs.settings.sfm import SfmOptions, SfmRequest
 from vdgs.verbs.shared import open_console, parse
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SfmArguments:
     """Photographs to a capture: features, matches, poses and points, metres and north from their positions, photographs
     without lens distortion in three sizes. The same command goes on where it was stopped. Photographs are only read."""
@@ -45,7 +45,8 @@ def sfm(arguments: list[str]) -> None:
     if not asked.photographs:
         raise VdgsError("name the folder of the photographs: vdgs sfm PHOTOGRAPHS --output CAPTURE")
     request = SfmRequest(
-        asked.photographs, asked.output, asked.gps, asked.threads, asked.keep_work, asked.options
+        photographs=asked.photographs, output=asked.output, gps=asked.gps, threads=asked.threads,
+        keep_work=asked.keep_work, options=asked.options,
     )  # fmt: skip
     console = open_console(asked.quiet)
     if asked.dry_run:

@@ -44,7 +44,7 @@ def status(arguments: list[str]) -> int:
     return 0 if facts["whole"] else NOT_WHOLE
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class EvalArguments:
     """Render the test views of a run, or its training views, and measure them: metrics.json, per_view.json, pictures, a
     table."""
@@ -81,7 +81,10 @@ def eval(arguments: list[str]) -> None:
     from vdgs.stages.evaluate import Measuring, evaluate_stage
 
     device, console = use_device(asked.device), open_console(asked.quiet)
-    measuring = Measuring(asked.run, asked.model, asked.lpips_weights, asked.bins, asked.views, device)
+    measuring = Measuring(
+        path=asked.run, which=asked.model, lpips_weights=asked.lpips_weights, bins=asked.bins, views=asked.views,
+        device=device,
+    )  # fmt: skip
     configure_threads(asked.threads)
     context = RunContext.from_path(asked.run, asked.capture)
     asked.where.check()
@@ -106,7 +109,7 @@ def report(arguments: list[str]) -> None:
     open_console(asked.quiet).print(f"report: {write_report(RunFolder(asked.run))}", highlight=False)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RenderArguments(RenderRequest):
     """Render a run: its test views, its training views, or a camera path; as PNG files or a video."""
 

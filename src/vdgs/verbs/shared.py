@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -80,12 +81,11 @@ def change_settings(run: RunFolder, method: MethodConfig, redo: bool, quiet: boo
     """Give the run other settings for later stages, if they are other. RunError where another process drives it."""
     from vdgs.errors import VdgsError
     from vdgs.settings.checks import validate
-    from vdgs.settings.plain import to_dict
 
     problems = validate(method)
     if problems:
         raise VdgsError("These settings do not work:\n  " + "\n  ".join(problems))
-    wanted = run.settings() | to_dict(method)
+    wanted = replace(run.settings(), **vars(method))
     if wanted != run.settings():
         with run.driven(), run.locked():
             for line in run.change_settings(wanted, redo):

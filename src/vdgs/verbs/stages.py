@@ -43,7 +43,7 @@ def visibility(arguments: list[str]) -> None:
     measure_visibility(RunContext.from_path(asked.run, asked.capture), open_console(asked.quiet))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PartitionArguments:
     """Cut a run's scene into blocks by place and visibility, and give each block its cameras."""
 
@@ -72,7 +72,7 @@ class PartitionArguments:
 
 def partition(arguments: list[str]) -> None:
     def defaults(method: MethodConfig) -> PartitionArguments:
-        return PartitionArguments(tyro.MISSING, partition=method.partition, assignment=method.assignment)
+        return PartitionArguments(run=tyro.MISSING, partition=method.partition, assignment=method.assignment)
 
     asked, run, method = parse_for_run(PartitionArguments, arguments, "vdgs partition", defaults)
     from vdgs.executors.sharded_job import Wish
@@ -91,7 +91,7 @@ def partition(arguments: list[str]) -> None:
         explain_view(run, asked.why, open_console(asked.quiet))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrainArguments:
     """Train the blocks of a run. The same command continues; blocks may also be trained on several machines."""
 
@@ -118,7 +118,7 @@ class TrainArguments:
 
 def train(arguments: list[str]) -> None:
     def defaults(method: MethodConfig) -> TrainArguments:
-        return TrainArguments(tyro.MISSING, settings=method.block)
+        return TrainArguments(run=tyro.MISSING, settings=method.block)
 
     asked, run, method = parse_for_run(TrainArguments, arguments, "vdgs train", defaults)
     device = use_device(asked.device)

@@ -26,7 +26,7 @@ from vdgs.verbs.shared import (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CoarseArguments:
     """Train the global anchor model of a capture. The same command continues a run that was stopped."""
 
@@ -51,7 +51,7 @@ class CoarseArguments:
 
 def coarse(arguments: list[str]) -> None:
     preset, settings = preset_defaults(arguments)
-    default = CoarseArguments(tyro.MISSING, tyro.MISSING, preset, training=settings.training)
+    default = CoarseArguments(capture=tyro.MISSING, output=tyro.MISSING, preset=preset, training=settings.training)
     asked = parse(CoarseArguments, arguments, "vdgs coarse", default)
     from vdgs.runs.beginning import begin_run
     from vdgs.stages.coarse import train_coarse
@@ -64,7 +64,7 @@ def coarse(arguments: list[str]) -> None:
     train_coarse(context, asked.watching, open_console(asked.quiet), device)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunArguments(RunRequest):
     """Do everything: coarse model, visibility, blocks, cameras, block training, merge, metrics, report.
 
@@ -89,8 +89,8 @@ class RunArguments(RunRequest):
 def run(arguments: list[str]) -> None:
     preset, settings = preset_defaults(arguments)
     default = RunArguments(
-        tyro.MISSING, tyro.MISSING, preset, training=settings.training, partition=settings.partition,
-        assignment=settings.assignment, block=settings.block, merge=settings.merge,
+        capture=tyro.MISSING, output=tyro.MISSING, preset=preset, training=settings.training,
+        partition=settings.partition, assignment=settings.assignment, block=settings.block, merge=settings.merge,
     )  # fmt: skip
     asked = parse(RunArguments, arguments, "vdgs run", default)
     device = use_device(asked.device)

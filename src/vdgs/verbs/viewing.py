@@ -12,7 +12,7 @@ from vdgs.settings.requests import ViewRequest
 from vdgs.verbs.shared import open_console, parse, use_device
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ViewArguments(ViewRequest):
     """Show a run in a browser: move through the true model, drawn on this machine; its layers (depth, V, alpha, blocks,
     errors), what is known of a clicked place, camera paths for `vdgs render --path`. Follows a run that still trains.

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from vdgs.errors import RunError, VdgsError
-from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.partition.merging import merge
 from vdgs.runs.cut import blocks_of, views_of_blocks
 from vdgs.runs.folder import RunFolder
@@ -81,9 +81,14 @@ def _unfinished_coarse(run: RunFolder, device: str) -> TrainedRun:
     capture = open_capture(run)
     colours = capture.point_colours.mean(axis=0) / 255 if len(capture.points) else np.zeros(3)
     background = (float(colours[0]), float(colours[1]), float(colours[2]))
-    model = AnchorModel(saved.anchors, saved.decoder, 1.0, background, {}).to(torch.device(device))
+    model = AnchorModel(anchors=saved.anchors, decoder=saved.decoder, voxel=1.0, background=background).to(
+        torch.device(device)
+    )
     why = f"this is the coarse model after {saved.iteration:,} iterations; its background is not known yet"
-    return TrainedRun(run, model, saved.file, UNFINISHED, run.coarse.status(), key, why, capture)
+    return TrainedRun(
+        folder=run, model=model, model_path=saved.file, name=UNFINISHED, status=run.coarse.status(), key=key,
+        caution=why, capture=capture,
+    )  # fmt: skip
 
 
 def _with_blocks(coarse: TrainedRun) -> TrainedRun | None:
@@ -117,5 +122,11 @@ def _block_so_far(coarse: TrainedRun, folder: StageFolder, key: str, index: int,
         return None
     if saved is None:
         return None
-    facts = {"decoder": "own"} if own else {}
-    return AnchorModel(saved.anchors, saved.decoder, coarse.model.voxel, coarse.model.background, facts)
+    metadata = ModelMetadata(decoder="own" if own else None)
+    return AnchorModel(
+        anchors=saved.anchors,
+        decoder=saved.decoder,
+        voxel=coarse.model.voxel,
+        background=coarse.model.background,
+        metadata=metadata,
+    )

@@ -190,4 +190,4 @@ def error_scale() -> Scale:
     ticks = tuple((value, f"≥ {value:.0%}" if value == _WORST else f"{value:.0%}") for value in numbers)
     titles = ("difference from the nearest photograph", "error of the photograph", "error")
     paint: Callable[[np.ndarray], np.ndarray] = lambda values: np.asarray(colours(values / _WORST))  # noqa: E731
-    return Scale(titles, 0.0, _WORST, ticks, paint)
+    return Scale(titles=titles, low=0.0, high=_WORST, ticks=ticks, paint=paint)

@@ -47,7 +47,7 @@ def camera_of(wxyz: np.ndarray, position: np.ndarray, fov: float, width: int, he
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ place
     focal = 0.5 * height / math.tan(0.5 * fov)
-    return Camera(pose, focal, focal, width / 2, height / 2, width, height)
+    return Camera(camera_from_world=pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height)
 
 
 def most_pixels(free: int) -> int:

@@ -79,7 +79,7 @@ def invitation(scene: str, door: Door) -> list[str]:
     return [*lines, "Whoever has this address can see the scene. Ctrl-C ends it."]
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class Viewer:
     """A server that runs."""
 
@@ -109,7 +109,7 @@ def serve(run: TrainedRun, host: str, port: int | None, console: Console) -> Ite
     """A viewer of an opened run on a port (None: the first that is free), while the context lasts."""
     scene, studio = Scene(run), Studio()
     door, server = _listening(host, port)
-    viewer = Viewer(server, door, scene, studio, {})
+    viewer = Viewer(server=server, door=door, scene=scene, studio=studio, visitors={})
     _place_newcomers(server, run)
 
     def comes(client: Any) -> None:

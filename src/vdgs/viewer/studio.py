@@ -74,7 +74,7 @@ class Frame:
     shown: Shown
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class Seat:
     """A visitor's place in the studio."""
 
@@ -112,7 +112,7 @@ class Studio:
 
     def seat(self, painter: Paints, deliver: Callable[[Frame], None], failed: Callable[[Exception], None]) -> Seat:
         """A place for a new visitor."""
-        seat = Seat(painter, deliver, failed)
+        seat = Seat(painter=painter, deliver=deliver, failed=failed)
         with self._changed:
             self._seats.append(seat)
         return seat

@@ -76,9 +76,9 @@ def train_watched(
     kind, need = stage.kind, need_of(state, stage)
     announce(need, kind, console)
     training = Watched(
-        folder, state,
+        folder=folder, state=state,
         to_saved=lambda: to_saved(state),
-        status=lambda: Status("running", iteration=state.iteration, iterations=stage.config.iterations),
+        status=lambda: Status(state="running", iteration=state.iteration, iterations=stage.config.iterations),
         size=lambda: f"{len(state.anchors):,} anchors",
         after_divergence=AFTER_DIVERGENCE[kind],
         save_memory=lambda: after_failure(need, state, stage),
@@ -105,9 +105,8 @@ def finish(folder: StageFolder, state: TrainingState, model: AnchorModel, consol
     save_state(folder.checkpoints, to_saved(state))
     model.save(folder.model)
     status = Status(
-        "done", iteration=state.iteration, iterations=state.iteration, photographs=round(area * state.iteration, 1),
-        anchors=len(state.anchors),
-        model=identity(folder.model),
+        state="done", iteration=state.iteration, iterations=state.iteration,
+        photographs=round(area * state.iteration, 1), anchors=len(state.anchors), model=identity(folder.model),
         seconds=state.seconds, psnr_training=None if math.isnan(state.psnr) else state.psnr,
         peak_memory_bytes=state.peak_memory_bytes,
     )  # fmt: skip

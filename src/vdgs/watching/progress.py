@@ -71,7 +71,7 @@ class TrainingProgress:
     def status(self, state: TrainingState) -> Status:
         """Where training stands."""
         return Status(
-            "running", iteration=state.iteration, iterations=self._config.iterations, anchors=len(state.anchors),
+            state="running", iteration=state.iteration, iterations=self._config.iterations, anchors=len(state.anchors),
             psnr_training=None if math.isnan(state.psnr) else state.psnr, seconds=round(state.seconds, 1),
             seconds_left=round(self._seconds_left(state)), peak_memory_bytes=state.peak_memory_bytes,
         )  # fmt: skip

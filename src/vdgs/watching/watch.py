@@ -36,7 +36,7 @@ class WatchedState(Protocol):
 State = TypeVar("State", bound=WatchedState)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Watched:
     """A training as the one who watches it sees it."""
 
@@ -103,19 +103,19 @@ def watch(training: Watched, loop: Callable[[Callable[[], bool]], bool]) -> None
             folder.set_status(training.status())
             complete = loop(lambda: bool(asked))
     except TrainingDiverged as error:
-        folder.set_status(Status("failed", iteration=state.iteration, why=str(error)))
+        folder.set_status(Status(state="failed", iteration=state.iteration, why=str(error)))
         raise TrainingDiverged(f"{error} {_kept(folder)} {training.after_divergence}".rstrip()) from error
     except MEMORY_ERRORS as error:
         if not is_out_of_memory(error):
             raise
         traceback.clear_frames(error.__traceback__)  # they hold the pictures and splats of the step that failed
         kept = _rescue(training)
-        folder.set_status(Status("failed", iteration=state.iteration, why="out of memory"))
+        folder.set_status(Status(state="failed", iteration=state.iteration, why="out of memory"))
         raise VdgsError(
             f"{folder.path}: out of memory with {training.size()}{_wanted(error)}. {kept} {training.save_memory()}"
         ) from error
     except VdgsError as error:  # a photograph that is gone, a full disk: every step so far is whole
-        folder.set_status(Status("failed", iteration=state.iteration, why=str(error)))
+        folder.set_status(Status(state="failed", iteration=state.iteration, why=str(error)))
         training.save()
         raise
     if not complete:

@@ -124,7 +124,7 @@ def _views(
         intrinsics = cameras[record.camera]
         sightings = _sightings(record, sorted_points, intrinsics)
         name, pose = safe_name(record.name, file), _pose(record, file)
-        views.append(SourceView(name, pose, intrinsics, sightings=sightings))
+        views.append(SourceView(name=name, camera_from_world=pose, intrinsics=intrinsics, sightings=sightings))
     views.sort(key=lambda view: view.name)
     twice = duplicates(view.name for view in views)
     if twice:

@@ -5,19 +5,19 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from vdgs.captures.formats.source import Intrinsics, check_intrinsics
 from vdgs.captures.photographs import read_header
 from vdgs.errors import CaptureError
+from vdgs.storage.documents import JsonObject
 
 #: Camera axes: OpenGL (right, up, back) from OpenCV (right, down, forward); its own inverse.
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def read_json(file: Path) -> dict[str, Any]:
+def read_json(file: Path) -> JsonObject:
     """The object in a JSON file. Raises `CaptureError` for anything else."""
     try:
         content = json.loads(file.read_text(encoding="utf-8-sig"))
@@ -30,7 +30,7 @@ def read_json(file: Path) -> dict[str, Any]:
     return content
 
 
-def frames_of(content: dict[str, Any], file: Path) -> list[dict[str, Any]]:
+def frames_of(content: JsonObject, file: Path) -> list[JsonObject]:
     """The list of frames. Raises `CaptureError` if there are none."""
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
@@ -51,7 +51,7 @@ def matrix_of(value: object, file: Path, label: str) -> np.ndarray:
     return result
 
 
-def number(source: dict[str, Any], key: str, file: Path) -> float | None:
+def number(source: JsonObject, key: str, file: Path) -> float | None:
     """A finite number by key, or None where it is absent. Raises `CaptureError` for anything else."""
     value = source.get(key)
     if value is None:
@@ -68,7 +68,7 @@ def _finite(value: int | float) -> bool:
         return False
 
 
-def intrinsics_of(frame: dict[str, Any], common: dict[str, Any], image: Path, file: Path) -> Intrinsics:
+def intrinsics_of(frame: JsonObject, common: JsonObject, image: Path, file: Path) -> Intrinsics:
     """Intrinsics of a frame, its own keys before the common ones (fl_x, fl_y, cx, cy, w, h, k1...p2).
 
     Focal lengths may be given as camera_angle_x, y (radians). Where w and h are absent the image's own
@@ -109,7 +109,7 @@ def _focal(side: float, angle: float | None) -> float | None:
     return side / 2 / math.tan(angle / 2) if angle is not None and 0 < angle < math.pi else None
 
 
-def _camera_model(values: dict[str, Any], file: Path) -> str:
+def _camera_model(values: JsonObject, file: Path) -> str:
     """The camera model in capitals: nerfstudio's `camera_model`, or what instant-ngp says by keys of its own."""
     model = str(values.get("camera_model") or "OPENCV").upper()
     for key in _OTHER_LENSES:

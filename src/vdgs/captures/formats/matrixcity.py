@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from vdgs.captures.formats.source import KnownWorld, SourceCapture, SourceView, 
 from vdgs.captures.formats.sparse_points import find_sparse_points
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
+from vdgs.storage.documents import JsonObject
 
 #: Unit of the pose files in metres.
 POSE_UNIT_M = 100.0
@@ -72,12 +72,24 @@ def read_matrixcity(root: Path, options: CaptureOptions) -> SourceCapture:
         world = KnownWorld(np.eye(3), unit, True, f"MatrixCity: z is up, unit {unit:.0f} m")
     one_split = {view.split for view in views} == {"train"}
     if one_split:  # no test files: the split is ours to choose
-        views = [SourceView(v.name, v.camera_from_world, v.intrinsics, None, v.image_path) for v in views]
-    return SourceCapture("matrixcity", options.images or "", tuple(views), points, colours, world)
+        views = [
+            SourceView(
+                name=v.name,
+                camera_from_world=v.camera_from_world,
+                intrinsics=v.intrinsics,
+                split=None,
+                image_path=v.image_path,
+            )
+            for v in views
+        ]
+    return SourceCapture(
+        source="matrixcity", images=options.images or "", views=tuple(views), points=points, colours=colours,
+        world=world,
+    )  # fmt: skip
 
 
 def _read_frame(
-    root: Path, frame: dict[str, Any], content: dict[str, Any], file: Path, split: Split
+    root: Path, frame: JsonObject, content: JsonObject, file: Path, split: Split
 ) -> tuple[SourceView, float]:
     """A view, and the unit of its world in metres if the file is MatrixCity's."""
     label = str(frame.get("file_path", frame.get("frame_index", "?")))
@@ -90,10 +102,12 @@ def _read_frame(
     pose = np.linalg.inv(rigid(matrix @ OPENGL_FROM_OPENCV, file, f"frame {label}"))
     common = {key: value for key, value in content.items() if key != "frames"}
     intrinsics = intrinsics_of(frame, common, image, file)
-    return SourceView(name, pose, intrinsics, split, image), 1.0 if scaled else POSE_UNIT_M
+    return SourceView(
+        name=name, camera_from_world=pose, intrinsics=intrinsics, split=split, image_path=image
+    ), 1.0 if scaled else POSE_UNIT_M
 
 
-def _find_image(root: Path, frame: dict[str, Any], file: Path, split: Split) -> tuple[str, Path]:
+def _find_image(root: Path, frame: JsonObject, file: Path, split: Split) -> tuple[str, Path]:
     """Name (as from the dataset's root) and file of a frame's image.
 
     Published file_paths climb ("../../train/block_1/0000.png"); the climbing is dropped and the rest is

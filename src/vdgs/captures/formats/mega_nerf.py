@@ -9,7 +9,6 @@ describes the originals: the images are already undistorted.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,6 +28,7 @@ from vdgs.captures.names import composed
 from vdgs.captures.photographs import find_images
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
+from vdgs.storage.documents import JsonObject
 
 #: Ground axes (right, forward, up) from DRB axes.
 GROUND_FROM_DRB = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
@@ -61,7 +61,10 @@ def read_mega_nerf(root: Path, options: CaptureOptions) -> SourceCapture:
     points, colours = find_sparse_points(root, poses, "Mega-NeRF's layout", _aliases(root, views))
     world = KnownWorld(GROUND_FROM_DRB, 1.0, True, "Mega-NeRF: x is down, metres by pose_scale_factor")
     folders = tuple(root / folder / images for folder, _ in FOLDERS)
-    return SourceCapture("mega-nerf", images, tuple(views), points, colours, world, folders)
+    return SourceCapture(
+        source="mega-nerf", images=images, views=tuple(views), points=points, colours=colours, world=world,
+        image_folders=folders,
+    )  # fmt: skip
 
 
 def _read_folder(
@@ -88,10 +91,12 @@ def _read_view(file: Path, image: Path, folder: str, split: Split, origin: np.nd
     world_from_camera[:3, 3] = world_from_camera[:3, 3] * scale + origin
     pose = np.linalg.inv(rigid(world_from_camera @ OPENGL_FROM_OPENCV, file, "c2w"))
     intrinsics = check_intrinsics(Intrinsics("PINHOLE", (fx, fy, cx, cy), width, height), file, image.name)
-    return SourceView(f"{folder}/{image.name}", pose, intrinsics, split, image)
+    return SourceView(
+        name=f"{folder}/{image.name}", camera_from_world=pose, intrinsics=intrinsics, split=split, image_path=image
+    )
 
 
-def _load(file: Path) -> dict[str, Any]:
+def _load(file: Path) -> JsonObject:
     """A dictionary from a torch file; `weights_only`, so that nothing in it can run."""
     import torch  # here: other formats do without it, and it takes seconds
 
@@ -107,7 +112,7 @@ def _load(file: Path) -> dict[str, Any]:
     return content
 
 
-def _array(content: dict[str, Any], key: str, shape: tuple[int, ...], file: Path) -> np.ndarray:
+def _array(content: JsonObject, key: str, shape: tuple[int, ...], file: Path) -> np.ndarray:
     import torch
 
     try:

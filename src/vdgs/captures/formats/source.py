@@ -69,7 +69,7 @@ class Intrinsics:
         return self.model not in PINHOLE_WHEN_ZERO or any(value != 0.0 for value in extra)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SourceView:
     """One photograph: name relative to the image folder (posix), pose, intrinsics, split where it has one."""
 
@@ -96,7 +96,7 @@ class KnownWorld:
     how: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SourceCapture:
     """A capture as the files have it; points [n, 3] float64, colours [n, 3] uint8."""
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import numpy as np
 
@@ -28,6 +27,7 @@ from vdgs.captures.formats.sparse_points import find_sparse_points
 from vdgs.captures.names import Names, on_disk
 from vdgs.errors import CaptureError
 from vdgs.settings.capture import CaptureOptions
+from vdgs.storage.documents import JsonObject
 
 FILE = "transforms.json"
 #: Its lists of photographs, and the side that each is of.
@@ -74,7 +74,16 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
         mask = frame.get("mask_path")
         mask_path = safe_name(str(mask), file, "mask_path", root) if mask else None
         mask_file = (on_disk(root, mask_path) or root / mask_path) if mask_path else None
-        views.append(SourceView(short, pose, intrinsics, splits.get(name), image, mask_file))
+        views.append(
+            SourceView(
+                name=short,
+                camera_from_world=pose,
+                intrinsics=intrinsics,
+                split=splits.get(name),
+                image_path=image,
+                mask_path=mask_file,
+            )
+        )
     twice = duplicates(view.name for view in views)
     if twice:
         raise CaptureError(f"{file}: the same image occurs more than once.{listing(twice)}")
@@ -83,11 +92,12 @@ def read_transforms(root: Path, options: CaptureOptions) -> SourceCapture:
     homogeneous[:, :3, 3] = points
     moved = undo(homogeneous)[:, :3, 3]
     return SourceCapture(
-        "transforms", chosen, tuple(views), moved, colours, image_folders=(root / chosen,) if chosen else ()
-    )
+        source="transforms", images=chosen, views=tuple(views), points=moved, colours=colours,
+        image_folders=(root / chosen,) if chosen else (),
+    )  # fmt: skip
 
 
-def _name(frame: dict[str, Any], file: Path, root: Path) -> str:
+def _name(frame: JsonObject, file: Path, root: Path) -> str:
     path = frame.get("file_path")
     if not isinstance(path, str):
         raise CaptureError(f"{file}: a frame has no 'file_path'. Export the file again.")
@@ -116,9 +126,7 @@ def _image(root: Path, name: str) -> Path:
     return found
 
 
-def _splits(
-    content: dict[str, Any], names: list[str], file: Path, root: Path, options: CaptureOptions
-) -> dict[str, Split]:
+def _splits(content: JsonObject, names: list[str], file: Path, root: Path, options: CaptureOptions) -> dict[str, Split]:
     """Splits by file_path (`names`) where train_filenames and val_filenames or test_filenames are given.
 
     Frames in no list have none; where one side has no list at all, it takes them (choice). Raises `CaptureError`
@@ -145,7 +153,7 @@ def _splits(
     return splits
 
 
-def _undo_applied(content: dict[str, Any], file: Path) -> Callable[[np.ndarray], np.ndarray]:
+def _undo_applied(content: JsonObject, file: Path) -> Callable[[np.ndarray], np.ndarray]:
     """A function that takes rigid world-from-camera matrices [..., 4, 4] back to the original world."""
     applied = np.eye(4)
     if content.get("applied_transform") is not None:
@@ -163,9 +171,7 @@ def _undo_applied(content: dict[str, Any], file: Path) -> Callable[[np.ndarray],
     return undo
 
 
-def _points(
-    root: Path, content: dict[str, Any], file: Path, poses: dict[str, np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
+def _points(root: Path, content: JsonObject, file: Path, poses: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Points and `poses` (camera-from-world by name) in the world of the file, before `applied_transform` is undone."""
     ply = content.get("ply_file_path")
     if ply is not None:

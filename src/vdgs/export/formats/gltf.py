@@ -11,13 +11,14 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
 from vdgs.errors import VdgsError
 from vdgs.export.formats.scene import Y_UP, Facts, Scene, bytes_of, colours, opacities, sizes
 from vdgs.model.gaussians import Gaussians
+from vdgs.storage.documents import JsonObject
 from vdgs.storage.files import write_atomically
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -42,7 +43,7 @@ class Column:
     def bytes_each(self) -> int:
         return self.width * (4 if self.component == FLOAT else 1)
 
-    def accessor(self, count: int) -> dict[str, Any]:
+    def accessor(self, count: int) -> JsonObject:
         normalised = {"normalized": True} if self.component == BYTE else {}
         return {"componentType": self.component, "count": count, "type": self.kind, **normalised}
 
@@ -109,9 +110,7 @@ def _values(piece: Gaussians) -> Iterator[np.ndarray]:
         yield np.ascontiguousarray(piece.rest[:, index].numpy())
 
 
-def _document(
-    wanted: list[Column], scene: Scene, starts: list[int], low: np.ndarray, high: np.ndarray
-) -> dict[str, Any]:
+def _document(wanted: list[Column], scene: Scene, starts: list[int], low: np.ndarray, high: np.ndarray) -> JsonObject:
     accessors = [{"bufferView": index, **column.accessor(scene.count)} for index, column in enumerate(wanted)]
     accessors[0] |= {"min": [float(x) for x in low], "max": [float(x) for x in high]}
     views = [
@@ -129,7 +128,7 @@ def _document(
     }  # fmt: skip
 
 
-def asset(facts: Facts) -> dict[str, Any]:
+def asset(facts: Facts) -> JsonObject:
     """glTF's and 3D Tiles' word on where a file comes from."""
     return {"version": "2.0", "generator": facts.program, "extras": {**facts.known(), "axes": "x east, y up, z south"}}
 
@@ -162,7 +161,7 @@ def packed_tile(gaussians: Gaussians, spz: bytes, translation: np.ndarray, facts
     return _heads(len(text), len(data))[0] + text + _heads(len(text), len(data))[1] + data
 
 
-def _json(document: dict[str, Any]) -> bytes:
+def _json(document: JsonObject) -> bytes:
     return json.dumps(document, separators=(",", ":"), allow_nan=False).encode("ascii")
 
 

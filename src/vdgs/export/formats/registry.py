@@ -20,7 +20,7 @@ from vdgs.export.formats.tiles import NAME, refuse_other_names, write_tiles
 from vdgs.model.gaussians import Gaussians
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Format:
     """One kind of file. `write` returns a sentence for each thing that was lost."""
 
@@ -45,16 +45,41 @@ class Format:
 
 #: The longer endings first: `.points.ply` is a `.ply` too.
 FORMATS: tuple[Format, ...] = (
-    Format(".points.ply", "point cloud, local coordinates", write_points),
-    Format(".ply", "3DGS PLY, nothing lost", write_ply, ply_pieces),
-    Format(".spz", "SPZ, a sixth of the PLY or less", write_spz, spz_pieces, refuse_too_far, True, REACH),
-    Format(".splat", "32 bytes a Gaussian, fixed colours", write_splat, splat_pieces, facts_beside=True),
-    Format(".sog", "PlayCanvas' SOG, a twelfth of the PLY or less", write_sog, facts_beside=True),
-    Format(".glb", "glTF with KHR_gaussian_splatting, nothing lost", write_glb, check=refuse_too_large),
-    Format(NAME, "3D Tiles for CesiumJS, in levels", write_tiles, check=refuse_other_names, on_globe=True),
-    Format(".html", "page that shows the scene offline", write_html, html_pieces, refuse_without_viser, fixed=True),
-    Format(".laz", "point cloud, map coordinates, compressed", write_laz, check=refuse_without_laspy),
-    Format(".las", "point cloud, map coordinates", write_laz, check=refuse_without_laspy),
+    Format(ending=".points.ply", what="point cloud, local coordinates", write=write_points),
+    Format(ending=".ply", what="3DGS PLY, nothing lost", write=write_ply, read=ply_pieces),
+    Format(
+        ending=".spz",
+        what="SPZ, a sixth of the PLY or less",
+        write=write_spz,
+        read=spz_pieces,
+        check=refuse_too_far,
+        facts_beside=True,
+        reach=REACH,
+    ),
+    Format(
+        ending=".splat",
+        what="32 bytes a Gaussian, fixed colours",
+        write=write_splat,
+        read=splat_pieces,
+        facts_beside=True,
+    ),
+    Format(ending=".sog", what="PlayCanvas' SOG, a twelfth of the PLY or less", write=write_sog, facts_beside=True),
+    Format(
+        ending=".glb", what="glTF with KHR_gaussian_splatting, nothing lost", write=write_glb, check=refuse_too_large
+    ),
+    Format(
+        ending=NAME, what="3D Tiles for CesiumJS, in levels", write=write_tiles, check=refuse_other_names, on_globe=True
+    ),
+    Format(
+        ending=".html",
+        what="page that shows the scene offline",
+        write=write_html,
+        read=html_pieces,
+        check=refuse_without_viser,
+        fixed=True,
+    ),
+    Format(ending=".laz", what="point cloud, map coordinates, compressed", write=write_laz, check=refuse_without_laspy),
+    Format(ending=".las", what="point cloud, map coordinates", write=write_laz, check=refuse_without_laspy),
 )
 
 

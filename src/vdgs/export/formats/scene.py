@@ -49,7 +49,7 @@ class Facts:
     #: Who wrote the file.
     program: str = f"vdgs {__version__}"
 
-    def known(self) -> dict[str, Any]:
+    def known(self) -> dict[str, object]:
         """JSON-able, without what is not known."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
@@ -68,7 +68,7 @@ class Page:
     most_bytes: int = 30_000_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Scene:
     """Gaussians on their way into a file. They are gone through once."""
 
@@ -86,7 +86,13 @@ class Scene:
     def of(gaussians: Gaussians, facts: Facts | None = None) -> Scene:
         """A scene of Gaussians that are all in memory."""
         low, high = gaussians.means.amin(0).tolist(), gaussians.means.amax(0).tolist()
-        return Scene([gaussians], len(gaussians), gaussians.degree, facts or Facts(), (tuple(low), tuple(high)))
+        return Scene(
+            chunks=[gaussians],
+            count=len(gaussians),
+            degree=gaussians.degree,
+            facts=facts or Facts(),
+            bounds=(tuple(low), tuple(high)),
+        )
 
     def pieces(self, turn: Float[np.ndarray, "3 3"] | None = None) -> Iterator[Gaussians]:
         """At most `ROWS` Gaussians at a time, on the CPU, unit quaternions, turned where asked.

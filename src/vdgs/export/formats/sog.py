@@ -13,7 +13,6 @@ import math
 import tempfile
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,6 +23,7 @@ from vdgs.export.formats.scene import ROWS, Y_DOWN, Facts, Scene, bytes_of, opac
 from vdgs.export.formats.spool import Spooled, spooled
 from vdgs.kernels import choose
 from vdgs.model.gaussians import Gaussians
+from vdgs.storage.documents import JsonObject
 from vdgs.storage.files import write_atomically
 
 #: Sets of spherical harmonics at most. The format would take 65536; their gain is small and their search long.
@@ -117,9 +117,9 @@ class _Images:
         image[:sets, :, :3] = coded
         return image.reshape(-1, SETS_IN_ROW * coded.shape[1], 4)
 
-    def meta(self, facts: Facts) -> dict[str, Any]:
+    def meta(self, facts: Facts) -> JsonObject:
         """What the JSON of the bundle says."""
-        meta: dict[str, Any] = {
+        meta: JsonObject = {
             "version": 2, "asset": {"generator": facts.program, "extras": facts.known()}, "count": self.count,
             "antialias": False,
             "means": {"mins": self.low.tolist(), "maxs": self.high.tolist(), "files": ["means_l.webp", "means_u.webp"]},

@@ -15,7 +15,6 @@ import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -30,6 +29,7 @@ from vdgs.export.formats.spool import Spooled, spooled
 from vdgs.kernels import choose
 from vdgs.model.gaussians import REACH, Gaussians
 from vdgs.model.similarity import covariances, transformed
+from vdgs.storage.documents import JsonObject
 from vdgs.storage.files import write_bytes, write_json
 
 NAME = "tileset.json"
@@ -51,7 +51,7 @@ EDGES = 4.0
 class Tile:
     """What the tileset says of a tile, what stands in it, and the box of all that it covers (z up)."""
 
-    entry: dict[str, Any]
+    entry: JsonObject
     gaussians: Gaussians
     low: np.ndarray
     high: np.ndarray
@@ -163,7 +163,7 @@ class _Tree:
         file = self.folder / f"{name}.glb"
         here = transformed(gaussians, 1.0, Y_UP, -(Y_UP @ middle))
         write_bytes(file, packed_tile(here, spz.encoded(here, SPZ_VERSION), Y_UP @ middle, self.facts))
-        entry: dict[str, Any] = {
+        entry: JsonObject = {
             "boundingVolume": {"box": _box_of(low, high)}, "geometricError": error,
             "content": {"uri": f"{self.folder.name}/{file.name}"},
         }  # fmt: skip
@@ -183,7 +183,7 @@ def _box_of(low: np.ndarray, high: np.ndarray) -> list[float]:
     return [*((low + high) / 2).tolist(), *np.diag((high - low) / 2).ravel().tolist()]
 
 
-def _tileset(root: Tile, facts: Facts) -> dict[str, Any]:
+def _tileset(root: Tile, facts: Facts) -> JsonObject:
     needs = {"extensionsUsed": [EXTENSION, PACKED], "extensionsRequired": [EXTENSION, PACKED]}
     top = {"transform": transform(facts), "refine": "REPLACE", **root.entry}
     return {

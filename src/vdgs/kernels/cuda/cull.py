@@ -14,7 +14,7 @@ from vdgs.kernels.cuda.launching import Program
 
 #: Threads of a block, and anchors of a word: kThreads and kWarp of the source.
 THREADS, WORD = 256, 32
-PROGRAM = Program("cull.cu", headers=("gaussian_math.h", "image_formation.h"))
+PROGRAM = Program(name="cull.cu", headers=("gaussian_math.h", "image_formation.h"))
 
 
 @torch.no_grad()

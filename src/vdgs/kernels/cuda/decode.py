@@ -28,7 +28,7 @@ from vdgs.kernels.types import (
 
 #: Warps of a block, each with an anchor: kWarps of the source. A lane an offset.
 ANCHORS_OF_A_BLOCK, MOST_OFFSETS = ANCHORS_OF_A_RUN, 32
-PROGRAM = Program("decode.cu", headers=("gaussian_math.h", "image_formation.h"))
+PROGRAM = Program(name="decode.cu", headers=("gaussian_math.h", "image_formation.h"))
 ROOM = Room()
 
 

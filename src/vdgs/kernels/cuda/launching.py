@@ -47,7 +47,7 @@ def compile_source(name: str, target: Target, *, headers: Sequence[str] = (), co
     return cached(f"{name}-{target.name}", parts, lambda: compiler.compile(name, source, texts, target, OPTIONS))
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class Program:
     """The kernels of one source, compiled and loaded once for each device, at the first launch there."""
 

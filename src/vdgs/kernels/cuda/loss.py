@@ -15,7 +15,7 @@ from vdgs.kernels.types import Photometric
 
 #: Side of the tile that one block of threads does: kTile of the source.
 TILE_PX = 16
-PROGRAM = Program("loss.cu")
+PROGRAM = Program(name="loss.cu")
 
 
 def photometric_loss(

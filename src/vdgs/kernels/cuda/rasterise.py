@@ -18,7 +18,7 @@ from vdgs.kernels.types import OrderedSplats, Raster, RasterGradients, RasterPul
 
 #: Side of a tile, threads of a block and sums of an entry: kTile, kThreads and kSums of the source.
 TILE_PX, THREADS, SUMS = 16, 256, 10
-PROGRAM = Program("rasterise.cu", headers=("image_formation.h",))
+PROGRAM = Program(name="rasterise.cu", headers=("image_formation.h",))
 
 
 def rasterise(
@@ -96,7 +96,15 @@ def _draw(
         ctypes.c_int(width), ctypes.c_int(height), image, transmittance, last, *depths,
     )  # fmt: skip
     raster = Raster(image, 1.0 - transmittance, *depths)
-    return raster, _Pullback(program, splats, background, entries, raster, transmittance, last)
+    return raster, _Pullback(
+        program=program,
+        splats=splats,
+        background=background,
+        entries=entries,
+        raster=raster,
+        transmittance=transmittance,
+        last=last,
+    )
 
 
 def _order(runs: Runs, m: int, program: Program) -> Int32[Tensor, " m"]:
@@ -124,7 +132,7 @@ def _entries(splats: list[Tensor], runs: Runs | None, grid: tuple[int, int], pro
     return _Entries(owners, before, torch.searchsorted(ordered, begins), ends, order)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Pullback:
     """What is kept of a picture for its backward pass: see `RasterPullback`."""
 

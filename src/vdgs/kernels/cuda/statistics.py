@@ -16,7 +16,7 @@ from vdgs.kernels.types import Statistics
 
 #: Threads of a block: kThreads of the source.
 THREADS = 256
-PROGRAM = Program("statistics.cu")
+PROGRAM = Program(name="statistics.cu")
 
 
 def add_view_statistics(

@@ -41,7 +41,8 @@ def decode(
             tensors, rows = tuple(t[rows] for t in tensors), None
     anchors = (contiguous(t) for t in tensors)
     heads = (contiguous(t) for t in weights.tensors())
-    return AnchorSplats(*_Decode.apply(packed_camera(camera), rows, *anchors, *heads))
+    *projected, volumes, source = _Decode.apply(packed_camera(camera), rows, *anchors, *heads)
+    return AnchorSplats(*projected, volumes=volumes, source=source)
 
 
 @torch.no_grad()

@@ -81,7 +81,7 @@ def decode_chosen(
     return replace(drawn, source=source)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Anchors:
     """Anchors as a camera sees them. What is not finite is replaced by zeros before the arithmetic: 0 · NaN would enter
     the gradients of the weights."""
@@ -110,7 +110,10 @@ class _Anchors:
         )
         inputs = torch.cat([features, viewing], -1)
         opacities = torch.tanh(weights.opacity.outputs(inputs))
-        return _Anchors(positions, offsets, log_scales, inputs, opacities, finite)
+        return _Anchors(
+            positions=positions, offsets=offsets, log_scales=log_scales, inputs=inputs, opacities=opacities,
+            finite=finite,
+        )  # fmt: skip
 
 
 def _spawned(
@@ -125,8 +128,9 @@ def _spawned(
     scales = extent[:, 3:] * torch.sigmoid(covariance[:, :3])
     projected, variances = project_with_variances(means, scales, covariance[:, 3:], camera)
     splats = AnchorSplats(
-        projected.means_px, projected.conics, projected.depths, colour, anchors.opacities[anchor, offset],
-        volumes=scales.prod(-1), source=(anchor * k + offset).to(torch.int32),
+        means_px=projected.means_px, conics=projected.conics, depths=projected.depths, colours=colour,
+        opacities=anchors.opacities[anchor, offset], volumes=scales.prod(-1),
+        source=(anchor * k + offset).to(torch.int32),
     )  # fmt: skip
     return projected, variances, splats
 

@@ -62,7 +62,7 @@ def load_part(path: Path) -> Scores:
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        return Scores(str(arrays.pop("mode")), **arrays)
+        return Scores(mode=str(arrays.pop("mode")), **arrays)
     except DAMAGED as error:
         raise RunError(
             f"{path}: is missing or damaged ({error}). Delete {path.parent} and run the same command again."
@@ -79,10 +79,8 @@ def load_scores(path: Path) -> SavedScores:
         raise RunError(f"{path}: is not there. Assign the cameras first: vdgs partition RUN") from error
     except DAMAGED as error:
         raise RunError(f"{path}: is damaged ({error}). Assign the cameras again: vdgs partition RUN") from error
-    scores = Scores(
-        str(arrays["mode"]),
-        *(arrays[name] for name in ("scores", "held", "covered", "anchors", "beneath")),
-    )
+    scored = {name: arrays[name] for name in ("scores", "held", "covered", "anchors", "beneath")}
+    scores = Scores(mode=str(arrays["mode"]), **scored)
     complaints = [str(line) for line in arrays["complaints"]]
     assignment = Assignment(arrays["why"] != 0, arrays["why"], complaints)
     return SavedScores([str(name) for name in arrays["names"]], scores, assignment)

@@ -33,7 +33,7 @@ from vdgs.settings.method import AssignmentConfig
 DRAWN_ALPHA = 0.5
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Scores:
     """What assignment decides from: rows are cameras, columns blocks."""
 
@@ -95,14 +95,17 @@ class Scorer:
         finally:
             workers.shutdown(cancel_futures=True)
         positions = np.array([camera.position[:2] for camera in cameras], np.float64).reshape(-1, 2)
-        return Scores(config.mode, scores, held, covered, members.counts(), self._blocks.owner(positions))
+        return Scores(
+            mode=config.mode, scores=scores, held=held, covered=covered, anchors=members.counts(),
+            beneath=self._blocks.owner(positions),
+        )  # fmt: skip
 
 
 def joined(parts: Sequence[Scores]) -> Scores:
     """The rows of several parts, one below the other; at least one part, all for the same blocks."""
     over = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("scores", "held", "covered")}
     beneath = np.concatenate([part.beneath for part in parts])
-    return Scores(parts[0].mode, **over, anchors=parts[0].anchors, beneath=beneath)
+    return Scores(mode=parts[0].mode, **over, anchors=parts[0].anchors, beneath=beneath)
 
 
 def difference(block: Raster, full: Raster) -> Float[np.ndarray, "h w"]:

@@ -53,8 +53,9 @@ def draw_visibility_map(
     facts = f"an anchor is seen by {np.median(visibility):g} training cameras (median)"
     heading = (f"{count_of(len(visibility), 'anchor')} and {count_of(len(cameras), 'training camera')}", facts)
     seen = SeenMap(
-        positions, visibility, low, high, float(np.median(positions[:, 2])), (marks,), *axes,
-        "an anchor", (*heading, "anchors coloured by V; pale: V on level ground"),
+        points=positions, visibility=visibility, low=low, high=high, ground=float(np.median(positions[:, 2])),
+        marks=(marks,), x_label=axes[0], y_label=axes[1], noun="an anchor",
+        titles=(*heading, "anchors coloured by V; pale: V on level ground"),
     )  # fmt: skip
     draw_seen_map(file, seen)
 

@@ -1,0 +1,65 @@
+"""What config.yaml of a run holds, typed: everything that the result depends on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.method import (
+    AssignmentConfig,
+    BlockConfig,
+    MergeConfig,
+    MethodConfig,
+    PartitionConfig,
+    TrainConfig,
+)
+from vdgs.settings.plain import from_dict, to_dict
+from vdgs.settings.ranges import outside
+
+#: The parts of config.yaml.
+SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSettings:
+    """The settings of a run: where its capture lies, how the capture is read, and the method, section by section."""
+
+    capture_path: str
+    capture: CaptureOptions
+    training: TrainConfig
+    partition: PartitionConfig
+    assignment: AssignmentConfig
+    block: BlockConfig
+    merge: MergeConfig
+
+    @staticmethod
+    def of(capture_path: Path | str, capture: CaptureOptions, method: MethodConfig) -> RunSettings:
+        """From the settings of a command."""
+        return RunSettings(capture_path=str(capture_path), capture=capture, **vars(method))
+
+    @property
+    def method(self) -> MethodConfig:
+        """All but the capture."""
+        return MethodConfig(**{name: getattr(self, name) for name in SECTIONS[1:]})
+
+    def to_dict(self) -> dict[str, Any]:
+        """As config.yaml holds it."""
+        return {"capture": {"path": self.capture_path} | to_dict(self.capture)} | to_dict(self.method)
+
+    @staticmethod
+    def from_dict(content: Mapping[str, Any]) -> RunSettings:
+        """The inverse; what is not named keeps its default. Raises ValueError, naming the setting, for one that there
+        is not, of another kind or out of its range."""
+        sections = dict(content)
+        capture = sections.pop("capture", None)
+        if not isinstance(capture, Mapping) or not isinstance(capture.get("path"), str):
+            raise ValueError("`capture` must be a group of settings with a path")
+        options = from_dict(CaptureOptions, {k: v for k, v in capture.items() if k != "path"}, "capture")
+        method = from_dict(MethodConfig, sections, "")
+        for section in SECTIONS[1:]:
+            for each in outside(getattr(method, section), (section,)):
+                raise ValueError(f"{'.'.join(each.path)} is {each.value}; it must be {each.range}")
+        return RunSettings.of(capture["path"], options, method)

@@ -1,0 +1,168 @@
+"""The JSON documents that several rooms read and write, as types: keys of older files may be missing."""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias, TypedDict
+
+#: A JSON object as a file holds it: its reader or writer is the only one that knows what is in it.
+JsonObject: TypeAlias = dict[str, Any]
+
+
+class GroundFrameDocument(TypedDict, total=False):
+    """Where the ground frame lies (`captures.capture.GroundFrame`)."""
+
+    scale: float
+    rotation: list[list[float]]
+    translation: list[float]
+    metric: bool
+    how: str
+    origin_geo: tuple[float, float, float] | None
+    axes_geo: tuple[float, float] | None
+
+
+class CaptureMetadata(TypedDict, total=False):
+    """What capture.json and a model say about the capture that they come from."""
+
+    root: str
+    source: str
+    images: str
+    training_views: list[str]
+    test_views: list[str]
+    points: int
+    ground_frame: GroundFrameDocument
+    warnings: list[str]
+    #: CRC-32 of each part of the capture that results depend on.
+    fingerprint: dict[str, int]
+
+
+class EvaluationMetrics(TypedDict, total=False):
+    """metrics.json: means over the views; None where there is no such figure. The figures that are not named here have
+    the suffixes of `evaluation.view` (`_cc`, `_affine`, `_neutral`)."""
+
+    psnr: float | None
+    ssim: float | None
+    lpips: float | None
+    by_visibility: list[JsonObject] | None
+    views_by_visibility: list[JsonObject] | None
+    seen_pixels: int | None
+    solid_share: float | None
+    largest_splats: int | None
+    largest_splats_view: str | None
+    model: str | None
+    model_identity: str | None
+    key: str | None
+    n_anchors: int | None
+    model_bytes: int | None
+    train_seconds: float | None
+    peak_memory_bytes: int | None
+    fps: float | None
+    test_views: int
+    notes: list[str]
+
+
+class BlockMetricsDocument(TypedDict):
+    """by_block.json: figures of each block, of all of them, of the seams, and of each view."""
+
+    blocks: list[dict[str, float | None]]
+    all: dict[str, float | None]
+    seams: JsonObject
+    views: list[JsonObject]
+
+
+class MeasuredAs(TypedDict, total=False):
+    """status.json of an evaluation: the model that was measured, and how."""
+
+    key: str | None
+    model: str | None
+    lpips_weights: str
+    bins: int
+    exposed: str | None
+
+
+class StageStatus(TypedDict):
+    """A stage in what `vdgs status --json` prints."""
+
+    stage: str
+    state: str
+    why: str | None
+    folder: str
+    iteration: int | None
+    iterations: int | None
+    seconds_left: float | None
+
+
+class RunStatus(TypedDict):
+    """What `vdgs status --json` prints."""
+
+    run: str
+    whole: bool
+    at_work: bool
+    next: str | None
+    stages: list[StageStatus]
+
+
+class ExportedFile(TypedDict):
+    """A file in export.json."""
+
+    file: str
+    gaussians: int
+    bytes: int
+    seconds: float
+    notes: list[str]
+
+
+class ExportMetadata(TypedDict):
+    """export.json of a run."""
+
+    model: str
+    key: str
+    gaussians: int
+    sh_degree: int
+    rounds: int
+    seconds_to_bake: float
+    seconds_to_refine: float
+    files: list[ExportedFile]
+    losses: list[JsonObject]
+
+
+class MapMetadata(TypedDict, total=False):
+    """map.json of a folder of maps."""
+
+    software: str
+    model: str
+    model_identity: str | None
+    crs: str | None
+    crs_name: str
+    unit: str
+    heights: str
+    georeference: str
+    gsd: float
+    width: int
+    height: int
+    bounds: list[float]
+    samples_per_pixel: int
+    sharpened: bool
+    training_cameras: int
+    notes: list[str]
+    mapped_share: float
+    seen_by_fewer_than_5_share: float | None
+    lowest: float | None
+    highest: float | None
+
+
+class FitnessQuestion(TypedDict):
+    """What a node is asked to look at before it works on a run (`executors.fitness`)."""
+
+    folder: str
+    files: list[tuple[str, int]]
+    code: str
+    version: str
+    held: str | None
+
+
+class FitnessAnswer(TypedDict):
+    """What a node answers."""
+
+    node: str
+    processor: str
+    problems: list[str]
