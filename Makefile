@@ -12,11 +12,12 @@ export OMP_WAIT_POLICY = PASSIVE
 # What one process of the tests has compiled, the others find.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test lint types clean
+.PHONY: help setup demo test test-fast lint types clean
 
 help:
 	@echo "make demo    generate a small town, run the whole method on it, report (a few minutes, no GPU)"
 	@echo "make test    lint, types and the whole test suite"
+	@echo "make test-fast  the tests that are marked neither slow nor browser (two minutes)"
 	@echo "make setup   only install into $(VENV)"
 	@echo "make clean   remove $(VENV), build/ and $(DEMO)/"
 
@@ -52,6 +53,9 @@ types: setup
 
 test: lint types
 	$(BIN)/python -m pytest
+
+test-fast: setup
+	$(BIN)/python -m pytest -m "not slow and not browser"
 
 clean:
 	rm -rf $(VENV) build $(DEMO)

@@ -24,13 +24,13 @@ import pytest
 from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
+import typecheck
+from package_files import files_with_shapes, module_name
+
 if TYPE_CHECKING:
     from sfm_support import Flight
+    from small_pipeline import NativeRun
 
-ROOT = Path(__file__).parents[1]
-PACKAGE = ROOT / "src" / "vdgs"
-#: Beside the package, and checked as it is. What is archived in its reports is not.
-EXPERIMENTS = (ROOT / "experiments" / "baselines", ROOT / "experiments" / "bench")
 #: Memory is what limits their number on machines of many cores (about 1 GB each).
 MOST_WORKERS = 4
 
@@ -41,24 +41,8 @@ settings.register_profile("search", settings.get_profile("vdgs"), derandomize=Fa
 settings.load_profile("vdgs")
 
 
-def checked_files() -> list[Path]:
-    """The files of the package and of the experiments."""
-    return sorted(file for folder in (PACKAGE, *EXPERIMENTS) for file in folder.rglob("*.py"))
-
-
-def files_with_shapes() -> list[Path]:
-    """Those that annotate shapes: where the arithmetic is."""
-    return [file for file in checked_files() if "from jaxtyping import" in file.read_text(encoding="utf-8")]
-
-
-def module_name(file: Path) -> str:
-    """`vdgs.model.gaps` for src/vdgs/model/gaps.py, `experiments.bench.seen` for experiments/bench/seen.py."""
-    parts = file.relative_to(PACKAGE.parent if file.is_relative_to(PACKAGE) else ROOT).with_suffix("").parts
-    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-
-
 # Their annotations are checked while the tests run.
-install_import_hook([module_name(file) for file in files_with_shapes()], "typecheck.checked")
+install_import_hook([module_name(file) for file in files_with_shapes()], f"{typecheck.__name__}.checked")
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
@@ -107,6 +91,14 @@ def uncut(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = vdgs("coarse", folder / "capture", "--output", folder / "coarse", *COARSE, "--test-every", "4")
     assert done.returncode == 0, done.stderr + done.stdout
     return folder / "coarse"
+
+
+@pytest.fixture(scope="session")
+def native_small(tmp_path_factory: pytest.TempPathFactory) -> NativeRun:
+    """A whole run of six photographs by the native operations. Not to be changed."""
+    from small_pipeline import native_run
+
+    return native_run(tmp_path_factory.mktemp("native"))
 
 
 @pytest.fixture(scope="session")

@@ -12,11 +12,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import pytest
 import torch
 
-from vdgs.kernels.cuda import launching
+from vdgs.kernels.cuda import launching, nvrtc
 from vdgs.kernels.cuda.driver import Grid
 from vdgs.kernels.cuda.launching import read_source
+from vdgs.kernels.cuda.nvrtc import CudaUnavailable, Nvrtc
 
 HERE = Path(__file__).parent
 SHARED = Path(launching.__file__).parents[1] / "shared"
@@ -104,3 +106,13 @@ class HostDriver:
         )  # fmt: skip
         if not whole:
             raise Stuck("threads of a block wait for others that never come")
+
+
+try:
+    COMPILER: Nvrtc | None = nvrtc.nvrtc()
+except CudaUnavailable:
+    COMPILER = None
+
+
+needs_nvrtc = pytest.mark.skipif(COMPILER is None, reason="NVRTC is not installed: pip install nvidia-cuda-nvrtc")
+needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from vdgs.cameras import Camera, CameraModel
-from vdgs.kernels.types import DecoderWeights
+from vdgs.kernels import native
+from vdgs.kernels.reference.project import project
+from vdgs.kernels.runs import Shown
+from vdgs.kernels.types import AdamState, DecoderWeights, SplatGradients
 
 
 def looking_down(model: CameraModel = "pinhole", width: int = 64, height: int = 48) -> Camera:
@@ -90,3 +93,75 @@ class Scene:
     def arguments(self) -> tuple:
         """What `decode` takes before the camera."""
         return self.positions, self.features, self.offsets, self.log_scales, self.weights
+
+
+CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
+
+
+def anchors(n: int, seed: int, spread: float = 8.0, log_scale: float = -1.0) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    return spread * torch.randn(n, 3, generator=g), torch.randn(n, 6, generator=g) + log_scale
+
+
+def ellipse_touches_image(positions, log_scales, camera) -> torch.Tensor:
+    """Whether the box around the projected 3-sigma ellipse (axes of the world) meets the image."""
+    identity = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(len(positions), 4)
+    projected = project(positions.double(), log_scales[:, :3].double().exp(), identity, camera)
+    xx, xy, yy = projected.conics.unbind(-1)
+    reach = 3 * torch.sqrt(torch.stack([yy, xx], -1) / (xx * yy - xy * xy)[:, None])
+    size = torch.tensor([camera.width, camera.height])
+    inside = (projected.means_px + reach > 1e-3) & (projected.means_px - reach < size - 1e-3)
+    return projected.valid & inside.all(-1)
+
+
+def view_statistics(seed: int, n: int = 3000, k: int = 7):
+    """Arguments of `add_view_statistics`: what a view showed, and sums to add it to."""
+    g = torch.Generator().manual_seed(seed)
+    visible = torch.nonzero(torch.rand(n, generator=g) < 0.6)[:, 0]
+    source = torch.nonzero(torch.rand(len(visible) * k, generator=g) < 0.4)[:, 0].int()
+    m = len(source)
+    sums = [torch.rand(n, k, generator=g), torch.rand(n, k, generator=g), torch.rand(n, generator=g), torch.rand(n)]
+    inside = torch.rand(len(visible), generator=g) < 0.7
+    return (visible, inside, source, torch.rand(m, generator=g), torch.randn(m, 2, generator=g), 400, 300), sums
+
+
+def moved_by(
+    kernels, scene: Scene, camera: Camera, rows: torch.Tensor, frozen: bool = False, spoil: bool = False,
+    shown: Shown | None = None,
+):  # fmt: skip
+    """Whether all was finite, and after a step of Adam: parameters and moments, updates, gradients of the decoder.
+    `shown`: where splats stand, if not in the order of the anchors."""
+    with torch.no_grad():
+        splats = native.decode(scene.positions, *scene.trainable[:3], scene.weights, camera, rows)
+    g = torch.Generator().manual_seed(8)
+    m = len(splats.source)
+    gradients = SplatGradients(
+        0.1 * torch.randn(m, 2, generator=g), torch.randn(m, 3, generator=g), torch.randn(m, 3, generator=g),
+        torch.randn(m, generator=g), 0.3, splats.source, splats.colours, splats.opacities,
+    )  # fmt: skip
+    if spoil:
+        gradients.means_px[0] = torch.nan
+    if shown is not None:
+        gradients = elsewhere(gradients, shown)
+    states = [
+        AdamState(t.clone(), 0.1 * torch.randn(t.shape, generator=g), torch.rand(t.shape, generator=g), rate, 4.0)
+        for t, rate in zip(scene.trainable[:3], (0.01, 0.02, 0.005), strict=True)
+    ]
+    updates = (torch.arange(len(scene.positions)) ** 2 % 97).to(torch.int32)
+    updates[3] = 30_000  # more than the tables tell apart
+    weights = scene.weights.map(lambda t: t.clone().requires_grad_(not frozen))
+    finite, found = kernels(scene.positions, states, weights, camera, rows, gradients, updates)
+    return bool(finite), [t for state in states for t in state[:3]], updates, found
+
+
+def elsewhere(gradients: SplatGradients, shown: Shown) -> SplatGradients:
+    """Gradients of splats in their order, as those of splats that stand otherwise; what these looked like is lost."""
+    order = shown.runs.order(len(shown))
+    moved = {}
+    for name in ("means_px", "conics", "colours", "opacities"):
+        moved[name] = torch.empty_like(getattr(gradients, name))
+        moved[name][order.long()] = getattr(gradients, name)
+    nothing = {
+        name: torch.full_like(getattr(gradients, name), torch.nan) for name in ("colour_values", "opacity_values")
+    }
+    return replace(gradients, source=shown, **moved, **nothing)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import shapely
@@ -10,6 +11,7 @@ import torch
 
 from captures_support import look_down
 from vdgs.cameras import Camera
+from vdgs.captures.capture import Capture, GroundFrame, View
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
@@ -67,3 +69,22 @@ def opaque_plane(spacing: float = 0.2, half: float = 3.0) -> AnchorModel:
 def camera_above(x: float, y: float, altitude: float = 4.0, tilt_deg: float = 0.0, yaw_deg: float = 0.0) -> Camera:
     pose = look_down(np.array([x, y, altitude]), tilt_deg, yaw_deg)
     return Camera(camera_from_world=pose, fx=60.0, fy=60.0, cx=32.0, cy=24.0, width=64, height=48)
+
+
+def ground(origin: tuple[float, float, float] | None) -> GroundFrame:
+    return GroundFrame(
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="hand-made", origin_geo=origin
+    )
+
+
+def capture_at(origin: tuple[float, float, float] | None) -> Capture:
+    cameras = [camera_above(0.3, -0.2), camera_above(-2.0, 1.0, tilt_deg=30.0), camera_above(1.5, 2.0)]
+    views = [
+        View(name=f"{n}.png", camera=camera, image_path=Path("images") / f"{n}.png", mask_path=None, split="train")
+        for n, camera in enumerate(cameras)
+    ]
+    points = np.zeros((1, 3))
+    return Capture(
+        root=Path("place"), source="colmap", images="images", views=tuple(views), points=points,
+        point_colours=np.zeros((1, 3), np.uint8), ground=ground(origin),
+    )  # fmt: skip

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from vdgs.kernels.runs import Runs
-from vdgs.kernels.types import OrderedSplats, RasterPullback, Splats
+from vdgs.kernels.types import OrderedSplats, Raster, RasterPullback, Splats
 
 
 def assert_first_gradients_are_those_of_all(
@@ -96,3 +96,38 @@ def make_scene(
         np.array([0.2, 0.3, 0.4]),
     )
     return Scene(tuple(torch.from_numpy(a).float() for a in arrays), width, height).to(torch.float32)
+
+
+def weights_of(raster: Raster, seed: int = 1) -> list[Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    # Depths run to 100: their weight is smaller, so that no part of the gradient drowns.
+    return [
+        torch.randn(t.shape, generator=g, dtype=torch.float64) * s
+        for t, s in zip(smooth(raster), (1, 1, 0.05), strict=True)
+    ]
+
+
+def smooth(raster: Raster) -> tuple[Tensor, Tensor, Tensor]:
+    """What gradients pass through: image, alpha and expected depth."""
+    assert raster.depth is not None
+    return raster.image, raster.alpha, raster.depth
+
+
+def loss_of(raster: Raster) -> Tensor:
+    return sum((t * w.to(t.dtype)).sum() for t, w in zip(smooth(raster), weights_of(raster), strict=True))
+
+
+def assert_same_picture(actual: Raster, exact: Raster, tolerance: float) -> None:
+    for a, e in zip(smooth(actual), smooth(exact), strict=True):
+        assert_close(a, e, tolerance)
+    # It jumps from splat to splat: where transmittance is one half but for rounding, either side is right.
+    assert actual.median_depth is not None
+    assert exact.median_depth is not None
+    differs = actual.median_depth.double() != exact.median_depth.double()
+    assert int(differs.sum()) <= differs.numel() // 1000
+
+
+def assert_close(actual: Tensor, exact: Tensor, tolerance: float) -> None:
+    """Close in the norm: a pixel at a threshold may go either way, and both are right."""
+    error = (actual.detach().double() - exact.detach()).norm()
+    assert error <= tolerance * exact.detach().norm().clamp(min=1e-6), f"relative error {error / exact.norm():.2e}"

@@ -2,9 +2,9 @@
 
     python slurm_stand_in.py sbatch --parsable job.sh
 
-It knows what vdgs uses, and does as the real ones do (tests/test_slurm.py runs the same tests on both): arrays, one
-element at a time in each place, signals to the script of a job, an orderly and a hard end, the queue a second time. A
-process of its own goes with every element. $VDGS_TEST_SLURM names the folder.
+It knows what vdgs uses, and does as the real ones do (the same tests run on both): arrays, one element at a time in
+each place, signals to the script of a job, an orderly and a hard end, the queue a second time. A process of its own
+goes with every element. $VDGS_TEST_SLURM names the folder.
 """
 
 from __future__ import annotations

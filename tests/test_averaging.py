@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from test_training import CONFIG, run, stage, start
+from training_support import CONFIG, run, stage, start
 from vdgs.model.anchors import TRAINED
 from vdgs.settings.method import GrowthConfig, TrainConfig
 from vdgs.storage.checkpoints import load_newest, save_state

@@ -24,6 +24,8 @@ from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
 from vdgs.settings.method import MethodConfig
 
+pytestmark = pytest.mark.xdist_group("bench_explicit")
+
 
 def test_the_published_length_has_the_published_schedule():
     assert scheduled(PUBLISHED_ITERATIONS) == GaussiansConfig()

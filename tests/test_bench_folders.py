@@ -25,6 +25,8 @@ from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.method import with_iterations
 from vdgs.settings.presets import PRESETS
 
+pytestmark = pytest.mark.xdist_group("bench_folders")
+
 PLAIN = CaptureOptions()
 
 

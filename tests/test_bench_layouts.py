@@ -16,6 +16,8 @@ from vdgs.captures.loading import load_capture
 from vdgs.runs.folder import RunFolder
 from vdgs.synth import SynthOptions, generate
 
+pytestmark = pytest.mark.xdist_group("bench_layouts")
+
 WIDTH, HEIGHT = 160, 120
 
 

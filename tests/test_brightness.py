@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from captures_support import TinyScene, render_plane, tiny_scene, write_colmap
 from cli_support import vdgs
-from vdgs.captures import brightness
 from vdgs.captures.brightness import LEAST_LIGHT, PointColours, point_colours
 from vdgs.captures.capture import View
 from vdgs.captures.formats.colmap_records import SIGHTINGS, some_of
@@ -215,12 +214,11 @@ def test_photographs_are_looked_at_small_and_are_as_bright(side, asked):
     assert images.asked == {(index, asked) for index in range(8)}
 
 
-def test_of_many_photographs_some_are_looked_at(monkeypatch):
-    monkeypatch.setattr(brightness, "AT_MOST", 7)
+def test_of_many_photographs_some_are_looked_at():
     told: list[tuple[int, int]] = []
     gains = some_gains(3)
     images = Photographed(gains)
-    colours = point_colours(images, lambda done, of: told.append((done, of)))
+    colours = point_colours(images, lambda done, of: told.append((done, of)), most_images=7)
     assert colours is not None
     assert told == [(done, 7) for done in range(7)]
     found = colours.gains()

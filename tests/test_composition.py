@@ -9,13 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from captures_support import tiny_scene, write_colmap
 from composition_on_host import build, install
-from cuda_on_host import host_compiler
+from cuda_on_host import host_compiler, needs_nvrtc
 from gsplat_stand_in import needs_gsplat
 from pretended_device import pretended_card
-from test_cuda_compiling import needs_nvrtc
-from test_reference_set import BLOCK, CUT, SETTINGS, psnr, vdgs
+from small_pipeline import after_the_coarse_stage, psnr, train_coarse, vdgs
 from vdgs.kernels import devices
 
 pytestmark = [
@@ -24,33 +22,21 @@ pytestmark = [
 ]  # fmt: skip
 
 
-def whole_run(capture: Path, run: Path, *device: str) -> None:
-    vdgs("coarse", capture, "--output", run, "--up", "z", *SETTINGS, *device)
-    vdgs("visibility", run)
-    vdgs("partition", run, *CUT)
-    for block in (0, 1):
-        vdgs("train", run, "--block", block, *BLOCK, *device)
-    vdgs("merge", run)
-    vdgs("eval", run, "--model", "coarse", *device)
-    vdgs("eval", run, "--model", "merged", *device)
-
-
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory, compiled_code) -> tuple[Path, Path]:
+def runs(native_small, tmp_path_factory, compiled_code) -> tuple[Path, Path]:
     """By the native set, and on the card."""
     folder = tmp_path_factory.mktemp("composed")
     drivers = build(folder / "kernels")
-    write_colmap(folder / "capture", tiny_scene(columns=3, rows=2, width=32, height=24, points=80))
-    native, card = folder / "native", folder / "card"
-    whole_run(folder / "capture", native)
+    card = folder / "card"
     with pytest.MonkeyPatch.context() as patch:
         install(drivers, compiled_code, patch, "cuda", "gsplat")
         patch.setattr(devices, "_no_card", lambda index: "")
         with pretended_card():
-            whole_run(folder / "capture", card, "--device", "cuda")
+            train_coarse(native_small.capture, card, "--device", "cuda")
+            after_the_coarse_stage(card, "--device", "cuda")
             vdgs("render", card, "--kind", "depth", "--output", folder / "depth", "--device", "cuda")
             vdgs("export", card, "--to", folder / "scene.ply", "--device", "cuda")
-    return native, card
+    return native_small.whole, card
 
 
 def test_a_card_learns_the_place_as_the_processor_does(runs):

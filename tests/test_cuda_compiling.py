@@ -10,16 +10,12 @@ import pytest
 import torch
 
 from cli_support import python_begun
+from cuda_on_host import COMPILER, needs_nvrtc
 from experiments.microbench.cuda_resources import resources_of
 from vdgs.errors import VdgsError
 from vdgs.kernels.cuda import cache, launching, nvrtc
 from vdgs.kernels.cuda.nvrtc import CompileError, CudaUnavailable, Found, Nvrtc, Target
 
-try:
-    COMPILER: Nvrtc | None = nvrtc.nvrtc()
-except CudaUnavailable:
-    COMPILER = None
-needs_nvrtc = pytest.mark.skipif(COMPILER is None, reason="NVRTC is not installed: pip install nvidia-cuda-nvrtc")
 ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
 
 

@@ -7,10 +7,8 @@ import ctypes
 import pytest
 import torch
 
-from cuda_on_host import ORDERS, HostDriver, build_on_host, host_compiler
-from decode_scenes import looking_down
-from test_cuda_compiling import needs_nvrtc
-from test_cull import CAMERAS, anchors, ellipse_touches_image
+from cuda_on_host import ORDERS, HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
+from decode_scenes import CAMERAS, anchors, ellipse_touches_image, looking_down
 from vdgs.cameras import Camera
 from vdgs.kernels.cuda.cull import PROGRAM, cull
 from vdgs.kernels.cuda.driver import cuda_driver
@@ -19,7 +17,6 @@ from vdgs.kernels.native.cull import cull as native
 from vdgs.kernels.reference.cull import cull as reference
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_cull")]
-needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,9 @@ from functools import partial
 import pytest
 import torch
 
-from cuda_on_host import ORDERS, HostDriver, build_on_host, host_compiler
-from decode_scenes import Scene, looking_down, turned
-from test_cuda_compiling import needs_nvrtc
+from cuda_on_host import ORDERS, HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
+from decode_scenes import Scene, looking_down, moved_by, turned
 from vdgs.cameras import Camera
-from vdgs.kernels import native
-from vdgs.kernels.cuda import decode_adam
 from vdgs.kernels.cuda.camera import PackedCamera
 from vdgs.kernels.cuda.decode import PROGRAM, decode, decode_to_train, sources_of
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
@@ -27,7 +24,7 @@ from vdgs.kernels.runs import Shown
 from vdgs.kernels.types import AdamState, AnchorSplats, SplatGradients, Splats, TrainingSplats
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_decode")]
-needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
+
 CAMERAS = {
     "down": looking_down(),
     "turned": turned(),
@@ -248,49 +245,6 @@ def test_a_card_gives_what_the_reference_gives(name):
     assert_same(here, exactly(scene, CAMERAS[name]))
 
 
-def moved_by(
-    kernels, scene: Scene, camera: Camera, rows: torch.Tensor, frozen: bool = False, spoil: bool = False,
-    shown: Shown | None = None,
-):  # fmt: skip
-    """Whether all was finite, and after a step of Adam: parameters and moments, updates, gradients of the decoder.
-    `shown`: where splats stand, if not in the order of the anchors."""
-    with torch.no_grad():
-        splats = native.decode(scene.positions, *scene.trainable[:3], scene.weights, camera, rows)
-    g = torch.Generator().manual_seed(8)
-    m = len(splats.source)
-    gradients = SplatGradients(
-        means_px=0.1 * torch.randn(m, 2, generator=g), conics=torch.randn(m, 3, generator=g),
-        colours=torch.randn(m, 3, generator=g), opacities=torch.randn(m, generator=g), volume=0.3, source=splats.source,
-        colour_values=splats.colours, opacity_values=splats.opacities,
-    )  # fmt: skip
-    if spoil:
-        gradients.means_px[0] = torch.nan
-    if shown is not None:
-        gradients = elsewhere(gradients, shown)
-    states = [
-        AdamState(t.clone(), 0.1 * torch.randn(t.shape, generator=g), torch.rand(t.shape, generator=g), rate, 4.0)
-        for t, rate in zip(scene.trainable[:3], (0.01, 0.02, 0.005), strict=True)
-    ]
-    updates = (torch.arange(len(scene.positions)) ** 2 % 97).to(torch.int32)
-    updates[3] = 30_000  # more than the tables tell apart
-    weights = scene.weights.map(lambda t: t.clone().requires_grad_(not frozen))
-    finite, found = kernels(scene.positions, states, weights, camera, rows, gradients, updates)
-    return bool(finite), [t for state in states for t in state[:3]], updates, found
-
-
-def elsewhere(gradients: SplatGradients, shown: Shown) -> SplatGradients:
-    """Gradients of splats in their order, as those of splats that stand otherwise; what these looked like is lost."""
-    order = shown.runs.order(len(shown))
-    moved = {}
-    for name in ("means_px", "conics", "colours", "opacities"):
-        moved[name] = torch.empty_like(getattr(gradients, name))
-        moved[name][order.long()] = getattr(gradients, name)
-    nothing = {
-        name: torch.full_like(getattr(gradients, name), torch.nan) for name in ("colour_values", "opacity_values")
-    }
-    return replace(gradients, source=shown, **moved, **nothing)
-
-
 @needs_a_compiler
 class TestMoving:
     @pytest.fixture
@@ -340,14 +294,13 @@ class TestMoving:
         with pytest.raises(TypeError, match="on that card"):
             moved_by(by_reference, scene, turned(), rows, shown=shown)
 
-    def test_piece_by_piece_anchors_move_to_the_same_bits(self, moving, monkeypatch):
+    def test_piece_by_piece_anchors_move_to_the_same_bits(self, moving):
         """The decoder's gradients are sums of those of pieces."""
         scene, rows = Scene.random(45, 10), torch.arange(0, 45, 2)
         whole = moved_by(moving, scene, turned(), rows)
-        monkeypatch.setattr(decode_adam, "PIECE", 16)
         program = moving.keywords["program"]
         program.driver.launched.clear()
-        pieces = moved_by(moving, scene, turned(), rows)
+        pieces = moved_by(partial(moving, piece=16), scene, turned(), rows)
         assert [grid for _, grid, _ in program.driver.launched] == [(2, 1, 1), (1, 1, 1)]
         assert all(torch.equal(one, other) for one, other in zip(whole[1], pieces[1], strict=True))
         for one, other in zip(whole[3], pieces[3], strict=True):

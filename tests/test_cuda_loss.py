@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from cuda_on_host import HostDriver, build_on_host, host_compiler
-from test_cuda_compiling import needs_nvrtc
-from test_loss import scene, with_gradient
+from cuda_on_host import HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
+from loss_scenes import scene, with_gradient
 from vdgs.kernels.cuda import loss as cuda
 from vdgs.kernels.cuda.driver import CudaUnavailable, cuda_driver
 from vdgs.kernels.cuda.launching import Program, read_source
 from vdgs.kernels.reference import loss as reference
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_loss")]
-needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
+
 #: How many the kernels have.
 BARRIERS = 7
 SIZES = [(1, 1), (3, 2), (16, 16), (17, 33), (37, 50), (64, 31)]

@@ -9,10 +9,17 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from cuda_on_host import ORDERS, HostDriver, Stuck, build_on_host, host_compiler
-from rasterise_scenes import Scene, assert_first_gradients_are_those_of_all, in_runs, make_scene, splats_of
-from test_cuda_compiling import needs_nvrtc
-from test_rasterise import assert_close, assert_same_picture, loss_of
+from cuda_on_host import ORDERS, HostDriver, Stuck, build_on_host, needs_a_compiler, needs_nvrtc
+from rasterise_scenes import (
+    Scene,
+    assert_close,
+    assert_first_gradients_are_those_of_all,
+    assert_same_picture,
+    in_runs,
+    loss_of,
+    make_scene,
+    splats_of,
+)
 from vdgs.kernels.cuda.driver import cuda_driver
 from vdgs.kernels.cuda.launching import Program, read_source
 from vdgs.kernels.cuda.rasterise import PROGRAM, rasterise, rasterise_vjp
@@ -20,7 +27,7 @@ from vdgs.kernels.reference.rasterise import rasterise as reference
 from vdgs.kernels.types import Raster, Splats
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_rasterise")]
-needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
+
 #: Whatever makes the threads of a block wait for each other.
 BARRIER = re.compile(r"__syncthreads(?:_and|_or)?\(")
 BARRIERS = 5

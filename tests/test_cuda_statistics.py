@@ -9,9 +9,8 @@ from functools import partial
 import pytest
 import torch
 
-from cuda_on_host import ORDERS, HostDriver, build_on_host, host_compiler
-from test_cuda_compiling import needs_nvrtc
-from test_statistics import view
+from cuda_on_host import ORDERS, HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
+from decode_scenes import view_statistics
 from vdgs.kernels.cuda.driver import cuda_driver
 from vdgs.kernels.cuda.launching import Program, read_source
 from vdgs.kernels.cuda.statistics import PROGRAM, add_view_statistics
@@ -19,7 +18,6 @@ from vdgs.kernels.reference.statistics import add_view_statistics as by_referenc
 from vdgs.kernels.types import Statistics
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_statistics")]
-needs_a_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler")
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +43,7 @@ def added(add, inputs, sums, views: int = 2) -> list[torch.Tensor]:
 @needs_a_compiler
 @pytest.mark.parametrize(("n", "k"), [(3000, 7), (40, 1), (40, 32), (1, 10)])
 def test_it_equals_the_reference(n, k, library):
-    inputs, sums = view(0, n, k)
+    inputs, sums = view_statistics(0, n, k)
     for ours, theirs in zip(added(on_host(library), inputs, sums), added(by_reference, inputs, sums), strict=True):
         torch.testing.assert_close(ours, theirs)
 
@@ -53,7 +51,7 @@ def test_it_equals_the_reference(n, k, library):
 @needs_a_compiler
 @pytest.mark.parametrize("order", ORDERS[1:])
 def test_the_order_in_which_threads_take_turns_changes_no_bit(order, library):
-    inputs, sums = view(1, 300)
+    inputs, sums = view_statistics(1, 300)
     results = [added(on_host(library, turns), inputs, sums) for turns in (0, order)]
     assert all(torch.equal(one, other) for one, other in zip(*results, strict=True))
 
@@ -81,23 +79,23 @@ def test_nothing_drawn_counts_only_the_visible_that_are_inside(library):
 @needs_a_compiler
 class TestRefusals:
     def test_a_source_beyond_the_visible(self, library):
-        (visible, inside, source, *rest), sums = view(0, 40)
+        (visible, inside, source, *rest), sums = view_statistics(0, 40)
         source[-1] = len(visible) * 7
         with pytest.raises(IndexError):
             on_host(library)(Statistics(*sums), visible, inside, source, *rest)
 
     def test_a_mask_that_does_not_fit(self, library):
-        (visible, inside, *rest), sums = view(0, 40)
+        (visible, inside, *rest), sums = view_statistics(0, 40)
         with pytest.raises((ValueError, TypeError), match="inside"):
             on_host(library)(Statistics(*sums), visible, inside[1:], *rest)
 
     def test_splats_that_are_not_as_many_as_sources(self, library):
-        (visible, inside, source, opacities, gradient_px, *size), sums = view(0, 40)
+        (visible, inside, source, opacities, gradient_px, *size), sums = view_statistics(0, 40)
         with pytest.raises((ValueError, TypeError), match="opacities"):
             on_host(library)(Statistics(*sums), visible, inside, source, opacities[1:], gradient_px, *size)
 
     def test_other_types(self, library):
-        (visible, inside, source, opacities, *rest), sums = view(0, 40)
+        (visible, inside, source, opacities, *rest), sums = view_statistics(0, 40)
         with pytest.raises(TypeError, match="opacities must be float32"):
             on_host(library)(Statistics(*sums), visible, inside, source, opacities.double(), *rest)
         with pytest.raises(TypeError, match="source"):
@@ -107,7 +105,7 @@ class TestRefusals:
 @pytest.mark.gpu
 def test_a_card_gives_what_the_reference_gives():
     cuda_driver()
-    inputs, sums = view(0)
+    inputs, sums = view_statistics(0)
     there = [t.cuda() if isinstance(t, torch.Tensor) else t for t in inputs]
     found = added(add_view_statistics, there, [s.cuda() for s in sums])
     for ours, theirs in zip(found, added(by_reference, inputs, sums), strict=True):

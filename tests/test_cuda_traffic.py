@@ -14,15 +14,11 @@ from functools import partial
 import pytest
 import torch
 
-from cuda_on_host import host_compiler
+from cuda_on_host import host_compiler, needs_nvrtc
 from cuda_traffic import Bytes, CountedProgram, Traffic, total
-from decode_scenes import Scene, turned
+from decode_scenes import CAMERAS, Scene, anchors, moved_by, turned, view_statistics
+from loss_scenes import scene as pictures
 from rasterise_scenes import in_runs, make_scene, splats_of
-from test_cuda_compiling import needs_nvrtc
-from test_cuda_decode import moved_by
-from test_cull import CAMERAS, anchors
-from test_loss import scene as pictures
-from test_statistics import view
 from vdgs.kernels.cuda import cache
 from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.cull import cull
@@ -91,7 +87,7 @@ def counted(tmp_path_factory, compiled_code) -> Counted:
         source, opaque = count(DECODE, decoding)
         positions, log_scales = anchors(2048, seed=1)
         rows = count(CULL, lambda program: cull(positions, log_scales, CAMERAS[0], program=program))
-        inputs, sums = view(0, 300, K)
+        inputs, sums = view_statistics(0, 300, K)
         count(STATISTICS, lambda program: add_view_statistics(Statistics(*sums), *inputs, program=program))
         drawn, entries = count(RASTERISE, drawing)
         count(LOSS, comparing)

@@ -7,31 +7,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from decode_scenes import looking_down, turned
+from decode_scenes import CAMERAS, anchors, ellipse_touches_image, looking_down
 from vdgs.cameras import NEAR
 from vdgs.kernels.native import module
 from vdgs.kernels.native.cull import cull as native_cull
 from vdgs.kernels.reference.cull import cull as twin_cull
-from vdgs.kernels.reference.project import project
 
-CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
 BOTH = pytest.mark.parametrize("cull", [twin_cull, native_cull])
-
-
-def anchors(n: int, seed: int, spread: float = 8.0, log_scale: float = -1.0) -> tuple[torch.Tensor, torch.Tensor]:
-    g = torch.Generator().manual_seed(seed)
-    return spread * torch.randn(n, 3, generator=g), torch.randn(n, 6, generator=g) + log_scale
-
-
-def ellipse_touches_image(positions, log_scales, camera) -> torch.Tensor:
-    """Whether the box around the projected 3-sigma ellipse (axes of the world) meets the image."""
-    identity = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(len(positions), 4)
-    projected = project(positions.double(), log_scales[:, :3].double().exp(), identity, camera)
-    xx, xy, yy = projected.conics.unbind(-1)
-    reach = 3 * torch.sqrt(torch.stack([yy, xx], -1) / (xx * yy - xy * xy)[:, None])
-    size = torch.tensor([camera.width, camera.height])
-    inside = (projected.means_px + reach > 1e-3) & (projected.means_px - reach < size - 1e-3)
-    return projected.valid & inside.all(-1)
 
 
 @BOTH

@@ -14,6 +14,8 @@ from vdgs.doctor import report as doctor_report
 from vdgs.doctor.check import Check
 from vdgs.doctor.report import healthy, print_report, report
 
+pytestmark = pytest.mark.xdist_group("doctor")
+
 
 @pytest.fixture(scope="module")
 def checks() -> list[Check]:

@@ -25,6 +25,8 @@ from vdgs.evaluation.measured_model import EvaluationSettings, MeasuredModel, Mo
 from vdgs.evaluation.reference_views import ReferenceViews
 from vdgs.storage.files import jsonable, write_json
 
+pytestmark = pytest.mark.xdist_group("evaluate")
+
 NAMES = ["a/b.jpg", "c/b.jpg", "a/b.png", "plain.jpg"]
 
 

@@ -1,42 +1,25 @@
 """Jobs side by side: each ends as it should, none harms another, and none outlives the one who started it unasked."""
 
-import io
 import json
 import os
 import signal
 import subprocess
 import sys
-import textwrap
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 from cli_support import PATIENCE_SECONDS, wait_until
+from executor_support import job, run
 from vdgs.executors import local
 from vdgs.executors.executor import Listener, Outcome, Task
 from vdgs.executors.lines import Lines
 from vdgs.executors.local import LocalExecutor
 from vdgs.executors.parent import PARENT, stop_when_parent_dies
-from vdgs.executors.pieces import Piece, run_pieces
+from vdgs.executors.pieces import Piece
 from vdgs.runs.stage_folder import StageFolder
 
-#: What every fake block begins with: it knows its folder, can say how far it is, and lists the SIGTERMs it gets.
-PRELUDE = f"""
-import json, os, pathlib, signal, sys, time
-folder = pathlib.Path(sys.argv[1])
-def tell(state, **facts):
-    (folder / "status.json").write_text(json.dumps({{"state": state, **facts}}))
-def stop(*_):
-    with (folder / "terms").open("a") as terms:
-        terms.write("TERM ")
-signal.signal(signal.SIGTERM, stop)
-def wait_for(condition):
-    end = time.monotonic() + {PATIENCE_SECONDS}
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.02)
-"""
 FINE = 'tell("done", iteration=10, iterations=10, psnr_training=25.5, anchors=1234)'
 #: Runs until asked to stop, then saves until it may end; a second SIGTERM would be noticed.
 LONG = """
@@ -47,19 +30,6 @@ wait_for((folder.parent / "may_end").exists)
 tell("stopped", iteration=4)
 sys.exit(130)
 """
-
-
-def job(root: Path, index: int, script: str) -> Piece:
-    folder = StageFolder(root / f"{index:02d}")
-    who = f"block = {index}\n"
-    return Piece(index, folder, [sys.executable, "-S", "-c", PRELUDE + who + textwrap.dedent(script), str(folder.path)])
-
-
-def run(jobs, *, at_once=2, retries=2, terminal=False):
-    """Outcomes, and what was printed."""
-    console = Console(file=io.StringIO(), width=120, height=40, force_terminal=terminal, color_system=None)
-    outcomes = run_pieces(jobs, LocalExecutor(at_once, retries, poll_seconds=0.02), console)
-    return outcomes, console.file.getvalue()
 
 
 class Told(Listener):

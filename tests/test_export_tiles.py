@@ -20,6 +20,8 @@ from vdgs.export.formats.tiles import write_tiles
 from vdgs.model.gaussians import Gaussians, draw_gaussians
 from vdgs.model.similarity import covariances, transformed
 
+pytestmark = pytest.mark.xdist_group("export_tiles")
+
 PLACE = Facts(geodetic=(48.13, 11.57, 512.0))
 
 

@@ -24,7 +24,9 @@ from cli_support import wait_until
 from formats_support import overhead, picture, psnr, random_gaussians
 from vdgs.export.formats import registry
 from vdgs.export.formats.scene import Scene
-from viewer_support import browser, open_page
+from viewer_support import needs_browser, open_page
+
+pytestmark = [pytest.mark.browser, needs_browser]
 
 MODULES = Path(os.environ.get("VDGS_NODE") or "none") / "node_modules"
 NEEDED = ("@mkkellogg/gaussian-splats-3d/build/gaussian-splats-3d.module.js", "three/build/three.module.js")
@@ -73,7 +75,6 @@ def served(folder: Path) -> Iterator[str]:
         thread.join()
 
 
-@pytest.mark.skipif(browser() is None, reason="no Chromium on this machine (apt-get install chromium)")
 @pytest.mark.skipif(
     not all((MODULES / file).is_file() for file in NEEDED),
     reason="VDGS_NODE names no folder with a viewer: npm install --prefix FOLDER @mkkellogg/gaussian-splats-3d three",

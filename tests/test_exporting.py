@@ -13,9 +13,8 @@ from rich.console import Console
 
 from captures_support import look_down
 from formats_support import random_gaussians
-from merging_support import camera_above, model_at
+from merging_support import capture_at, ground, model_at
 from vdgs.cameras import Camera
-from vdgs.captures.capture import Capture, GroundFrame, View
 from vdgs.captures.geodesy import ecef_from_geodetic, enu_axes
 from vdgs.errors import VdgsError
 from vdgs.export import exporting, here
@@ -35,25 +34,6 @@ from vdgs.storage.files import read_json
 #: Far from the middle of its UTM zone: grid north is 1.1 degrees off.
 PLACE = (46.95, 7.44, 560.0)
 QUIET = Console(quiet=True)
-
-
-def ground(origin: tuple[float, float, float] | None) -> GroundFrame:
-    return GroundFrame(
-        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="hand-made", origin_geo=origin
-    )
-
-
-def capture_at(origin: tuple[float, float, float] | None) -> Capture:
-    cameras = [camera_above(0.3, -0.2), camera_above(-2.0, 1.0, tilt_deg=30.0), camera_above(1.5, 2.0)]
-    views = [
-        View(name=f"{n}.png", camera=camera, image_path=Path("images") / f"{n}.png", mask_path=None, split="train")
-        for n, camera in enumerate(cameras)
-    ]
-    points = np.zeros((1, 3))
-    return Capture(
-        root=Path("place"), source="colmap", images="images", views=tuple(views), points=points,
-        point_colours=np.zeros((1, 3), np.uint8), ground=ground(origin),
-    )  # fmt: skip
 
 
 def scattered(parts: tuple[int, ...] = ()) -> AnchorModel:

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from checkerboard import Photographs
-from test_exporting import capture_at
-from test_training import CONFIG, bits, run, stage, start
+from merging_support import capture_at
+from training_support import CONFIG, bits, run, stage, start
 from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, View
 from vdgs.captures.order import places_in_flights

@@ -29,6 +29,8 @@ from vdgs.runs.stage_folder import StageFolder
 from vdgs.settings.capture import CaptureOptions
 from vdgs.settings.watching import WatchOptions
 
+pytestmark = pytest.mark.xdist_group("gaussians")
+
 DENSITY = DensityConfig(start=15, interval=10, until=0.5, dense=0.08, reset_interval=40)
 SHORT = GaussiansConfig(iterations=60, resolutions=((0, 2), (30, 1)), density=DENSITY)
 QUIET = Console(quiet=True)

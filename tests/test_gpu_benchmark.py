@@ -7,11 +7,10 @@ import torch
 
 from captures_support import tiny_scene, write_colmap
 from composition_on_host import build, install
-from cuda_on_host import host_compiler
+from cuda_on_host import host_compiler, needs_nvrtc
 from experiments.microbench import gpu
 from gsplat_stand_in import needs_gsplat
 from pretended_device import CARD, pretended_card
-from test_cuda_compiling import needs_nvrtc
 from vdgs.kernels import devices
 from vdgs.kernels.operations import OPERATIONS
 

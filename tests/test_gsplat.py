@@ -9,8 +9,14 @@ import pytest
 import torch
 
 import gsplat_stand_in
-from rasterise_scenes import assert_first_gradients_are_those_of_all, make_scene, splats_of
-from test_rasterise import assert_close, loss_of, smooth
+from rasterise_scenes import (
+    assert_close,
+    assert_first_gradients_are_those_of_all,
+    loss_of,
+    make_scene,
+    smooth,
+    splats_of,
+)
 from vdgs.errors import VdgsError
 from vdgs.kernels.gsplat import rasterise, rasterise_vjp
 from vdgs.kernels.gsplat.rasterise import GsplatUnavailable, load, reach_px

@@ -2,36 +2,18 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from loss_scenes import scene, with_gradient
 from native_choice import every_instruction_set, on_threads, using
 from vdgs.kernels.native import loss as native
 from vdgs.kernels.reference import loss as reference
 
 SIZES = [(1, 1), (1, 7), (3, 2), (5, 40), (37, 1), (13, 29), (64, 33), (131, 70)]
-
-
-def scene(height: int, width: int, seed: int = 0, kept: float | None = None):
-    """A smooth picture, the same with noise, and a mask."""
-    generator = np.random.default_rng(seed)
-    base = cv2.GaussianBlur(generator.random((height, width, 3)), (0, 0), 2.0).reshape(height, width, 3)
-    base = (base - base.min()) / max(np.ptp(base), 1e-3)
-    noisy = np.clip(base + generator.normal(0, 0.1, base.shape), -0.2, 1.2)
-    target = torch.from_numpy((base * 255).astype(np.uint8))
-    mask = None if kept is None else torch.from_numpy((generator.random((height, width)) < kept) * np.uint8(9))
-    return torch.from_numpy(noisy.astype(np.float32)), target, mask
-
-
-def with_gradient(implementation, image, target, mask=None, **settings_):
-    leaf = image.clone().requires_grad_()
-    result = implementation.photometric_loss(leaf, target, mask, **settings_)
-    (gradient,) = torch.autograd.grad(result.loss, leaf)
-    return result, gradient
 
 
 def definition(image: np.ndarray, target: np.ndarray) -> np.ndarray:

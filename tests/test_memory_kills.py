@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from test_executor import job, run
+from executor_support import job, run
 from vdgs.executors.engine import End
 from vdgs.executors.fitness import Question
 from vdgs.executors.keeper import Keeper, Order

@@ -23,6 +23,8 @@ from vdgs.settings.requests import RenderRequest
 from vdgs.settings.watching import WatchOptions
 from vdgs.stages.coarse import train_coarse
 
+pytestmark = pytest.mark.xdist_group("moved_capture")
+
 METHOD = MethodConfig(TrainConfig(iterations=3, anchors=AnchorConfig(offsets=2)))
 UP = CaptureOptions(up="z")
 QUIET = Console(quiet=True)

@@ -11,10 +11,9 @@ import torch
 from block_support import CONFIG, coarse
 from checkerboard import Photographs
 from composition_on_host import build, install
-from cuda_on_host import ORDERS, host_compiler
+from cuda_on_host import ORDERS, host_compiler, needs_nvrtc
 from gsplat_stand_in import needs_gsplat
 from pretended_device import CARD, pretended_card
-from test_cuda_compiling import needs_nvrtc
 from vdgs import kernels
 from vdgs.settings.method import CompensationConfig, GrowthConfig
 from vdgs.training import Stage, Surroundings, TrainingState, loop, start_state, to_saved, train_step

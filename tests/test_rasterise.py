@@ -17,7 +17,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from native_choice import on_threads
-from rasterise_scenes import Scene, assert_first_gradients_are_those_of_all, make_scene, splats_of
+from rasterise_scenes import (
+    Scene,
+    assert_close,
+    assert_first_gradients_are_those_of_all,
+    assert_same_picture,
+    loss_of,
+    make_scene,
+    splats_of,
+)
 from vdgs.kernels import constants
 from vdgs.kernels.native.module import load, supported
 from vdgs.kernels.native.rasterise import rasterise, rasterise_vjp, shares
@@ -47,25 +55,6 @@ def draw(scene: Scene, isa: str, depth: bool = True) -> Raster:
     return rasterise(*splats_of(scene.tensors), scene.width, scene.height, depth=depth, module=load(isa))
 
 
-def weights_of(raster: Raster, seed: int = 1) -> list[Tensor]:
-    g = torch.Generator().manual_seed(seed)
-    # Depths run to 100: their weight is smaller, so that no part of the gradient drowns.
-    return [
-        torch.randn(t.shape, generator=g, dtype=torch.float64) * s
-        for t, s in zip(smooth(raster), (1, 1, 0.05), strict=True)
-    ]
-
-
-def smooth(raster: Raster) -> tuple[Tensor, Tensor, Tensor]:
-    """What gradients pass through: image, alpha and expected depth."""
-    assert raster.depth is not None
-    return raster.image, raster.alpha, raster.depth
-
-
-def loss_of(raster: Raster) -> Tensor:
-    return sum((t * w.to(t.dtype)).sum() for t, w in zip(smooth(raster), weights_of(raster), strict=True))
-
-
 @cache
 def exact_of(scene: Scene) -> tuple[Raster, list[Tensor]]:
     """What the reference draws, and the gradients of `loss_of`; once for all instruction sets."""
@@ -73,22 +62,6 @@ def exact_of(scene: Scene) -> tuple[Raster, list[Tensor]]:
     exact = reference(*splats_of(scene.tensors), scene.width, scene.height, depth=True)
     loss_of(exact).backward()
     return exact, [tensor.grad for tensor in scene.tensors]
-
-
-def assert_same_picture(actual: Raster, exact: Raster, tolerance: float) -> None:
-    for a, e in zip(smooth(actual), smooth(exact), strict=True):
-        assert_close(a, e, tolerance)
-    # It jumps from splat to splat: where transmittance is one half but for rounding, either side is right.
-    assert actual.median_depth is not None
-    assert exact.median_depth is not None
-    differs = actual.median_depth.double() != exact.median_depth.double()
-    assert int(differs.sum()) <= differs.numel() // 1000
-
-
-def assert_close(actual: Tensor, exact: Tensor, tolerance: float) -> None:
-    """Close in the norm: a pixel at a threshold may go either way, and both are right."""
-    error = (actual.detach().double() - exact.detach()).norm()
-    assert error <= tolerance * exact.detach().norm().clamp(min=1e-6), f"relative error {error / exact.norm():.2e}"
 
 
 @pytest.mark.parametrize("isa", ISAS)

@@ -174,15 +174,14 @@ def test_the_strongest_cluster_of_a_cell_is_found_in_windows_as_over_all_cells()
 
 
 @pytest.mark.parametrize("flags", [boundary.MOST_FLAGS, 0])
-def test_the_first_point_of_each_cell(flags: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(boundary, "MOST_FLAGS", flags)
+def test_the_first_point_of_each_cell(flags: int) -> None:
     points = np.random.default_rng(8).normal(0, 5, (5000, 2))
     seen, expected = set(), []
     for index, cell in enumerate(map(tuple, np.floor(points / 0.7).astype(int).tolist())):
         if cell not in seen:
             seen.add(cell)
             expected.append(index)
-    assert boundary._first_of_cells(points, 0.7).tolist() == expected
+    assert boundary._first_of_cells(points, 0.7, flags).tolist() == expected
 
 
 @pytest.mark.parametrize("mode", ["coverage", "literal", "leave_one_out"])

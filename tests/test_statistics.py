@@ -5,24 +5,15 @@ import torch
 
 import vdgs.kernels.native.statistics as native
 import vdgs.kernels.reference.statistics as reference
+from decode_scenes import view_statistics
 from native_choice import every_instruction_set, on_threads, using
 from vdgs.kernels.types import Statistics
-
-
-def view(seed: int, n: int = 3000, k: int = 7):
-    g = torch.Generator().manual_seed(seed)
-    visible = torch.nonzero(torch.rand(n, generator=g) < 0.6)[:, 0]
-    source = torch.nonzero(torch.rand(len(visible) * k, generator=g) < 0.4)[:, 0].int()
-    m = len(source)
-    sums = [torch.rand(n, k, generator=g), torch.rand(n, k, generator=g), torch.rand(n, generator=g), torch.rand(n)]
-    inside = torch.rand(len(visible), generator=g) < 0.7
-    return (visible, inside, source, torch.rand(m, generator=g), torch.randn(m, 2, generator=g), 400, 300), sums
 
 
 @every_instruction_set
 @pytest.mark.parametrize("seed", [0, 1])
 def test_native_equals_twin(instructions, seed):
-    inputs, sums = view(seed)
+    inputs, sums = view_statistics(seed)
     expected = [s.clone() for s in sums]
     reference.add_view_statistics(Statistics(*expected), *inputs)
     results = []

@@ -181,9 +181,8 @@ def test_a_place_that_many_photographs_show_takes_no_more_memory(monkeypatch):
     photographs = [dense._Cells(np.sort(rng.permutation(300)[:100]), rng.normal(size=(100, 8))) for _ in range(shown)]
     at_once = dense._Cells.together(photographs)
     held, of = list[int](), dense._Cells.of
-    monkeypatch.setattr(dense, "WAITING", 150)
     monkeypatch.setattr(dense._Cells, "of", lambda keys, values: held.append(len(keys)) or of(keys, values))
-    found = dense._summed(iter(photographs))
+    found = dense._summed(iter(photographs), most_waiting=150)
     assert max(held) <= 300 + 300 + 100
     assert np.array_equal(found.keys, at_once.keys)
     assert np.array_equal(found.sums, at_once.sums)

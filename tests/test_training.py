@@ -9,56 +9,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from checkerboard import Photographs
+from training_support import BLACK, CONFIG, bits, run, stage, start
 from vdgs.errors import TrainingDiverged, VdgsError
 from vdgs.kernels import native
 from vdgs.kernels.native.module import set_threads, threads
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
-from vdgs.model.decoder import Decoder
 from vdgs.model.render import render
 from vdgs.model.start import initial_anchors
-from vdgs.settings.method import AnchorConfig, GrowthConfig, RateConfig, TrainConfig
+from vdgs.settings.method import AnchorConfig, RateConfig
 from vdgs.storage.checkpoints import load_newest, save_state
-from vdgs.training import Stage, downscale_at, from_saved, start_state, to_saved, train, train_step, view_at
+from vdgs.training import downscale_at, from_saved, to_saved, train_step, view_at
 from vdgs.training.crops import Crop, crop_at
 from vdgs.training.optimiser import rates_at
 from vdgs.training.step import coast_anchors
 
 pytestmark = pytest.mark.xdist_group("training")
-
-BLACK = (0.0, 0.0, 0.0)
-CONFIG = TrainConfig(
-    iterations=60,
-    resolutions=((0.0, 2), (0.5, 1)),
-    anchors=AnchorConfig(offsets=4, appearance=3),
-    growth=GrowthConfig(interval=10, statistics_from=5, start=20, until=0.9, threshold=1e-6, gate=0.05),
-)
-
-
-def stage(config: TrainConfig = CONFIG) -> Stage:
-    return Stage(config=config, images=Photographs(), image_count=8, voxel=0.4, camera_height=5.0)
-
-
-def start(config: TrainConfig = CONFIG):
-    rng = np.random.default_rng(0)
-    points = np.concatenate([rng.uniform(-4, 4, (300, 2)), np.zeros((300, 1))], axis=1)
-    anchors, _ = initial_anchors(
-        points, np.full((300, 3), 128, np.uint8), Photographs().cameras, replace(config.anchors, voxel=0.4)
-    )
-    generator = torch.Generator().manual_seed(config.seed)
-    decoder = Decoder.initial(config.anchors.offsets, False, config.anchors.appearance, 8, generator)
-    return start_state(anchors, decoder, stage(config))
-
-
-def run(state, stage_, until: int | None = None):
-    train(
-        state, stage_,
-        stop=lambda: until is not None and state.iteration >= until, after_step=lambda *_: None,
-    )  # fmt: skip
-    return state
-
-
-def bits(state) -> dict[str, bytes]:
-    return {name: tensor.numpy().tobytes() for name, tensor in to_saved(state).tensors.items()}
 
 
 @pytest.fixture(scope="module")

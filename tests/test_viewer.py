@@ -39,6 +39,8 @@ from vdgs.viewer.places import place_at, position_at, thumbnail
 from vdgs.viewer.scene import Scene
 from vdgs.viewer.thinning import Levels
 
+pytestmark = pytest.mark.xdist_group("viewer_scene")
+
 PLACE = (46.95, 7.44, 560.0)
 
 

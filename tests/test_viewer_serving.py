@@ -10,12 +10,10 @@ import signal
 import socket
 import subprocess
 import sys
-from itertools import combinations
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
-import cv2
 import numpy as np
 import pytest
 from rich.console import Console
@@ -24,14 +22,11 @@ pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[v
 
 import viser
 
-from captures_support import tiny_scene, write_colmap
 from cli_support import vdgs, wait_until
 from vdgs.cameras import Camera
 from vdgs.errors import RunError, VdgsError
-from vdgs.evaluation.metrics import to_8bit
 from vdgs.films.path_files import load_path
 from vdgs.films.paths import look_at
-from vdgs.model.render import render
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_run
 from vdgs.viewer import navigation
@@ -39,27 +34,18 @@ from vdgs.viewer.following import newest, open_or_last_saved, standing_lines
 from vdgs.viewer.layers import Painter
 from vdgs.viewer.path_panel import PathPanel
 from vdgs.viewer.place_panel import PlacePanel
-from vdgs.viewer.serving import Viewer, free_port, serve
+from vdgs.viewer.serving import free_port, serve
 from vdgs.viewer.studio import KEPT, Seat
-from vdgs.viewer.visitor import NAMES, Visitor
-from viewer_support import Guest, browser, open_page
+from vdgs.viewer.visitor import Visitor
+from viewer_support import Guest, expected, quiet, trained
 
 pytestmark = pytest.mark.xdist_group("viewer")
-#: Viser's threads end after its sockets.
-quiet = pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning", "ignore::ResourceWarning")
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """A run of a textured plane whose coarse stage is done."""
-    folder = tmp_path_factory.mktemp("view")
-    write_colmap(folder / "capture", tiny_scene())
-    done = vdgs(
-        "coarse", folder / "capture", "--output", folder / "run", "--preset", "laptop", "--iterations", "60",
-        "--save-every", "20", "--up", "z",
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return folder / "run"
+    return trained(tmp_path_factory.mktemp("view"))
 
 
 @pytest.fixture(scope="module")
@@ -79,10 +65,6 @@ def above(x: float = 0.0, y: float = 0.0, width: int = 320, height: int = 240) -
     focal = 0.5 * height / math.tan(math.radians(25))
     pose = look_at(np.array([x, y - 2.0, 9.0]), np.array([x, y, 0.0]))
     return Camera(camera_from_world=pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height)
-
-
-def expected(viewer: Viewer, camera: Camera) -> np.ndarray:
-    return to_8bit(render(viewer.scene.run.model, camera).image.numpy())
 
 
 @quiet
@@ -391,85 +373,3 @@ def test_blocks_that_train_are_shown_with_what_they_have(run, tmp_path):
         assert "1 of 2 blocks" in shown.caution
         assert len(shown.model.anchors) > 0
         assert "**block 1**" in standing_lines(RunFolder(cut))
-
-
-# ------------------------------------------------------------------------------------- a real browser
-
-#: Width and height of the browser's window.
-WINDOW = 1000, 700
-
-
-def in_window(visitor: Visitor) -> Camera | None:
-    """Where a visitor stands, with the pixels of the whole window: a browser that is short of time asks for fewer,
-    and shows them as large. None until it has laid out its window."""
-    camera = visitor.camera
-    if camera is None or camera.width / camera.height != pytest.approx(WINDOW[0] / WINDOW[1], rel=0.01):
-        return None
-    return camera.resized(*WINDOW)
-
-
-def beside_the_panel(picture: np.ndarray) -> np.ndarray:
-    """That part of a picture of the window, at a quarter of its size, where fewer pixels look the same."""
-    return cv2.resize(picture[250:650, 40:600], None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(int)
-
-
-@quiet
-@pytest.mark.skipif(browser() is None, reason="no Chromium on this machine (apt-get install chromium)")
-def test_a_browser_shows_the_scene(viewer):
-    wait_until(lambda: not viewer.visitors)
-    with open_page(viewer.door.address(), *WINDOW) as page:
-        wait_until(lambda: viewer.visitors)
-        (visitor,) = viewer.visitors.values()
-        wait_until(lambda: in_window(visitor))
-
-        def differs() -> float:
-            """From what the model shows from there."""
-            seen, meant = page.screenshot(), expected(viewer, in_window(visitor))
-            return float(np.abs(beside_the_panel(seen) - beside_the_panel(meant)).mean())
-
-        wait_until(lambda: differs() < 6)
-        camera = in_window(visitor)
-        assert camera is not None
-        page.click(340.0, 440.0)
-        wait_until(lambda: "ground frame" in visitor.place._words.content)
-        place = visitor.place._place
-        assert place is not None
-        assert camera.project(place.position[None])[0][0] == pytest.approx((340.0, 440.0), abs=1.0)
-        page.drag((340.0, 440.0), (430.0, 400.0))
-        wait_until(lambda: not np.allclose(visitor.camera.position, camera.position))
-        wait_until(lambda: differs() < 8)  # the mark of the place is in it now
-
-
-@quiet
-@pytest.mark.skipif(browser() is None, reason="no Chromium on this machine (apt-get install chromium)")
-def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
-    wait_until(lambda: not viewer.visitors)
-    with open_page(viewer.door.address(), *WINDOW) as page:
-        wait_until(lambda: viewer.visitors)
-        (visitor,) = viewer.visitors.values()
-        wait_until(lambda: in_window(visitor))
-
-        def painted() -> np.ndarray:
-            """What the visitor should see now."""
-            camera = in_window(visitor)
-            return beside_the_panel(visitor.errand(lambda: visitor.painter.paint(visitor.shown, camera, camera)))
-
-        def seen() -> np.ndarray:
-            return beside_the_panel(page.screenshot())
-
-        shown = {}
-        for name in NAMES:
-            visitor._layer.value = name
-            wait_until(lambda name=name: visitor.shown.layer == NAMES[name])
-            wait_until(lambda: np.abs(seen() - painted()).mean() < 6)
-            shown[name] = seen()
-        for one, other in combinations(shown, 2):
-            assert np.abs(shown[one] - shown[other]).mean() > 3, (one, other)
-        visitor._layer.value = "Colour"
-        for name, looks in (("From above", (0, 0, -1)), ("All", (0, 0.71, -0.71))):
-            wait_until(lambda name=name: page.press(name))
-            wait_until(lambda looks=looks: visitor.camera.forward == pytest.approx(looks, abs=0.02))
-            up = -visitor.camera.camera_from_world[1, :3]
-            assert up[1] > 0.7  # north is up
-            assert abs(up[0]) < 0.01
-            wait_until(lambda: np.abs(seen() - painted()).mean() < 6)

@@ -18,16 +18,39 @@ from urllib.request import urlopen
 import cv2
 import msgspec
 import numpy as np
+import pytest
 import viser
 import zstandard
 from scipy.spatial.transform import Rotation
 from websockets.sync.client import ClientConnection, connect
 
+from captures_support import tiny_scene, write_colmap
+from cli_support import vdgs
 from vdgs.cameras import Camera
+from vdgs.evaluation.metrics import to_8bit
+from vdgs.model.render import render
+from vdgs.viewer.serving import Viewer
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 #: A busy machine may need long; nothing waits so long where all is well.
 PATIENCE = 60.0
+#: Viser's threads end after its sockets.
+quiet = pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning", "ignore::ResourceWarning")
+
+
+def trained(folder: Path) -> Path:
+    """A run of a textured plane whose coarse stage is done."""
+    write_colmap(folder / "capture", tiny_scene())
+    done = vdgs(
+        "coarse", folder / "capture", "--output", folder / "run", "--preset", "laptop", "--iterations", "60",
+        "--save-every", "20", "--up", "z",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return folder / "run"
+
+
+def expected(viewer: Viewer, camera: Camera) -> np.ndarray:
+    return to_8bit(render(viewer.scene.run.model, camera).image.numpy())
 
 
 class Guest:
@@ -232,3 +255,6 @@ def _port_of(file: Path, process: subprocess.Popen[bytes]) -> int:
             return int(file.read_text().split()[0])
         time.sleep(0.05)
     raise AssertionError("the browser does not listen")
+
+
+needs_browser = pytest.mark.skipif(browser() is None, reason="no Chromium on this machine (apt-get install chromium)")

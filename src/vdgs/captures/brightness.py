@@ -90,13 +90,16 @@ class PointColours:
         return gains
 
 
-def point_colours(images: ImageCache, tell: Callable[[int, int], None]) -> PointColours | None:
+def point_colours(
+    images: ImageCache, tell: Callable[[int, int], None], most_images: int = AT_MOST
+) -> PointColours | None:
     """What photographs show of the points that several of them show; None where these are too few to compare any: not
     every capture says which photograph shows which point.
 
+    At most `most_images` photographs, spread over all, are looked at.
     `tell(done, of)` is called before each photograph is looked at, and may raise. Raises what reading them does.
     """
-    chosen = np.unique(np.linspace(0, len(images.views) - 1, min(len(images.views), AT_MOST)).astype(int)).tolist()
+    chosen = np.unique(np.linspace(0, len(images.views) - 1, min(len(images.views), most_images)).astype(int)).tolist()
     shows = [index for index in chosen if images.views[index].sightings is not None]
     factor, found = _factor(images), []
     for done, index in enumerate(shows):

@@ -85,15 +85,15 @@ def pinhole_for(intrinsics: Intrinsics) -> Intrinsics:
     return Intrinsics("PINHOLE", (*focal, *centre), camera.width, camera.height)
 
 
-def sampling_map(distorted: Intrinsics, pinhole: Intrinsics) -> np.ndarray:
+def sampling_map(distorted: Intrinsics, pinhole: Intrinsics, strip_px: int = STRIP_PX) -> np.ndarray:
     """Where each pixel of the pinhole picture lies in the distorted one, [h, w, 2] float32.
 
-    In OpenCV's convention: pixel centres are at 0.5 here and at 0 in `cv2.remap`. Made a few rows at a time: all at
-    once would take eight times the memory of the map.
+    In OpenCV's convention: pixel centres are at 0.5 here and at 0 in `cv2.remap`. Made `strip_px` pixels at a
+    time: all at once would take eight times the memory of the map.
     """
     (fx, fy), (cx, cy) = pinhole.focal, pinhole.principal_point
     x = (np.arange(pinhole.width) + 0.5 - cx) / fx
-    lens, rows = _colmap(distorted), max(1, STRIP_PX // pinhole.width)
+    lens, rows = _colmap(distorted), max(1, strip_px // pinhole.width)
     found = np.empty((pinhole.height, pinhole.width, 2), np.float32)
     for first in range(0, pinhole.height, rows):
         y = (np.arange(first, min(first + rows, pinhole.height)) + 0.5 - cy) / fy

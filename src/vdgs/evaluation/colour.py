@@ -38,16 +38,17 @@ def correct_colours(
     reference: np.ndarray,
     mask: Bool[np.ndarray, "h w"] | None = None,
     rounds: int = ROUNDS,
+    chunk: int = CHUNK,
 ) -> ColourCorrection:
     """Warp the colours of `image` [h, w, 3] towards those of `reference`, both uint8 or floats in [0, 1].
 
     Each round regresses every channel of the reference on the features of the current estimate, over
     the pixels whose value in that channel is unsaturated in the input, in the current estimate and in
     the reference, because the set of saturated pixels moves with the colours. `mask` restricts the fit,
-    not the image that comes back. With fewer than `MIN_PIXELS` usable pixels in any channel of any
-    round the image comes back unchanged, `fitted` false.
+    not the image that comes back. The features of `chunk` pixels are held at a time. With fewer than
+    `MIN_PIXELS` usable pixels in any channel of any round the image comes back unchanged, `fitted` false.
     """
-    return _corrected(image, reference, mask, rounds, _quadratic)
+    return _corrected(image, reference, mask, rounds, _quadratic, chunk)
 
 
 def correct_colours_affinely(
@@ -61,18 +62,23 @@ Features = Callable[[Float[np.ndarray, "3 n"]], np.ndarray]
 
 
 def _corrected(
-    image: np.ndarray, reference: np.ndarray, mask: Bool[np.ndarray, "h w"] | None, rounds: int, features: Features
+    image: np.ndarray,
+    reference: np.ndarray,
+    mask: Bool[np.ndarray, "h w"] | None,
+    rounds: int,
+    features: Features,
+    chunk: int = CHUNK,
 ) -> ColourCorrection:
     start, target = _planes(image), _planes(reference)
     kept = True if mask is None else mask.reshape(1, -1)
     usable = kept & _unsaturated(start) & _unsaturated(target)
     current, fitted = start, True
     for _ in range(rounds):
-        coefficients = _fit(current, target, usable & _unsaturated(current), features)
+        coefficients = _fit(current, target, usable & _unsaturated(current), features, chunk)
         if coefficients is None:
             current, fitted = start, False
             break
-        warped = [np.clip(coefficients @ features(current[:, at]), 0.0, 1.0) for at in _chunks(current)]
+        warped = [np.clip(coefficients @ features(current[:, at]), 0.0, 1.0) for at in _chunks(current, chunk)]
         current = np.concatenate(warped, axis=1)
     return ColourCorrection(np.ascontiguousarray(current.T).reshape(image.shape), fitted)
 
@@ -82,13 +88,14 @@ def _fit(
     target: Float[np.ndarray, "3 n"],
     usable: Bool[np.ndarray, "3 n"],
     features_of: Features,
+    chunk: int,
 ) -> Float[np.ndarray, "3 f"] | None:
     """Least squares per channel from its own usable pixels, through the normal equations."""
     if usable.sum(axis=1).min() < MIN_PIXELS:
         return None
     count = len(features_of(current[:, :1]))
     gram, moment = np.zeros((3, count, count)), np.zeros((3, count))
-    for at in _chunks(current):
+    for at in _chunks(current, chunk):
         features = features_of(current[:, at])
         for channel in range(3):
             counted = features * usable[channel, at]
@@ -118,5 +125,5 @@ def _planes(image: np.ndarray) -> Float[np.ndarray, "3 n"]:
     return planes / 255.0 if image.dtype == np.uint8 else planes
 
 
-def _chunks(planes: Float[np.ndarray, "3 n"]) -> list[slice]:
-    return [slice(start, start + CHUNK) for start in range(0, planes.shape[1], CHUNK)]
+def _chunks(planes: Float[np.ndarray, "3 n"], chunk: int) -> list[slice]:
+    return [slice(start, start + chunk) for start in range(0, planes.shape[1], chunk)]

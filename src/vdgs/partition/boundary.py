@@ -188,12 +188,14 @@ def _outline(points: Float[np.ndarray, "m 2"], cell: float) -> shapely.Polygon:
     return largest_part(shape.simplify(cell / 4))
 
 
-def _first_of_cells(points: Float[np.ndarray, "m 2"], edge: float) -> Int64[np.ndarray, " c"]:
+def _first_of_cells(
+    points: Float[np.ndarray, "m 2"], edge: float, most_flags: int = MOST_FLAGS
+) -> Int64[np.ndarray, " c"]:
     """The first point in each cell of a grid, ascending."""
     cells = np.floor(points / edge).astype(np.int64)
     cells -= cells.min(axis=0)
     across, along = (int(size) for size in cells.max(axis=0) + 1)
-    if across * along > MOST_FLAGS:
+    if across * along > most_flags:
         return np.sort(np.unique(cells, axis=0, return_index=True)[1])
     # Of indices that are written twice the last one stays: written backwards, the first.
     first = np.full(across * along, -1, np.int64)

@@ -217,13 +217,13 @@ def _told_by(
     return inside.reshape(places.shape[:2]), agrees.reshape(places.shape[:2])
 
 
-def _summed(photographs: Iterable[_Cells]) -> _Cells:
-    """The cells of all photographs. Those that wait to be added are at most as many as there are, or `WAITING`: the
-    time is that of one sum of all, and so are the bits, for each cell is summed in the order of the photographs."""
+def _summed(photographs: Iterable[_Cells], most_waiting: int = WAITING) -> _Cells:
+    """The cells of all photographs. Those that wait to be added are at most as many as there are, or `most_waiting`:
+    the time is that of one sum of all, and so are the bits, for each cell is summed in the order of the photographs."""
     total, waiting = _Cells(np.zeros(0, np.int64), np.zeros((0, 8))), list[_Cells]()
     for each in photographs:
         waiting.append(each)
-        if sum(len(some.keys) for some in waiting) > max(WAITING, len(total.keys)):
+        if sum(len(some.keys) for some in waiting) > max(most_waiting, len(total.keys)):
             total, waiting = _Cells.together([total, *waiting]), []
     return _Cells.together([total, *waiting])
 

@@ -33,11 +33,12 @@ def decode_backward_adam(
     updates: Int32[Tensor, "n"],
     *,
     program: Program = PROGRAM,
+    piece: int = PIECE,
 ) -> tuple[Finite, tuple[Tensor, ...] | None]:
     """As `reference.decode_adam.decode_backward_adam`, for float32 tensors on a CUDA device.
 
     Gradients of anchors are never held: a warp takes an anchor from its splats to its new place. Those of the decoder
-    are matrix products (by torch) of what each anchor adds, some 1.4 kB, for `PIECE` anchors at a time: 22 MB, which
+    are matrix products (by torch) of what each anchor adds, some 1.4 kB, for `piece` anchors at a time: 22 MB, which
     the caches of large cards hold; where nobody wants them, nothing. Nothing waits for the device, and whether all was
     finite stays there: an anchor for which it is not does not move. Of gradients by depth the kernel knows nothing:
     with them, torch does it all. All of `moved` anneal alike (`AdamState.early`). Raises ValueError or TypeError for
@@ -68,9 +69,9 @@ def decode_backward_adam(
     ]  # fmt: skip
     wanted = any(t.requires_grad for t in weights.tensors())
     of_weights = [torch.zeros_like(t) for t in weights.tensors()] if wanted else None
-    piece = PIECE if wanted else max(v, 1)
-    for first in range(0, v, piece):
-        count = min(piece, v - first)
+    at_once = piece if wanted else max(v, 1)
+    for first in range(0, v, at_once):
+        count = min(at_once, v - first)
         made = _Made.empty(count, k, inputs, positions) if wanted else None
         program.launch(
             "move_anchors", (-(-count // ANCHORS_OF_A_BLOCK),), (32 * ANCHORS_OF_A_BLOCK,), *before,
