@@ -48,7 +48,7 @@ def test_a_browser_without_network_draws_what_we_draw(tmp_path):
     registry.write(tmp_path / "scene.html", replace(Scene.of(gaussians), page=page))
     pose = look_at(np.array(page.position), np.array(page.target))
     focal = 0.5 * 480 / np.tan(np.radians(25))
-    camera = Camera(pose, focal, focal, 320.0, 240.0, 640, 480)
+    camera = Camera(camera_from_world=pose, fx=focal, fy=focal, cx=320.0, cy=240.0, width=640, height=480)
     with torch.no_grad():
         expected = draw_gaussians(gaussians, camera, torch.tensor(background), 0)[0].image.clamp(0, 1).numpy()
     part = slice(60, 440), slice(320, 580)  # beside what the client says of software rendering

@@ -25,7 +25,7 @@ CONFIG = TrainConfig(
 
 
 def stage(config: TrainConfig = CONFIG) -> Stage:
-    return Stage(config, Photographs(), 8, 0.4, 5.0)
+    return Stage(config=config, images=Photographs(), image_count=8, voxel=0.4, camera_height=5.0)
 
 
 def start(config: TrainConfig = CONFIG):
