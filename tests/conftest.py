@@ -24,12 +24,12 @@ import pytest
 from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
-import typecheck
-from package_files import files_with_shapes, module_name
+from support import typecheck
+from support.package_files import files_with_shapes, module_name
 
 if TYPE_CHECKING:
-    from sfm_support import Flight
-    from small_pipeline import NativeRun
+    from support.flights import Flight
+    from support.small_pipeline import NativeRun
 
 #: Memory is what limits their number on machines of many cores (about 1 GB each).
 MOST_WORKERS = 4
@@ -63,7 +63,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 @pytest.fixture(scope="session")
 def compiled_code(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where CUDA kernels that tests compile are kept, so that NVRTC runs once for all workers (that what is kept is
-    never wrong: test_cuda_compiling.py)."""
+    never wrong: kernels/test_cuda_compiling.py)."""
     own = tmp_path_factory.getbasetemp()
     folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "compiled"
     folder.mkdir(exist_ok=True)
@@ -82,9 +82,9 @@ def compiled_once(compiled_code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def uncut(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with a coarse model of fifteen photographs, and five others to test with. Not to be changed: others copy
     it (`cluster_support.copy_run`)."""
-    from captures_support import tiny_scene, write_colmap
-    from cli_support import vdgs
-    from cluster_support import COARSE
+    from support.captures import tiny_scene, write_colmap
+    from support.clusters import COARSE
+    from support.commands import vdgs
 
     folder = tmp_path_factory.mktemp("uncut")
     write_colmap(folder / "capture", tiny_scene(columns=5, rows=4))
@@ -96,7 +96,7 @@ def uncut(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def native_small(tmp_path_factory: pytest.TempPathFactory) -> NativeRun:
     """A whole run of six photographs by the native operations. Not to be changed."""
-    from small_pipeline import native_run
+    from support.small_pipeline import native_run
 
     return native_run(tmp_path_factory.mktemp("native"))
 
@@ -104,7 +104,7 @@ def native_small(tmp_path_factory: pytest.TempPathFactory) -> NativeRun:
 @pytest.fixture(scope="session")
 def nine(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     """Nine photographs of a flight. Not to be changed."""
-    from sfm_support import fly, grid
+    from support.flights import fly, grid
 
     return fly(tmp_path_factory.mktemp("nine") / "card", grid(3, 3, 9.0))
 
@@ -112,7 +112,7 @@ def nine(tmp_path_factory: pytest.TempPathFactory) -> Flight:
 @pytest.fixture(scope="session")
 def nine_begun(nine: Flight, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """What the folder of their capture holds when each step begins. Not to be changed: `sfm_support.copy_folder`."""
-    from sfm_support import folders_of_steps
+    from support.flights import folders_of_steps
 
     return folders_of_steps(nine, tmp_path_factory.mktemp("begun"))
 

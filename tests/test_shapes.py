@@ -11,7 +11,7 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from package_files import checked_files, files_with_shapes, module_name
+from support.package_files import checked_files, files_with_shapes, module_name
 from vdgs.captures.heights import reach
 from vdgs.evaluation.metrics import squared_error
 from vdgs.kernels import native, reference, rotations

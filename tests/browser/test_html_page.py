@@ -1,0 +1,62 @@
+"""What a real browser draws from a page that shows a scene offline."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[viewer]')")
+
+from support.commands import wait_until
+from support.gaussians import psnr
+from support.viewer import needs_browser, open_page
+from vdgs.cameras import Camera
+from vdgs.export.formats import registry
+from vdgs.export.formats.scene import Page, Scene
+from vdgs.films.paths import look_at
+from vdgs.kernels.spherical_harmonics import dc_of_colours
+from vdgs.model.gaussians import Gaussians, draw_gaussians
+
+pytestmark = [pytest.mark.browser, needs_browser, pytest.mark.xdist_group("viewer")]
+
+
+def two_floors() -> Gaussians:
+    """A chequered floor, and a red roof above its north-east quarter that comes first in the file: what does not sort
+    draws the floor over it. A white post in the west stands upright."""
+    x, y = (grid.ravel() for grid in np.meshgrid(np.arange(-4, 4, 0.25) + 0.125, np.arange(-4, 4, 0.25) + 0.125))
+    floor = np.stack([x, y, 0 * x], 1)
+    chequered = (np.floor(x / 2) + np.floor(y / 2)) % 2
+    paint = np.where(chequered[:, None] > 0, [0.1, 0.2, 0.9], [0.1, 0.7, 0.2])
+    above = floor[(x > 0) & (y > 0)] + [0, 0, 1.5]
+    post = np.stack([np.full(12, -2.0), np.full(12, -1.0), np.linspace(0, 2, 12)], 1)
+    means = np.concatenate([above, floor, post]).astype(np.float32)
+    colours = np.concatenate([np.full(above.shape, [0.9, 0.1, 0.1]), paint, np.full(post.shape, 0.95)])
+    count = len(means)
+    return Gaussians(
+        means=torch.from_numpy(means), log_scales=torch.tensor([0.13, 0.13, 0.02]).log().repeat(count, 1),
+        quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(count, 1), logits=torch.full((count,), 5.0),
+        dc=dc_of_colours(torch.from_numpy(colours.astype(np.float32))), rest=torch.zeros(count, 0, 3),
+    )  # fmt: skip
+
+
+def test_a_browser_without_network_draws_what_we_draw(tmp_path):
+    gaussians, background = two_floors(), (0.8, 0.75, 0.5)
+    page = Page((-1.0, -8.0, 6.0), (0.0, 0.0, 0.0), background, "two floors")
+    registry.write(tmp_path / "scene.html", replace(Scene.of(gaussians), page=page))
+    pose = look_at(np.array(page.position), np.array(page.target))
+    focal = 0.5 * 480 / np.tan(np.radians(25))
+    camera = Camera(camera_from_world=pose, fx=focal, fy=focal, cx=320.0, cy=240.0, width=640, height=480)
+    with torch.no_grad():
+        expected = draw_gaussians(gaussians, camera, torch.tensor(background), 0)[0].image.clamp(0, 1).numpy()
+    part = slice(60, 440), slice(320, 580)  # beside what the client says of software rendering
+    with open_page((tmp_path / "scene.html").as_uri(), 640, 480, offline=True) as shown:
+
+        def likeness() -> float:
+            return psnr(shown.screenshot()[part] / 255.0, expected[part])
+
+        wait_until(lambda: likeness() > 26)
+        assert shown.evaluate("document.title") == "two floors"
+        assert shown.evaluate("performance.getEntriesByType('resource').filter(e => /^http/.test(e.name)).length") == 0

@@ -1,0 +1,114 @@
+"""`vdgs view` in a real browser."""
+
+from __future__ import annotations
+
+import sys
+from itertools import combinations
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+
+pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[viewer]')")
+
+
+from support.commands import wait_until
+from support.viewer import expected, needs_browser, open_page, quiet, trained
+from vdgs.cameras import Camera
+from vdgs.runs.opening import open_run
+from vdgs.viewer.serving import serve
+from vdgs.viewer.visitor import NAMES, Visitor
+
+pytestmark = [pytest.mark.browser, needs_browser, pytest.mark.xdist_group("viewer")]
+
+
+#: Width and height of the browser's window.
+WINDOW = 1000, 700
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A run of a textured plane whose coarse stage is done."""
+    return trained(tmp_path_factory.mktemp("view"))
+
+
+@pytest.fixture(scope="module")
+def viewer(run):
+    with serve(open_run(run), "127.0.0.1", None, Console(file=sys.stderr)) as opened:
+        yield opened
+
+
+def in_window(visitor: Visitor) -> Camera | None:
+    """Where a visitor stands, with the pixels of the whole window: a browser that is short of time asks for fewer,
+    and shows them as large. None until it has laid out its window."""
+    camera = visitor.camera
+    if camera is None or camera.width / camera.height != pytest.approx(WINDOW[0] / WINDOW[1], rel=0.01):
+        return None
+    return camera.resized(*WINDOW)
+
+
+def beside_the_panel(picture: np.ndarray) -> np.ndarray:
+    """That part of a picture of the window, at a quarter of its size, where fewer pixels look the same."""
+    return cv2.resize(picture[250:650, 40:600], None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA).astype(int)
+
+
+@quiet
+def test_a_browser_shows_the_scene(viewer):
+    wait_until(lambda: not viewer.visitors)
+    with open_page(viewer.door.address(), *WINDOW) as page:
+        wait_until(lambda: viewer.visitors)
+        (visitor,) = viewer.visitors.values()
+        wait_until(lambda: in_window(visitor))
+
+        def differs() -> float:
+            """From what the model shows from there."""
+            seen, meant = page.screenshot(), expected(viewer, in_window(visitor))
+            return float(np.abs(beside_the_panel(seen) - beside_the_panel(meant)).mean())
+
+        wait_until(lambda: differs() < 6)
+        camera = in_window(visitor)
+        assert camera is not None
+        page.click(340.0, 440.0)
+        wait_until(lambda: "ground frame" in visitor.place._words.content)
+        place = visitor.place._place
+        assert place is not None
+        assert camera.project(place.position[None])[0][0] == pytest.approx((340.0, 440.0), abs=1.0)
+        page.drag((340.0, 440.0), (430.0, 400.0))
+        wait_until(lambda: not np.allclose(visitor.camera.position, camera.position))
+        wait_until(lambda: differs() < 8)  # the mark of the place is in it now
+
+
+@quiet
+def test_a_browser_shows_every_layer_and_goes_where_buttons_lead(viewer):
+    wait_until(lambda: not viewer.visitors)
+    with open_page(viewer.door.address(), *WINDOW) as page:
+        wait_until(lambda: viewer.visitors)
+        (visitor,) = viewer.visitors.values()
+        wait_until(lambda: in_window(visitor))
+
+        def painted() -> np.ndarray:
+            """What the visitor should see now."""
+            camera = in_window(visitor)
+            return beside_the_panel(visitor.errand(lambda: visitor.painter.paint(visitor.shown, camera, camera)))
+
+        def seen() -> np.ndarray:
+            return beside_the_panel(page.screenshot())
+
+        shown = {}
+        for name in NAMES:
+            visitor._layer.value = name
+            wait_until(lambda name=name: visitor.shown.layer == NAMES[name])
+            wait_until(lambda: np.abs(seen() - painted()).mean() < 6)
+            shown[name] = seen()
+        for one, other in combinations(shown, 2):
+            assert np.abs(shown[one] - shown[other]).mean() > 3, (one, other)
+        visitor._layer.value = "Colour"
+        for name, looks in (("From above", (0, 0, -1)), ("All", (0, 0.71, -0.71))):
+            wait_until(lambda name=name: page.press(name))
+            wait_until(lambda looks=looks: visitor.camera.forward == pytest.approx(looks, abs=0.02))
+            up = -visitor.camera.camera_from_world[1, :3]
+            assert up[1] > 0.7  # north is up
+            assert abs(up[0]) < 0.01
+            wait_until(lambda: np.abs(seen() - painted()).mean() < 6)

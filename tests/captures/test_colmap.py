@@ -1,0 +1,188 @@
+"""COLMAP models: what we read is what was written, and damage ends in a message."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from support.captures import TinyScene, data_folder, tiny_scene, write_colmap
+from vdgs.captures.formats.colmap import read_colmap
+from vdgs.captures.formats.source import CAMERA_MODELS
+from vdgs.captures.loading import load_capture
+from vdgs.errors import CaptureError
+from vdgs.settings.capture import CaptureOptions
+
+FUZZ = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def assert_same(model, scene: TinyScene) -> None:
+    assert [view.name for view in model.views] == list(scene.cameras)
+    for view, camera in zip(model.views, scene.cameras.values(), strict=True):
+        np.testing.assert_allclose(view.camera_from_world, camera.camera_from_world, atol=1e-12)
+        assert view.intrinsics.focal == (camera.fx, camera.fy)
+        assert view.intrinsics.principal_point == (camera.cx, camera.cy)
+    np.testing.assert_array_equal(model.points, scene.points)
+    np.testing.assert_array_equal(model.colours, scene.colours)
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize(("model", "extra"), [("PINHOLE", ()), ("SIMPLE_PINHOLE", ()), ("SIMPLE_RADIAL", (0.0,))])
+def test_reading_is_the_inverse_of_writing(tmp_path, text, model, extra):
+    scene = tiny_scene()
+    folder = write_colmap(tmp_path, scene, text=text, model=model, extra=extra, images=None)
+    assert_same(read_colmap(folder), scene)
+
+
+def test_pycolmap_reads_the_same_from_our_files(tmp_path):
+    scene = tiny_scene(points=20)
+    folder = write_colmap(tmp_path, scene, images=None)
+    model, theirs = read_colmap(folder), pycolmap.Reconstruction(str(folder))
+    poses = {image.name: image.cam_from_world().matrix() for image in theirs.images.values()}
+    for view in model.views:
+        np.testing.assert_allclose(view.camera_from_world[:3], poses[view.name], atol=1e-12)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_models_written_by_pycolmap_are_read(tmp_path, text):
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 6
+    options.num_points3D = 50
+    theirs = pycolmap.synthesize_dataset(options)
+    (theirs.write_text if text else theirs.write_binary)(str(tmp_path))
+    model = read_colmap(tmp_path)
+    poses = {image.name: image.cam_from_world().matrix() for image in theirs.images.values()}
+    assert {view.name for view in model.views} == set(poses)
+    for view in model.views:
+        np.testing.assert_allclose(view.camera_from_world[:3], poses[view.name], atol=1e-9)
+    points = np.array([point.xyz for point in theirs.points3D.values()])
+    np.testing.assert_allclose(np.sort(model.points, axis=0), np.sort(points, axis=0), atol=1e-9)
+
+
+def test_camera_models_agree_with_pycolmap():
+    for identifier, (name, parameters) in CAMERA_MODELS.items():
+        camera = pycolmap.Camera.create_from_model_name(1, name, 100.0, 200, 100)
+        assert int(camera.model) == identifier
+        assert len(camera.params) == parameters
+
+
+def test_binary_wins_over_text_and_names_may_hold_spaces_and_folders(tmp_path):
+    scene = tiny_scene(columns=2, rows=1)
+    renamed = TinyScene(
+        dict(zip(["a/first flight.png", "b/2.png"], scene.cameras.values(), strict=True)),
+        scene.points,
+        scene.colours,
+    )
+    for text in (True, False):
+        folder = write_colmap(tmp_path / str(text), renamed, text=text)
+        assert [view.name for view in read_colmap(folder).views] == ["a/first flight.png", "b/2.png"]
+        capture = load_capture(tmp_path / str(text), CaptureOptions(up="z"))
+        assert capture.views[0].image_path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "name", ["../up.png", "/etc/passwd", "a/../../b.png", "C:\\x.png", "..\\x.png", "", "a\nb.png"]
+)
+def test_names_that_leave_the_image_folder_are_refused(tmp_path, name):
+    scene = tiny_scene(columns=1, rows=1)
+    bad = TinyScene({name: next(iter(scene.cameras.values()))}, scene.points, scene.colours)
+    folder = write_colmap(tmp_path, bad, images=None)
+    with pytest.raises(CaptureError, match="inside the image folder"):
+        read_colmap(folder)
+
+
+def patched(file: Path, offset: int, data: bytes) -> None:
+    content = bytearray(file.read_bytes())
+    content[offset : offset + len(data)] = data
+    file.write_bytes(bytes(content))
+
+
+@pytest.mark.parametrize(
+    ("file", "offset", "data", "message"),
+    [
+        ("cameras.bin", 0, struct.pack("<Q", 1 << 60), "announced"),
+        ("images.bin", 0, struct.pack("<Q", 1 << 60), "announced"),
+        ("points3D.bin", 0, struct.pack("<Q", 1 << 60), "announced"),
+        ("cameras.bin", 12, struct.pack("<i", 77), "model number 77"),
+        ("cameras.bin", 16, struct.pack("<Q", 0), "image size of 0x48"),
+        ("cameras.bin", 16, struct.pack("<Q", 200_000), "image size of 200000x48"),
+        ("cameras.bin", 32, struct.pack("<d", -50.0), "focal length"),
+        ("cameras.bin", 32, struct.pack("<d", float("nan")), "not numbers"),
+        ("cameras.bin", 48, struct.pack("<d", 1e9), "principal point"),
+        ("images.bin", 12, struct.pack("<d", 3.0), "unit quaternion"),
+        ("images.bin", 12, struct.pack("<d", float("nan")), "unit quaternion"),
+        ("images.bin", 44, struct.pack("<d", float("inf")), "finite"),
+        ("images.bin", 68, struct.pack("<I", 99), "name a camera that is not"),
+        ("points3D.bin", 51, struct.pack("<Q", 1 << 61), "past the end"),
+    ],
+)
+def test_silly_values_are_named(tmp_path, file, offset, data, message):
+    folder = write_colmap(tmp_path, tiny_scene(), images=None)
+    patched(folder / file, offset, data)
+    with pytest.raises(CaptureError, match=message) as caught:
+        read_colmap(folder)
+    assert file.split(".")[0] in str(caught.value)
+
+
+@pytest.mark.parametrize("stem", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("text", [False, True])
+@FUZZ
+@given(data=st.data())
+def test_damaged_files_end_in_a_message_or_a_model(tmp_path, stem, text, data):
+    """Truncation, flipped bits and inserted bytes never crash, hang or exhaust memory."""
+    folder = write_colmap(tmp_path, tiny_scene(columns=2, rows=2, points=6), text=text, images=None)
+    file = folder / (stem + (".txt" if text else ".bin"))
+    content = bytearray(file.read_bytes())
+    kind = data.draw(st.sampled_from(["truncate", "flip", "insert", "count"]))
+    position = data.draw(st.integers(0, len(content) - 1))
+    if kind == "truncate":
+        content = content[:position]
+    elif kind == "flip":
+        for _ in range(data.draw(st.integers(1, 4))):
+            content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    elif kind == "insert":
+        content[position:position] = data.draw(st.binary(min_size=1, max_size=16))
+    else:
+        content[:8] = struct.pack("<Q", data.draw(st.integers(0, (1 << 64) - 1)))
+    file.write_bytes(bytes(content))
+    model = None
+    with contextlib.suppress(CaptureError):
+        model = read_colmap(folder)
+    if model is None:
+        with pytest.raises(CaptureError, match=re.escape(str(folder))):
+            read_colmap(folder)
+        return
+    for view in model.views:
+        rotation = view.camera_from_world[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+        assert np.isfinite(view.camera_from_world).all()
+    assert len(model.points) == len(model.colours)
+
+
+def test_the_biggest_of_several_models_is_used(tmp_path):
+    whole = tiny_scene()
+    part = TinyScene(dict(list(whole.cameras.items())[:3]), whole.points[:50], whole.colours[:50])
+    write_colmap(tmp_path, part, images=None, sparse="sparse/0")
+    write_colmap(tmp_path, whole, sparse="sparse/1")
+    capture = load_capture(tmp_path, CaptureOptions(up="z"))
+    assert len(capture.views) == len(whole.cameras)
+    assert any("several sparse models" in warning for warning in capture.warnings)
+
+
+@pytest.mark.capture
+@pytest.mark.parametrize("name", ["brighton", "copr", "seneca"])
+def test_real_models_agree_with_pycolmap(name):
+    folder = data_folder(name) / "sparse" / "0"
+    model, theirs = read_colmap(folder), pycolmap.Reconstruction(str(folder))
+    assert len(model.points) == len(theirs.points3D)
+    poses = {image.name: image.cam_from_world().matrix() for image in theirs.images.values()}
+    assert {view.name for view in model.views} == set(poses)
+    for view in model.views:
+        np.testing.assert_allclose(view.camera_from_world[:3], poses[view.name], atol=1e-12)

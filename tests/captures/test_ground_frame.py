@@ -1,0 +1,332 @@
+"""The ground frame: z up, whatever world the capture came in, and exactly invertible."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from support.captures import data_folder, moved, tiny_scene, to_source, write_colmap
+from vdgs.captures.alignment import fit_similarity, fit_similarity_robust, geometric_median
+from vdgs.captures.formats.source import Intrinsics, SourceCapture, SourceView
+from vdgs.captures.geodesy import ecef_from_geodetic, enu_from_geodetic, geodetic_from_ecef, geodetic_from_enu
+from vdgs.captures.ground import CAMERA_HEIGHT, find_ground_frame, rotation_to_z, transform_pose
+from vdgs.captures.loading import load_capture
+from vdgs.errors import CaptureError
+from vdgs.settings.capture import CaptureOptions
+
+ORIGIN = (46.8426, -91.994, 159.4)
+
+
+def random_rotation(generator: np.random.Generator) -> np.ndarray:
+    q, r = np.linalg.qr(generator.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else -q
+
+
+def source_of(scene) -> SourceCapture:
+    views = tuple(
+        SourceView(
+            name=name,
+            camera_from_world=camera.camera_from_world,
+            intrinsics=Intrinsics("PINHOLE", (50.0, 50.0, 32.0, 24.0), 64, 48),
+        )
+        for name, camera in scene.cameras.items()
+    )
+    return SourceCapture(source="colmap", images="images", views=views, points=scene.points, colours=scene.colours)
+
+
+def ground_of(scene, tmp_path, **options):
+    return find_ground_frame(source_of(scene), tmp_path, CaptureOptions(**options))
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10_000), scale=st.floats(0.01, 100))
+def test_a_rigid_motion_and_scaling_of_the_world_changes_only_the_yaw(tmp_path_factory, seed, scale):
+    scene = tiny_scene(seed=seed % 7)
+    folder = tmp_path_factory.mktemp("ground")
+    generator = np.random.default_rng(seed)
+    other = moved(scene, scale, random_rotation(generator), generator.normal(size=3) * 100)
+    first, second = ground_of(scene, folder)[0], ground_of(other, folder)[0]
+    a, b = first.to_ground(scene.points), second.to_ground(other.points)
+    np.testing.assert_allclose(a[:, 2], b[:, 2], atol=1e-7)
+    np.testing.assert_allclose(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1), atol=1e-6)
+    turn = fit_similarity(a, b)
+    np.testing.assert_allclose(turn.rotation[2], [0, 0, 1], atol=1e-7)
+    assert turn.scale == pytest.approx(1, abs=1e-9)
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10_000))
+def test_the_estimated_up_axis_is_up(tmp_path_factory, seed):
+    """The generated world has z up; so has the ground frame, whichever way the input was turned."""
+    generator = np.random.default_rng(seed)
+    rotation = random_rotation(generator)
+    scene = moved(tiny_scene(), 0.3, rotation, np.array([5.0, -3.0, 2.0]))
+    frame, warnings = ground_of(scene, tmp_path_factory.mktemp("ground"))
+    assert (frame.rotation @ rotation)[2, 2] > np.cos(np.radians(3))
+    assert not warnings
+    heights = [frame.to_ground(camera.position[None])[0, 2] for camera in scene.cameras.values()]
+    assert np.median(heights) == pytest.approx(CAMERA_HEIGHT)
+    assert np.median(frame.to_ground(scene.points)[:, 2]) == pytest.approx(0, abs=1e-9)
+    assert not frame.metric
+
+
+def test_the_frame_is_exactly_invertible_and_keeps_projections(tmp_path):
+    scene = moved(tiny_scene(), 250.0, random_rotation(np.random.default_rng(3)), np.array([5e5, 5e6, 300.0]))
+    frame, _ = ground_of(scene, tmp_path)
+    np.testing.assert_allclose(to_source(frame, frame.to_ground(scene.points)), scene.points, atol=1e-8)
+    for camera in scene.cameras.values():
+        pose = transform_pose(camera.camera_from_world, frame)
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-14)
+        local = frame.to_ground(scene.points) @ pose[:3, :3].T + pose[:3, 3]
+        before, depth = camera.project(scene.points)
+        after = local[:, :2] / local[:, 2:] * camera.fx + [camera.cx, camera.cy]
+        front = depth > 1
+        np.testing.assert_allclose(after[front], before[front], atol=1e-5)
+        np.testing.assert_allclose(local[:, 2], depth * frame.scale, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(("up", "vector"), [("x", [1, 0, 0]), ("-y", [0, -1, 0]), ("z", [0, 0, 1]), ("-z", [0, 0, -1])])
+def test_up_can_be_said_outright(tmp_path, up, vector):
+    frame, _ = ground_of(tiny_scene(), tmp_path, up=up)
+    np.testing.assert_allclose(frame.rotation @ vector, [0, 0, 1], atol=1e-12)
+    assert np.linalg.det(frame.rotation) == pytest.approx(1)
+
+
+def test_up_contradicts_a_georeference_that_is_asked_for(tmp_path):
+    with pytest.raises(CaptureError, match="--up contradicts"):
+        ground_of(tiny_scene(), tmp_path, up="z", gps=tmp_path / "gps.csv")
+    with pytest.raises(CaptureError, match="give one"):
+        ground_of(tiny_scene(), tmp_path, georef=tmp_path / "georef.json", gps=tmp_path / "gps.csv")
+
+
+@given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 1e-3))
+@example([0.0, 1e-05, -1.0])
+@example([0.0, 0.0, -1.0])
+@example([1e-170, 0.0, -1.0])
+def test_the_smallest_rotation_to_z(vector):
+    unit = np.array(vector) / np.linalg.norm(vector)
+    rotation = rotation_to_z(unit)
+    np.testing.assert_allclose(rotation @ unit, [0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+
+
+# ------------------------------------------------------------------------------------- georeferences
+
+
+def write_gps(file, scene, origin=ORIGIN, noise=0.0, wrong=()):
+    generator = np.random.default_rng(1)
+    rows = ["name,model,lat,lon,alt"]
+    for index, (name, camera) in enumerate(scene.cameras.items()):
+        enu = camera.position + generator.normal(0, noise, 3) + (np.array([400.0, 90, 30]) if index in wrong else 0)
+        lat, lon, alt = geodetic_from_enu(enu[None], origin)[0]
+        rows.append(f"{name.upper().replace('.PNG', '.JPG')},X,{lat!r},{lon!r},{alt!r}")
+    file.write_text("\n".join(rows).replace("np.float64(", "").replace(")", ""), encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize("wrong", [(), (2, 7)])
+def test_gps_gives_metres_and_east_north_up(tmp_path, wrong):
+    """Names match across extensions and case; positions that are wrong by 400 m are left out."""
+    truth = tiny_scene()
+    gps = write_gps(tmp_path / "gps.csv", truth, wrong=wrong)
+    rotation = random_rotation(np.random.default_rng(5))
+    world = moved(truth, 0.013, rotation, np.array([1.0, 2, 3]))
+    frame, warnings = ground_of(world, tmp_path, gps=gps)
+    assert frame.metric
+    assert len(warnings) == bool(wrong)
+    back = frame.to_ground(world.points)
+    offset = truth.points - back
+    np.testing.assert_allclose(offset, np.broadcast_to(offset[0], offset.shape), atol=1e-4)
+    assert np.median(back[:, 2]) == pytest.approx(0, abs=1e-9)
+    assert frame.origin_geo is not None
+    np.testing.assert_allclose(enu_from_geodetic(np.array([frame.origin_geo]), ORIGIN)[0], offset[0], atol=1e-4)
+
+
+def test_gps_along_one_line_falls_back_to_the_estimate(tmp_path):
+    truth = tiny_scene(columns=6, rows=1)
+    for name, camera in truth.cameras.items():
+        pose = camera.camera_from_world.copy()
+        pose[:3, 3] = -pose[:3, :3] @ np.array([camera.position[0], 0.0, 10.0])
+        truth.cameras[name] = replace(camera, camera_from_world=pose, width=64, height=48)
+    frame, warnings = ground_of(truth, tmp_path, gps=write_gps(tmp_path / "gps.csv", truth))
+    assert not frame.metric
+    assert any("along one line" in warning for warning in warnings)
+    assert frame.rotation[2, 2] > 0.99
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("name,lat,lon\na,1,2\n", "columns name,lat,lon,alt"),
+        ("", "columns name,lat,lon,alt"),
+        ("name,lat,lon,alt\n", "names its columns but holds no rows"),
+        ("name,lat,lon,alt\nother,1,2,3\n", "none of its 1 rows"),
+        ("name,lat,lon,alt\nframe_000,x,2,3\n", "not numbers"),
+        ("name,lat,lon,alt\nframe_000,91,2,3\n", "no place on Earth"),
+        ("name,lat,lon,alt\nframe_000,nan,2,3\n", "no place on Earth"),
+    ],
+)
+def test_bad_gps_tables_are_named(tmp_path, content, message):
+    file = tmp_path / "gps.csv"
+    file.write_text(content)
+    with pytest.raises(CaptureError, match=message):
+        ground_of(tiny_scene(), tmp_path, gps=file)
+
+
+def georef(file, **changes):
+    content = {
+        "frame": "ENU, metres",
+        "origin_lat_deg": ORIGIN[0],
+        "origin_lon_deg": ORIGIN[1],
+        "origin_alt_m": ORIGIN[2],
+    }
+    file.write_text(json.dumps(content | changes), encoding="utf-8")
+
+
+def test_a_georeferenced_world_keeps_its_axes_and_metres(tmp_path):
+    georef(tmp_path / "georef.json")
+    frame, _ = ground_of(tiny_scene(), tmp_path)
+    np.testing.assert_array_equal(frame.rotation, np.eye(3))
+    np.testing.assert_array_equal(frame.translation, 0)
+    assert (frame.scale, frame.metric, frame.origin_geo) == (1.0, True, ORIGIN)
+
+
+def test_a_georeference_that_contradicts_the_cameras_is_a_warning(tmp_path):
+    georef(tmp_path / "georef.json")
+    sideways = moved(tiny_scene(), 1.0, np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), np.zeros(3))
+    _, warnings = ground_of(sideways, tmp_path)
+    assert any("90 degrees away" in warning for warning in warnings)
+
+
+@pytest.mark.parametrize("near", [True, False])
+def test_a_far_origin_is_moved_so_that_float32_is_safe(tmp_path, near):
+    """Coordinates of UTM are no ENU about any origin: metres hold, a place on Earth would be made up."""
+    georef(tmp_path / "georef.json")
+    shift = np.array([4_321.4, -5_187.7, 20.0]) if near else np.array([432_100.4, -5_187_300.7, 20.0])
+    scene = moved(tiny_scene(), 1.0, np.eye(3), shift)
+    frame, warnings = ground_of(scene, tmp_path)
+    ground = frame.to_ground(scene.points)
+    assert np.abs(ground).max() < 100
+    np.testing.assert_allclose(ground.astype(np.float32), ground, atol=1e-5)
+    np.testing.assert_allclose(to_source(frame, ground), scene.points, rtol=1e-15)
+    assert (frame.origin_geo is not None) == near
+    assert any("projected coordinates (UTM)" in warning for warning in warnings) == (not near)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frame": "EPSG:32615"}, "no ENU frame"),
+        ({"origin_lat_deg": "north"}, "must give numbers"),
+        ({"origin_lat_deg": 200}, "no place"),
+    ],
+)
+def test_bad_georeferences_are_named(tmp_path, changes, message):
+    georef(tmp_path / "georef.json", **changes)
+    with pytest.raises(CaptureError, match=message):
+        ground_of(tiny_scene(), tmp_path)
+
+
+# ------------------------------------------------------------------------------------------ numerics
+
+
+@given(
+    st.floats(-89.9, 89.9),
+    st.floats(-179.9, 179.9),
+    st.floats(-400, 9000),
+    st.tuples(*[st.floats(-5e4, 5e4)] * 3),
+)
+def test_geodesy_is_invertible(latitude, longitude, altitude, enu):
+    place = np.array([[latitude, longitude, altitude]])
+    np.testing.assert_allclose(geodetic_from_ecef(ecef_from_geodetic(place)), place, atol=1e-6, rtol=1e-11)
+    origin = (latitude, longitude, altitude)
+    there = geodetic_from_enu(np.array([enu]), origin)
+    np.testing.assert_allclose(enu_from_geodetic(there, origin)[0], enu, atol=1e-6)
+
+
+def test_geodesy_agrees_with_pycolmap():
+    import pycolmap
+
+    places = np.array([[46.84, -91.99, 159.0], [-33.9, 18.4, 12.0], [78.2, 15.6, 400.0]])
+    transform = (
+        pycolmap.GPSTransform(pycolmap.GPSTransfromEllipsoid.WGS84)
+        if hasattr(pycolmap, "GPSTransfromEllipsoid")
+        else pycolmap.GPSTransform()
+    )
+    np.testing.assert_allclose(np.asarray(transform.ellipsoid_to_ecef(places)), ecef_from_geodetic(places), atol=1e-5)
+
+
+def test_a_similarity_survives_gross_outliers():
+    generator = np.random.default_rng(0)
+    source = generator.normal(size=(40, 3))
+    rotation = random_rotation(generator)
+    target = 3.0 * source @ rotation.T + [1.0, 2.0, 3.0]
+    target[:12] += generator.normal(0, 50, (12, 3))
+    similarity, inliers = fit_similarity_robust(source, target)
+    assert not inliers[:12].any()
+    np.testing.assert_allclose(similarity.apply(source[12:]), target[12:], atol=1e-9)
+
+
+def test_the_geometric_median_turns_with_its_points():
+    generator = np.random.default_rng(2)
+    points = generator.exponential(size=(500, 3))
+    rotation = random_rotation(generator)
+    np.testing.assert_allclose(
+        geometric_median(points @ rotation.T + 5), rotation @ geometric_median(points) + 5, atol=1e-8
+    )
+
+
+@pytest.mark.capture
+@pytest.mark.parametrize(("name", "degrees"), [("brighton", 2.0), ("copr", 5.0), ("seneca", 1.0)])
+def test_on_real_flights_the_estimate_agrees_with_the_georeference(name, degrees):
+    """The real captures are in ENU; the estimate, told nothing, must find z (nadir flights included)."""
+    folder = data_folder(name)
+    capture = load_capture(folder, CaptureOptions(images="images_4"))
+    assert capture.ground.metric
+    source = SourceCapture(
+        source="colmap",
+        images="images_4",
+        views=tuple(
+            SourceView(
+                name=v.name,
+                camera_from_world=v.camera.camera_from_world,
+                intrinsics=Intrinsics("PINHOLE", (1.0,) * 4, 1, 1),
+            )
+            for v in capture.views
+        ),
+        points=capture.points,
+        colours=capture.point_colours,
+    )
+    frame, _ = find_ground_frame(source, folder / "sparse", CaptureOptions())
+    assert np.degrees(np.arccos(frame.rotation[2, 2])) < degrees
+
+
+@pytest.mark.capture
+def test_real_gps_agrees_with_the_georeference():
+    folder = data_folder("seneca")
+    capture = load_capture(folder, CaptureOptions(images="images_4"))
+    by_gps = load_capture(folder, CaptureOptions(images="images_4", gps=folder / "gps.csv"))
+    assert by_gps.ground.scale == pytest.approx(1, abs=1e-3)
+    assert by_gps.ground.rotation[2, 2] > 0.99999
+    assert by_gps.ground.origin_geo is not None
+    assert capture.ground.origin_geo is not None
+    assert by_gps.ground.origin_geo[:2] == pytest.approx(capture.ground.origin_geo[:2], abs=1e-3)
+
+
+def test_loading_puts_cameras_and_points_into_the_frame(tmp_path):
+    truth = tiny_scene()
+    world = moved(truth, 2.0, random_rotation(np.random.default_rng(9)), np.array([3.0, 4, 5]))
+    write_colmap(tmp_path, world, shown=truth)
+    capture = load_capture(tmp_path, CaptureOptions())
+    for view in capture.views:
+        camera = world.cameras[view.name]
+        expected, depth = camera.project(world.points)
+        front = depth > 1
+        found, _ = view.camera.project(capture.points)
+        np.testing.assert_allclose(found[front], expected[front], atol=1e-6)

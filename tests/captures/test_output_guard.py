@@ -1,0 +1,151 @@
+"""Nothing is written among photographs, masks and sparse models, under whichever name that folder goes."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from experiments.bench.bench import BenchSettings, run_bench
+from experiments.bench.plan import Choices
+from support.captures import tiny_scene, write_colmap
+from support.dataset_layouts import write_mega_nerf
+from vdgs.captures.loading import load_capture
+from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
+from vdgs.errors import VdgsError
+from vdgs.inspection.inspect import inspect_capture
+from vdgs.maps.mapping import map_run
+from vdgs.runs.beginning import begin_run
+from vdgs.runs.run_context import RunContext
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.presets import PRESETS
+from vdgs.settings.requests import MapRequest
+from vdgs.synth import SynthOptions, generate
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A capture with masks whose photographs lie in `images_4`."""
+    write_colmap(tmp_path / "capture", tiny_scene())
+    (tmp_path / "capture" / "images").rename(tmp_path / "capture" / "images_4")
+    (tmp_path / "capture" / "masks").mkdir()
+    return tmp_path / "capture"
+
+
+def contents(folder: Path) -> dict[Path, bytes | None]:
+    return {path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
+
+
+INSIDE = ("images_4", "images_4/run", "images_4/film.mp4", "masks", "masks/new/run", "sparse/0", "out/../images_4/x")
+
+
+@pytest.mark.parametrize("inside", INSIDE)
+def test_inputs_of_any_capture_are_known_without_reading_it(root: Path, inside: str) -> None:
+    with pytest.raises(VdgsError, match="is for inputs of the capture"):
+        refuse_in_a_capture(root / inside)
+
+
+@pytest.mark.parametrize("beside", ["", "run", "renders/images", "images_by_me", "undistorted/images", "film.mp4"])
+def test_other_places_in_a_capture_are_free(root: Path, beside: str) -> None:
+    before, capture = contents(root), load_capture(root)
+    refuse_in_a_capture(root / beside)  # raises nothing
+    refuse_among_inputs(root / beside, capture)
+    assert contents(root) == before  # nor makes what it was asked about
+
+
+def test_relative_names_and_links_lead_to_the_same_folder(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (root.parent / "link").symlink_to(root / "images_4")
+    (root.parent / "film.mp4").symlink_to(root / "images_4" / "frame_000.png")
+    monkeypatch.chdir(root / "sparse")
+    for name in ("../images_4", "../../link/run", "../../film.mp4", "../../link/../images_4"):
+        with pytest.raises(VdgsError, match="images_4"):
+            refuse_in_a_capture(Path(name))
+
+
+def test_photographs_elsewhere_and_under_other_names_are_known(root: Path, tmp_path: Path) -> None:
+    store = tmp_path / "card" / "DCIM"
+    shutil.move(root / "images_4", store)
+    (root / "photos").symlink_to(store)
+    capture = load_capture(root, CaptureOptions(images="photos"))
+    for output in (store, store / "run", root / "photos" / "run"):
+        with pytest.raises(VdgsError, match="is for inputs"):
+            refuse_among_inputs(output, capture)
+    refuse_among_inputs(tmp_path / "card" / "run", capture)
+
+
+def test_what_single_photographs_are_links_to_is_known(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "store").mkdir()
+    photograph = root / "images_4" / "frame_003.png"
+    shutil.move(photograph, tmp_path / "store")
+    photograph.symlink_to(tmp_path / "store" / photograph.name)
+    with pytest.raises(VdgsError, match="store"):
+        refuse_among_inputs(tmp_path / "store", load_capture(root))
+
+
+def test_photographs_in_the_root_leave_folders_beside_them_free(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "flat", tiny_scene())
+    for photograph in (tmp_path / "flat" / "images").iterdir():
+        shutil.move(photograph, tmp_path / "flat")
+    capture = load_capture(tmp_path / "flat", CaptureOptions(images="."))
+    refuse_among_inputs(tmp_path / "flat" / "run", capture)
+    with pytest.raises(VdgsError, match="is for inputs"):
+        refuse_among_inputs(tmp_path / "flat", capture)
+
+
+def test_the_layout_of_mega_nerf_is_known(tmp_path: Path) -> None:
+    write_mega_nerf(tmp_path / "mill", tiny_scene())
+    for inside in ("train/rgbs", "val/rgbs/run", "train/metadata"):
+        with pytest.raises(VdgsError, match="is for inputs"):
+            refuse_in_a_capture(tmp_path / "mill" / inside)
+
+
+def begin(root: Path, output: Path) -> None:
+    begin_run(root, output, CaptureOptions(), PRESETS["laptop"])
+
+
+def inspect(root: Path, output: Path) -> None:
+    inspect_capture(load_capture(root), output)
+
+
+def synth(_: Path, output: Path) -> None:
+    generate(output, SynthOptions(size="toy"))
+
+
+def bench(_: Path, output: Path) -> None:
+    run_bench(BenchSettings("toy", output, Choices()), Console(quiet=True))
+
+
+def map_scene(root: Path, output: Path) -> None:
+    pytest.importorskip("rasterio")
+    asked = MapRequest(run=root.parent / "run", output=output)
+    map_run(RunContext.from_path(asked.run), asked, Console(quiet=True))
+
+
+@pytest.mark.parametrize("verb", [begin, inspect, synth, bench, map_scene])
+@pytest.mark.parametrize("inside", ["images_4", "images_4/new"])
+def test_no_verb_writes_among_inputs(root: Path, verb, inside: str) -> None:
+    before = contents(root)
+    with pytest.raises(VdgsError, match="Nothing was written"):
+        verb(root, root / inside)
+    assert contents(root) == before
+
+
+def test_photographs_are_not_undistorted_onto_themselves(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "bent", tiny_scene(), model="SIMPLE_RADIAL", extra=(0.1,))
+    before = contents(tmp_path)
+    options = CaptureOptions(undistort=True, undistorted_folder=tmp_path / "bent" / "images")
+    with pytest.raises(VdgsError, match="is for inputs"):
+        load_capture(tmp_path / "bent", options)
+    assert contents(tmp_path) == before
+
+
+def test_a_folder_that_cannot_be_read_is_no_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path) -> None:
+        raise PermissionError(13, os.strerror(13), str(path))
+
+    monkeypatch.setattr("vdgs.captures.outputs.find_models", refuse)
+    refuse_in_a_capture(tmp_path / "images" / "run")
+    assert not list(tmp_path.iterdir())

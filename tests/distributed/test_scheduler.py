@@ -1,0 +1,306 @@
+"""What becomes of tasks whatever engine begins them, on an engine that does what a test says."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from support.captures import tiny_scene, write_colmap
+from vdgs.cameras import Camera
+from vdgs.errors import VdgsError
+from vdgs.executors import fitness
+from vdgs.executors.choosing import Machine, choose
+from vdgs.executors.crew import Policy, run_crew
+from vdgs.executors.engine import Begun, End
+from vdgs.executors.executor import Listener, Needs, Task
+from vdgs.executors.fitness import Question, examine
+from vdgs.executors.lines import Lines
+from vdgs.executors.placement import Work, by_queue, exceeds, on_cluster, on_this_machine
+from vdgs.memory.estimate import decoded_bytes, estimate, need_of_block
+from vdgs.runs.stage_folder import StageFolder
+from vdgs.runs.status import Status
+from vdgs.settings.executors import ExecutorOptions, SlurmOptions
+from vdgs.settings.presets import PRESETS
+from vdgs.verbs import starting
+
+GB = 10**9
+SAVED = End(130, out_of_time=True)
+
+
+class Scripted:
+    """An engine whose attempts end as a list says, one after the other; it remembers what they asked for."""
+
+    def __init__(self, ends: list[End | OSError], most_memory: int | None = None, there: tuple[str, ...] = ()):
+        self.most_memory, self._ends, self._there = most_memory, list(ends), there
+        self.asked: list[tuple[str, int, Needs]] = []
+
+    def start(self, tasks):
+        self.asked += [(task.name, attempt, task.needs) for task, attempt in tasks]
+        return [self._next() for _ in tasks]
+
+    def find(self, task):
+        return self._next() if task.name in self._there else None
+
+    def refresh(self):
+        pass
+
+    def _next(self):
+        end = self._ends.pop(0)
+        return end if isinstance(end, OSError) else Attempt(end)
+
+
+@dataclass
+class Attempt:
+    end: End
+    begun: Begun | None = field(default_factory=lambda: Begun(0, "node-7"))
+
+    def look(self) -> End:
+        return self.end
+
+    def ask_to_stop(self) -> None:
+        raise AssertionError("nobody asked")
+
+    kill = ask_to_stop
+
+
+class Heard(Lines):
+    """All that is said of the tasks."""
+
+    def __init__(self):
+        self.lines: list[str] = []
+        super().__init__(lambda text, _: self.lines.append(text))
+
+    def placed(self, task: Task, where: str, found: bool) -> None:
+        self.lines.append(f"{task.name} on {where}" + (" again" if found else ""))
+
+
+def run(folder: Path, engine: Scripted, task: Task | None = None, retries: int = 2):
+    heard = Heard()
+    task = task or Task(name="block 00", command=["train"], output=folder / "output.log", needs=Needs(1, 4 * GB))
+    (outcome,) = run_crew([task], engine, Policy(1, retries, 1e-6), heard)
+    return outcome, heard.lines
+
+
+def test_memory_that_ran_out_is_asked_for_up_to_what_the_largest_node_has(tmp_path):
+    killed = End(-9, out_of_memory=True)
+    engine = Scripted([killed, killed, killed], most_memory=7 * GB)
+    outcome, lines = run(tmp_path, engine)
+    assert [needs.memory_bytes for _, _, needs in engine.asked] == [4 * GB, 6 * GB, 7 * GB]
+    assert (outcome.state, outcome.attempts) == ("failed", 3)
+    assert "crashed by SIGKILL (out of memory; it asks for 6.00 GB now)" in lines[1]
+    assert "no node has more than the 7.00 GB" in outcome.why
+
+
+def test_a_lost_place_is_worded_and_the_task_tried_a_bounded_number_of_times(tmp_path):
+    lost = End(None, "the loss of its node node-7")
+    outcome, lines = run(tmp_path, Scripted([lost, End(0)]))
+    assert (outcome.state, outcome.attempts) == ("done", 2)
+    assert lines[1].startswith("block 00: crashed by the loss of its node node-7; continues from its last checkpoint")
+    outcome, _ = run(tmp_path, Scripted([lost] * 3))
+    assert (outcome.state, outcome.attempts) == ("failed", 3)
+    assert outcome.why.startswith("crashed 3 times, at last by the loss of its node node-7")
+
+
+def test_a_time_limit_costs_no_attempt_as_long_as_the_task_gets_further(tmp_path):
+    folder = StageFolder(tmp_path / "00")
+    folder.path.mkdir()
+
+    class Further(Scripted):
+        def start(self, tasks):
+            folder.set_status(Status(state="running", iteration=10 * min(len(self.asked) + 1, 6)))
+            return super().start(tasks)
+
+    task = Task(name="block 00", command=["train"], output=tmp_path / "output.log", folder=folder.path)
+    engine = Further([SAVED] * 5 + [End(0)])
+    outcome, lines = run(tmp_path, engine, task, retries=0)
+    assert (outcome.state, outcome.attempts) == ("done", 1)
+    assert sum("saved and waits for another turn" in line for line in lines) == 5
+    outcome, _ = run(tmp_path, Further([SAVED] * 9), task, retries=1)
+    assert outcome.state == "failed"
+    assert "its time limit, before it got any further" in outcome.why
+
+
+def test_what_an_earlier_driver_began_is_watched_and_not_begun_again(tmp_path):
+    engine = Scripted([End(0)], there=("block 00",))
+    outcome, lines = run(tmp_path, engine)
+    assert (outcome.state, engine.asked) == ("done", [])
+    assert lines == ["block 00 on node-7 again"]
+
+
+def test_what_the_system_refuses_is_named(tmp_path):
+    outcome, _ = run(tmp_path, Scripted([OSError(28, "No space left on device", "/runs/00/output.log")]))
+    assert outcome.state == "failed"
+    assert outcome.why.startswith("/runs/00/output.log: No space left on device. Free some space")
+
+
+@dataclass(frozen=True)
+class Place:
+    processors: int
+    memory_bytes: int
+
+
+places = st.lists(st.builds(Place, st.integers(1, 64), st.integers(GB, 10**12)), min_size=1, max_size=5)
+
+
+@given(places, st.integers(1, 40), st.integers(0, 8), st.integers(10**8, 10**11))
+def test_blocks_find_room_on_a_cluster(places, blocks, jobs, each):
+    share = on_cluster(Work(pieces=blocks, piece_bytes=each, jobs=jobs), places, ExecutorOptions(executor="ray"))
+    needs, most = share.needs, max(place.memory_bytes for place in places)
+    assert share.at_once == min(blocks, jobs or blocks)
+    assert 1 <= needs.processors <= max(place.processors for place in places)
+    room = sum(place.processors // needs.processors for place in places)
+    assert needs.processors == 1 or room >= share.at_once
+    assert min(each, most) <= needs.memory_bytes <= most
+
+
+works = st.builds(
+    Work, st.integers(1, 60), st.integers(10**8, 10**11), st.just(0), st.sampled_from([0.0, 0.5, 20.0]),
+    photographs_bytes=st.integers(0, 10**12),
+)  # fmt: skip
+
+
+@given(works, st.integers(1, 128), st.integers(0, 10**12))
+def test_blocks_at_once_and_their_photographs_fit_into_one_machine(work, cores, free):
+    share = on_this_machine(work, cores, free)
+    photographs = min(work.photographs_bytes, 1e9 * share.image_gb)
+    assert share.at_once == 1 or share.at_once * (work.piece_bytes + photographs) <= free + 1
+    assert share.at_once == 1 or not exceeds(work, share.at_once, free)
+    assert exceeds(replace(work, image_gb=0), 1, free) or on_this_machine(replace(work, image_gb=0), 1, free).image_gb
+
+
+def test_large_photographs_leave_room_for_fewer_blocks():
+    """Photographs of 20 MP: 3 GB for the picture of a block and 16 GB for those that are kept."""
+    large = Work(pieces=32, piece_bytes=3_800_000_000, photographs_bytes=10**11)
+    share = on_this_machine(large, 32, 64 * GB)
+    assert (share.at_once, share.image_gb) == (12, 16 / 12)
+    assert on_this_machine(replace(large, image_gb=40), 32, 64 * GB).at_once == 6
+    # Small ones need no quarter of the memory.
+    small = Work(pieces=32, piece_bytes=2 * GB, photographs_bytes=10**7)
+    assert on_this_machine(small, 32, 64 * GB).at_once == 31
+
+
+def test_two_small_blocks_fit_into_a_laptop_with_4_gb_free():
+    """`make demo`: 56 photographs of 400 x 300 pixels, four blocks; with more anchors than it has."""
+    cameras = [Camera(camera_from_world=np.eye(4), fx=1, fy=1, cx=0, cy=0, width=400, height=300)] * 56
+    largest = need_of_block(PRESETS["laptop"], 100_000, 200_000, 400 * 300)
+    work = Work(pieces=4, piece_bytes=estimate(largest).total, photographs_bytes=decoded_bytes(cameras))
+    assert on_this_machine(work, 2, 4 * GB).at_once == 2
+    assert not exceeds(work, 2, 4 * GB)
+
+
+def test_photographs_give_way_to_blocks_that_a_person_asked_for():
+    work = Work(pieces=4, piece_bytes=3 * GB, jobs=2, photographs_bytes=10**11)
+    assert on_this_machine(work, 4, 7 * GB).image_gb == 0.5
+    assert on_this_machine(work, 4, 6 * GB).image_gb == 0.1
+    assert [exceeds(work, 2, free) for free in (6 * GB, 7 * GB)] == [True, False]
+    assert exceeds(replace(work, image_gb=2), 2, 7 * GB)
+
+
+def test_people_are_told_what_blocks_and_their_photographs_take(question):
+    work = Work(pieces=4, piece_bytes=2 * GB, photographs_bytes=10**11)
+    with choose(ExecutorOptions(), work, Machine(4, 8 * GB), lambda: question) as chosen:
+        assert "a block takes at most 2.00 GB and 667 MB for photographs, of 8.00 GB free" in chosen.line
+        assert chosen.line.startswith("3 at once")
+        assert not chosen.notes
+    with choose(ExecutorOptions(), replace(work, jobs=4), Machine(4, 8 * GB), lambda: question) as chosen:
+        assert "4 at once may run out of memory. What helps: less --jobs" in chosen.notes[0]
+
+
+def test_what_a_person_asks_for_is_asked_of_the_cluster():
+    asked = ExecutorOptions(executor="ray", processors=3, memory_gb=5, gpus=0.5)
+    for share in (
+        on_cluster(Work(pieces=4, piece_bytes=GB), [Place(8, 64 * GB)], asked),
+        by_queue(Work(pieces=4, piece_bytes=GB), asked),
+    ):
+        assert share.needs == Needs(3, 5 * GB, 0.5)
+    assert (
+        on_cluster(
+            Work(pieces=4, piece_bytes=GB, image_gb=2), [Place(8, 64 * GB)], ExecutorOptions(executor="ray")
+        ).image_gb
+        == 2
+    )
+    assert on_this_machine(Work(pieces=8, piece_bytes=2 * GB, image_gb=4), 2, 8 * GB).image_gb == 2
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        (ExecutorOptions(executor="slurm", gpus=0.5), "SLURM gives whole GPUs"),
+        (ExecutorOptions(executor="local", address="auto"), "add --executor ray"),
+        (ExecutorOptions(executor="ray", address="ray://head:10001"), "on one of its machines"),
+        (ExecutorOptions(executor="slurm", slurm=SlurmOptions(grace_seconds=0)), "--slurm.grace-seconds 0"),
+    ],
+)
+def test_options_that_do_not_fit_together_are_refused(asked, said):
+    with pytest.raises(VdgsError, match=said):
+        asked.check()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [(("--executor", "slurm"), "There is no sbatch"), (("--executor", "ray"), "Ray is not installed: pip install")],
+)
+def test_where_blocks_could_not_be_trained_no_coarse_model_is_trained_before_that_is_said(
+    options, said, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    write_colmap(tmp_path / "capture", tiny_scene())
+    with pytest.raises(VdgsError, match=said):
+        starting.run([str(tmp_path / "capture"), "--output", str(tmp_path / "run"), *options])
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.fixture
+def question(tmp_path) -> Question:
+    photograph = tmp_path / "a.jpg"
+    photograph.write_bytes(b"pixels")
+    (tmp_path / "run").mkdir()
+    return Question(tmp_path / "run", [photograph])
+
+
+def test_a_machine_that_sees_the_same_can_work_on_a_run(question):
+    with question.asked() as plain:
+        assert examine(plain)["problems"] == []
+    assert examine(question.plain())["problems"] == []  # nobody waits for the answer
+    assert list(question.folder.iterdir()) == []
+
+
+def test_what_a_machine_does_not_see_is_named(question, monkeypatch):
+    with question.asked() as plain:
+
+        def said(**other) -> str:
+            (problem,) = examine(plain | other)["problems"]
+            return problem
+
+        assert "there is no /elsewhere" in said(folder="/elsewhere")
+        assert "another folder there" in said(held=str(question.folder / ".fitness-of-another"))
+        assert "there is no /b.jpg" in said(files=[["/b.jpg", 6]])
+        assert "has 6 bytes there and 7 here" in said(files=[[str(question.files[0]), 7]])
+        assert "it has vdgs" in said(version="9.9")
+        assert "not the same code" in said(code="other")
+        monkeypatch.setattr(fitness, "is_locked", lambda _: False)
+        assert "reach no other node" in said()
+
+        def refuse(_: Path) -> bool:
+            raise OSError(38, "Function not implemented")
+
+        monkeypatch.setattr(fitness, "is_locked", refuse)
+        assert "do not work there (Function not implemented)" in said()
+
+
+def test_of_many_photographs_some_are_looked_for(question):
+    many = replace(question, files=[question.folder / f"{number}.jpg" for number in range(1000)])
+    names = [name for name, _ in many.plain()["files"]]
+    assert names[0].endswith("/0.jpg")
+    assert names[-1].endswith("/999.jpg")
+    assert len(names) < 12
+
+
+def test_listeners_need_not_listen():
+    listener, task = Listener(), Task(name="a", command=["b"], output=Path("c"))
+    assert listener.placed(task, "node", False) is listener.paused(task, "") is None

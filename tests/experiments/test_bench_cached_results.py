@@ -1,0 +1,124 @@
+"""`vdgs bench --known`: what other benches measured stands in the table and is not trained again."""
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from experiments.bench.bench import BenchSettings, run_bench
+from experiments.bench.known import left_to_train, on_the_same_pixels, read_known
+from experiments.bench.plan import Choices, make_plan
+from experiments.bench.results import Result
+from support.bench import InThisProcess, write_data
+from vdgs.errors import VdgsError
+
+pytestmark = pytest.mark.xdist_group("bench known")
+
+
+def asked(data: Path, output: Path, seeds: int = 1, known: tuple[Path, ...] = (), total: int = 40) -> BenchSettings:
+    choices = Choices(seeds, ("copr",), ("coarse", "baseline"), iterations_total=total, max_anchors=300)
+    return BenchSettings("table2", output, choices, data, known=known)
+
+
+def bench(settings: BenchSettings) -> tuple[dict[tuple[str, int], Result], str]:
+    said = io.StringIO()
+    return {(each.method, each.seed): each for each in run_bench(settings, Console(file=said))}, said.getvalue()
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("known") / "data"
+    write_data(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def there(data, tmp_path_factory) -> Path:
+    """The results of a bench on another machine."""
+    output = tmp_path_factory.mktemp("known") / "there"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("experiments.bench.bench.LocalExecutor", InThisProcess)
+        patch.setattr("experiments.bench.origin.origin", lambda threads: "1999-12-31, another machine")
+        bench(asked(data, output))
+    return output / "table2" / "results.json"
+
+
+def known_psnr(file: Path, method: str) -> float:
+    return next(each.figures["psnr"] for each in read_known([file]).values() if each.method == method)
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch) -> None:
+    monkeypatch.setattr("experiments.bench.bench.LocalExecutor", InThisProcess)
+
+
+def test_what_is_known_is_not_trained(data, there, tmp_path):
+    results, said = bench(asked(data, tmp_path / "out", known=(there,)))
+    assert "2 of 2 runs are known" in said
+    assert not (tmp_path / "out" / "runs").exists()
+    before = json.loads(there.read_text())["results"]
+    after = json.loads((tmp_path / "out" / "table2" / "results.json").read_text())["results"]
+    assert after == before
+    assert {each.origin for each in results.values()} == {"1999-12-31, another machine"}
+    assert "1999-12-31, another machine: all." in (tmp_path / "out" / "table2" / "table.md").read_text()
+    # A table that was written from a file can be the file of another one.
+    again, _ = bench(asked(data, tmp_path / "again", known=(tmp_path / "out" / "table2" / "results.json",)))
+    assert again == results
+
+
+def test_another_seed_is_trained_beside_it(data, there, tmp_path):
+    results, said = bench(asked(data, tmp_path / "out", seeds=2, known=(there,)))
+    assert "2 of 4 runs are known" in said
+    assert {state for each in results.values() for state in [each.state]} == {"done"}
+    assert {path.name for path in tmp_path.glob("out/runs/copr/*/*")} == {"1"}
+    text = (tmp_path / "out" / "table2" / "table.md").read_text()
+    assert "1999-12-31, another machine: seed 0: coarse on copr, baseline on copr." in text
+    assert results["baseline", 0].key != results["baseline", 1].key
+    # Here a coarse model of each bench says what its groups are: those of another are not compared.
+    assert not results["baseline", 0].groups
+    assert results["baseline", 1].groups
+    assert results["baseline", 0].figures["psnr"] == known_psnr(there, "baseline")
+    assert "of other pixels" in text
+
+
+def test_other_settings_are_another_run(data, there, tmp_path):
+    plan = make_plan("table2", asked(data, tmp_path, total=60).choices)
+    known = read_known([there])
+    assert all(run.key({}, {}) not in known for run in plan.runs)
+
+
+def test_a_coarse_stage_that_only_known_runs_share_is_not_trained():
+    plan = make_plan("toy", Choices(methods=("baseline", "full", "no-blocking")))
+    keys = {run.name: run.name for run in plan.coarse + plan.runs}
+    full, other = (next(run for run in plan.runs if run.method == name) for name in ("full", "no-blocking"))
+    known = {name: Result("tiny", "any", 0, "done") for name in (full.name, other.name)}
+    assert plan.coarse
+    assert not left_to_train(plan, keys, known).coarse
+    assert left_to_train(plan, keys, {full.name: known[full.name]}).coarse == plan.coarse
+    assert left_to_train(plan, keys, {}) == plan
+    assert not left_to_train(plan, keys, dict.fromkeys(keys, known[full.name])).scenes
+
+
+@pytest.mark.parametrize("content", ["[]", "{}", '{"results": [{"state": "done"}]}', '{"results": 3}', "no JSON"])
+def test_a_file_of_another_kind_is_named(tmp_path, content):
+    file = tmp_path / "results.json"
+    file.write_text(content)
+    with pytest.raises(VdgsError, match=r"results\.json"):
+        read_known([file])
+
+
+def test_groups_of_other_pixels_are_not_compared(there):
+    first, second = read_known([there]).values()
+    groups = tuple({"lower": 1, "upper": 2, "pixels": pixels} for pixels in (10, 12))
+    alike = [replace(first, groups=groups), replace(second, groups=groups), replace(second, groups=())]
+    assert on_the_same_pixels(alike, {}) == alike
+    known = replace(first, groups=groups[::-1], figures={"psnr": 20.0, "psnr@0": 19.0, "psnr@frusta0": 18.0})
+    here, gone = on_the_same_pixels([alike[1], known], {known.key: known})
+    assert here == alike[1]
+    assert gone.figures == {"psnr": 20.0}
+    assert not gone.groups
+    assert "other pixels" in gone.why
+    assert on_the_same_pixels([known, alike[1]], {known.key: known}) == [gone, here]  # whichever comes first

@@ -1,0 +1,133 @@
+"""3DGS as a method of the bench: its schedule, its settings, its run, its row."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from experiments.baselines.gs3d import session as gaussian_session
+from experiments.baselines.gs3d.run import gaussians_folder
+from experiments.baselines.gs3d.schedule import LEAST_INTERVAL, PUBLISHED_ITERATIONS, scheduled
+from experiments.baselines.gs3d.training import GaussiansConfig
+from experiments.bench import bench
+from experiments.bench.explicit import gaussians_config
+from experiments.bench.measure import GROUPS_FILE
+from experiments.bench.notes import notes_of
+from experiments.bench.plan import Choices, make_plan
+from experiments.bench.results import Result
+from support.bench import InThisProcess, benched, write_data
+from vdgs.errors import RunError, Stopped
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import open_run
+from vdgs.settings.method import MethodConfig
+
+pytestmark = pytest.mark.xdist_group("bench_explicit")
+
+
+def test_the_published_length_has_the_published_schedule():
+    assert scheduled(PUBLISHED_ITERATIONS) == GaussiansConfig()
+
+
+@given(st.integers(1, 2_000_000))
+def test_a_schedule_is_one_whatever_its_length(iterations):
+    config, published = scheduled(iterations), GaussiansConfig()
+    starts = [start for start, _ in config.resolutions]
+    assert starts == sorted(starts)
+    assert starts[0] == 0
+    assert [factor for _, factor in config.resolutions] == [4, 2, 1]
+    assert config.degree_interval >= 1
+    assert config.density.interval >= LEAST_INTERVAL
+    assert config.density.reset_interval >= LEAST_INTERVAL
+    # Below the end of density control by as much as in the published schedule.
+    assert config.density.start <= config.density.until * iterations
+    rounding = (0.5 + 1e-9) / iterations
+    assert config.density.start / iterations == pytest.approx(published.density.start / 30_000, abs=rounding)
+
+
+def test_long_and_short_schedules_move_in_proportion():
+    long, short = scheduled(300_000), scheduled(6_000)
+    assert (long.density.start, long.density.interval, long.density.reset_interval) == (5_000, 1_000, 30_000)
+    assert (short.density.start, short.density.interval, short.density.reset_interval) == (100, 100, 600)
+    assert (short.degree_interval, short.resolutions) == (200, ((0, 4), (50, 2), (100, 1)))
+
+
+def test_its_settings_are_those_of_the_table():
+    plan = make_plan("table1", Choices(seeds=2, scenes=("tiny",), max_anchors=700))
+    ours, black = plan.answers["tiny", "3dgs", 1], plan.answers["tiny", "3dgs-black", 1]
+    config = gaussians_config(ours.config)
+    assert (config.iterations, config.seed, config.background) == (600, 1, "mean")
+    assert config.density.max_gaussians == 7_000
+    assert gaussians_config(black.config) == replace(config, background="black")
+    assert ours.folder != black.folder
+    assert ours.coarse_from is None
+    reference = plan.reference("tiny")
+    assert reference is not None
+    assert "coarse" in reference.stages
+    assert any("7,000" in note for note in notes_of(plan, list[Result](), [], False))
+    alone = make_plan("table1", Choices(scenes=("tiny",), methods=("3dgs",)))
+    assert alone.reference("tiny") is None
+    assert gaussians_config(alone.runs[0].config).density.max_gaussians == 0
+    assert alone.runs[0].key({}, {}) != replace(alone.runs[0], config=MethodConfig()).key({}, {})
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    write_data(folder)
+    return folder
+
+
+def test_it_stands_beside_methods_with_anchors(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
+    both = benched(data, tmp_path, "3dgs", "scaffold-gs")
+    explicit, anchored = both["3dgs"].figures, both["scaffold-gs"].figures
+    assert explicit["iterations"] == anchored["iterations"] == 40
+    assert explicit["anchors"] is None
+    assert 0 < explicit["gaussians"] <= 3_000
+    assert anchored["gaussians"] == 10 * anchored["anchors"]
+    for name in ("psnr", "ssim", "psnr_cc", "psnr@0", "seconds", "peak_memory_bytes", "model_bytes", "fps"):
+        assert explicit[name] is not None, name
+    assert both["3dgs"].groups == both["scaffold-gs"].groups  # the same pixels
+    assert both["3dgs"].seen_by == "model"
+    text = (tmp_path / "table1" / "table.md").read_text()
+    assert "3DGS has no anchors" in text
+    assert "3,000, as many as they decode to" in text
+
+
+def test_alone_it_has_no_groups_and_other_settings_train_it_again(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
+    alone = benched(data, tmp_path, "3dgs")["3dgs"]
+    assert (alone.state, alone.groups, alone.seen_by) == ("done", (), "")
+    run = RunFolder(tmp_path / alone.folder)
+    assert not (run.path / GROUPS_FILE).exists()
+    with pytest.raises(RunError, match="has no coarse model"):
+        open_run(run.path)
+    model = gaussians_folder(run).model
+    before = model.stat().st_mtime_ns
+    (run.path / "bench.json").unlink()  # measured again, not trained
+    assert benched(data, tmp_path, "3dgs")["3dgs"].figures["psnr"] == alone.figures["psnr"]
+    assert model.stat().st_mtime_ns == before
+    assert benched(data, tmp_path, "3dgs", total=80, redo=True)["3dgs"].figures["iterations"] == 80
+    assert model.stat().st_mtime_ns != before
+
+
+def test_a_stopped_run_continues(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "LocalExecutor", InThisProcess)
+    whole = benched(data, tmp_path / "whole", "3dgs")["3dgs"]
+    train = gaussian_session.train
+
+    def half(state, stage, *, stop, after_step):
+        return train(state, stage, stop=lambda: state.iteration == 20, after_step=after_step)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(gaussian_session, "train", half)
+        with pytest.raises(Stopped):
+            benched(data, tmp_path / "half", "3dgs")
+    folder = gaussians_folder(RunFolder(tmp_path / "half" / whole.folder))
+    assert json.loads(folder.status_file.read_text())["iteration"] == 20
+    continued = benched(data, tmp_path / "half", "3dgs")["3dgs"]
+    assert continued.figures["psnr"] == whole.figures["psnr"]
+    assert continued.figures["iterations"] == 40

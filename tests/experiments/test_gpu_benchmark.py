@@ -1,0 +1,78 @@
+"""`experiments.microbench.gpu` without a card, so that it does not fail on its first day: all, on a pretended card."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from experiments.microbench import gpu
+from support.captures import tiny_scene, write_colmap
+from support.cuda_on_host import host_compiler, needs_nvrtc
+from support.fake_device import CARD, pretended_card
+from support.fake_gsplat import needs_gsplat
+from support.gpu_on_host import build, install
+from vdgs.kernels import devices
+from vdgs.kernels.operations import OPERATIONS
+
+pytest.importorskip("embreex", reason="synth: pip install 'vdgs[synth]'")
+pytestmark = [
+    pytest.mark.slow,
+    needs_nvrtc, needs_gsplat, pytest.mark.xdist_group("composition"),
+    pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def drivers(tmp_path_factory):
+    return build(tmp_path_factory.mktemp("kernels"))
+
+
+def test_all_of_it_runs_and_agrees(drivers, compiled_code, tmp_path, monkeypatch, capsys):
+    install(drivers, compiled_code, monkeypatch, "cuda", "")
+    monkeypatch.setattr(devices, "_no_card", lambda index: "")
+    monkeypatch.setattr(gpu, "TOWN_DB", 3.0)  # after eight iterations, less says nothing
+    write_colmap(tmp_path / "capture", tiny_scene(columns=3, rows=2, width=32, height=24, points=80))
+    machine = gpu.Machine(CARD, lambda: None, lambda: None, lambda: 0, (8, 6))
+    with pretended_card():
+        code = gpu.main(["--small", "--capture", str(tmp_path / "capture"), "--iterations", "4"], machine)
+    said = capsys.readouterr()
+    assert code == 0, said.err
+    for operation in OPERATIONS:
+        assert f"{operation}: " in said.out or f"{operation} by cuda: " in said.out
+    for kernel in ("rasterise_backward", "mark_anchors", "write_rows", "add_view", "move_anchors"):
+        assert f"{kernel:22}" in said.out
+    for line in ("rasterise_vjp by gsplat: gradient means_px", "a generated town", "cuda   "):
+        assert line in said.out
+    assert "gsplat  40x32" in said.out
+    assert "cuda    40x32" in said.out
+    assert "B for each anchor in view" in said.out
+    assert "capture: " in said.out
+
+
+def test_what_differs_or_fails_is_told_and_the_rest_goes_on(monkeypatch, capsys):
+    machine = gpu.Machine(torch.device("cpu"), lambda: None, lambda: None, lambda: 0, (8, 6))
+    for name in ("print_resources", "train_town", "print_memory"):
+        monkeypatch.setattr(gpu, name, lambda *_: None)
+
+    def fails(*_: object) -> None:
+        raise RuntimeError("the card fell out")
+
+    far = [gpu.gpu_parity.Difference("decode", "", "conics", "value", 0.5)]
+    monkeypatch.setattr(gpu.gpu_parity, "differences", lambda *_: far)
+    monkeypatch.setattr(gpu, "time_steps", fails)
+    assert gpu.main(["--small"], machine) == 1
+    said = capsys.readouterr()
+    assert "decode: conics differs by 5.0e-01" in said.err
+    assert "a training step: RuntimeError: the card fell out" in said.err
+    assert "memory" in said.out
+
+
+def test_what_there_is_no_time_for_is_named(capsys):
+    machine = gpu.Machine(torch.device("cpu"), lambda: None, lambda: None, lambda: 0, (8, 6))
+    assert gpu.main(["--small", "--minutes", "-1"], machine) == 0
+    assert "no time was left for: parity with the processor" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("size", [float("nan"), float("inf"), 2e-4])
+def test_a_number_that_is_none_is_no_agreement(size):
+    assert not gpu.gpu_parity.Difference("decode", "", "conics", "value", size).agrees

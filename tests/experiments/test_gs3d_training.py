@@ -1,0 +1,202 @@
+"""Training of 3DGS: deterministic, resumable bit for bit, on the schedules of its paper."""
+
+import io
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from experiments.baselines.gs3d import training as gaussian_training
+from experiments.baselines.gs3d.density import DensityConfig
+from experiments.baselines.gs3d.model import (
+    GaussiansModel,
+    initial_gaussians,
+)
+from experiments.baselines.gs3d.session import train_watched
+from experiments.baselines.gs3d.training import (
+    GaussianRates,
+    GaussiansConfig,
+    GaussiansStage,
+    degree_at,
+    downscale_at,
+    from_saved,
+    rates_at,
+    scene_extent,
+    start_state,
+    to_saved,
+    train,
+    train_step,
+)
+from support.checkerboard import Photographs
+from vdgs.errors import TrainingDiverged, VdgsError
+from vdgs.kernels import native, set_threads, threads
+from vdgs.runs.stage_folder import StageFolder
+from vdgs.settings.watching import WatchOptions
+from vdgs.storage.checkpoints import load_newest, save_state
+
+pytestmark = pytest.mark.xdist_group("gaussian_training")
+
+CONFIG = GaussiansConfig(
+    iterations=80,
+    resolutions=((0, 2), (20, 1)),
+    degree_interval=25,
+    density=DensityConfig(start=15, interval=10, until=0.75, dense=0.08, reset_interval=40),
+)
+
+
+def stage(config: GaussiansConfig = CONFIG) -> GaussiansStage:
+    return GaussiansStage(config, Photographs(), 8, scene_extent(Photographs().cameras))
+
+
+def start(config: GaussiansConfig = CONFIG):
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-4, 4, (300, 2)), np.zeros((300, 1))], axis=1)
+    grey = np.full((300, 3), 128, np.uint8)
+    return start_state(initial_gaussians(points, grey, config.initial_opacity, config.degree))
+
+
+def run(state, stage_, until: int | None = None):
+    train(
+        state, stage_,
+        stop=lambda: until is not None and state.iteration >= until, after_step=lambda *_: None,
+    )  # fmt: skip
+    return state
+
+
+def bits(state) -> dict[str, bytes]:
+    return {name: tensor.numpy().tobytes() for name, tensor in to_saved(state).tensors.items()}
+
+
+@pytest.fixture(scope="module")
+def unbroken():
+    return run(start(), stage())
+
+
+def test_training_learns_the_place():
+    longer = replace(
+        CONFIG, iterations=400, density=replace(CONFIG.density, interval=50, until=0.5, reset_interval=1000)
+    )
+    state = run(start(longer), stage(longer))
+    photographs, model = Photographs(), GaussiansModel(state.gaussians, (0.0, 0.0, 0.0), {})
+    errors = []
+    for index in range(8):
+        picture = model.render(photographs.camera(index)).image
+        errors.append(float(((picture - photographs.get(index)[0].float() / 255) ** 2).mean()))
+    assert np.mean(errors) < 0.2 * float(torch.var(photographs.get(0)[0].float() / 255))
+    assert len(state.gaussians) > 300
+
+
+def test_a_stopped_and_continued_run_has_the_same_bits(unbroken, tmp_path):
+    state = start()
+    for stop_at in (1, 19, 20, 27, 40, 79):
+        run(state, stage(), until=stop_at)
+        assert state.iteration == stop_at
+        save_state(tmp_path, to_saved(state))
+        saved, _ = load_newest(tmp_path)
+        assert saved is not None
+        state = from_saved(saved)
+    assert bits(run(state, stage())) == bits(unbroken)
+
+
+def test_the_number_of_threads_changes_no_bit(unbroken):
+    before = threads()
+    try:
+        set_threads(1 if before > 1 else 3)
+        assert bits(run(start(), stage())) == bits(unbroken)
+    finally:
+        set_threads(before)
+
+
+def memory_runs_out(monkeypatch, where: str, at_call: int, room=gaussian_training) -> None:
+    """The given function of a module, by name, finds no memory in its call of that number."""
+    function, calls = getattr(room, where), itertools.count(1)
+
+    def scarce(*values, **named):
+        if next(calls) == at_call:
+            raise MemoryError("std::bad_alloc")
+        return function(*values, **named)
+
+    monkeypatch.setattr(room, where, scarce)
+
+
+def watched(folder: StageFolder):
+    folder.path.mkdir(exist_ok=True)
+    console = Console(file=io.StringIO())
+    saved, _ = load_newest(folder.checkpoints)
+    state = start() if saved is None else from_saved(saved)
+    train_watched(folder, state, stage(), WatchOptions(), console)
+    return state
+
+
+@pytest.mark.parametrize("where", ["draw_gaussians", "_make_room"])
+def test_where_memory_runs_out_before_anything_moves_no_step_is_lost(where, unbroken, tmp_path, monkeypatch):
+    folder = StageFolder(tmp_path / "gaussians")
+    with monkeypatch.context() as scarcity:
+        memory_runs_out(scarcity, where, 38)
+        with pytest.raises(VdgsError, match=r"out of memory with .* The checkpoint of iteration 37 is saved in"):
+            watched(folder)
+    assert bits(watched(folder)) == bits(unbroken)
+
+
+def test_where_memory_runs_out_within_a_step_nothing_half_moved_is_saved(tmp_path, monkeypatch):
+    folder = StageFolder(tmp_path / "gaussians")
+    memory_runs_out(monkeypatch, "adam_rows", 38 * 5, room=native)  # four of the tensors have moved, or three
+    with pytest.raises(VdgsError, match="There is no checkpoint yet"):
+        watched(folder)
+
+
+def test_another_seed_is_another_run():
+    short = replace(CONFIG, iterations=10)
+    other = replace(short, seed=1)
+    assert bits(run(start(other), stage(other))) != bits(run(start(), stage(short)))
+
+
+def test_growth_keeps_everything_aligned_and_resets_opacities(unbroken):
+    assert len({tensor.shape[0] for tensor in to_saved(unbroken).tensors.values()}) == 1
+    state, counts = start(), {}
+    train(
+        state, stage(), stop=lambda: False, after_step=lambda s, r: counts.update({s.iteration: (r, len(s.gaussians))})
+    )
+    decided = [iteration for iteration, (report, _) in counts.items() if report.cloned is not None]
+    assert decided == [20, 30, 40, 50, 60]
+    for iteration in decided:
+        report, after = counts[iteration]
+        assert after == counts[iteration - 1][1] + report.cloned + report.split - report.pruned
+    assert counts[80][1] == counts[60][1]
+    assert sum(report.cloned for report, _ in counts.values() if report.cloned) > 0
+    assert sum(report.split for report, _ in counts.values() if report.split) > 0
+
+
+def test_opacities_are_reset_with_their_moments():
+    state = run(start(), stage(), until=39)
+    assert float(state.gaussians.logits.sigmoid().max()) > 0.05
+    train_step(state, stage())
+    assert float(state.gaussians.logits.sigmoid().max()) <= 0.01 + 1e-6
+    assert not state.moments.first["logits"].any()
+    assert state.moments.first["means"].any()
+
+
+def test_bands_of_colour_are_released_one_after_the_other():
+    assert [degree_at(i, CONFIG) for i in (0, 24, 25, 50, 75, 79)] == [0, 0, 1, 2, 3, 3]
+    state = run(start(), stage(), until=25)
+    assert not state.gaussians.rest.any()
+    run(state, stage(), until=50)
+    assert state.gaussians.rest[:, :3].any()
+    assert not state.gaussians.rest[:, 3:].any()
+
+
+def test_the_schedules():
+    assert [downscale_at(i, GaussiansConfig()) for i in (0, 249, 250, 499, 500, 9999)] == [4, 4, 2, 2, 1, 1]
+    config = GaussiansConfig(iterations=100, rates=GaussianRates())
+    assert rates_at(config, 3.0, 0)["means"] == pytest.approx(3 * 1.6e-4)
+    assert rates_at(config, 3.0, 50)["means"] == pytest.approx(3 * 1.6e-5)
+    assert rates_at(config, 3.0, 100)["means"] == pytest.approx(3 * 1.6e-6)
+    assert rates_at(config, 3.0, 100)["dc"] == pytest.approx(20 * rates_at(config, 9.0, 0)["rest"])
+
+
+def test_a_loss_that_is_not_a_number_stops_training():
+    with pytest.raises(TrainingDiverged, match="iteration 1"):
+        train_step(start(), replace(stage(), background=(float("nan"), 0.0, 0.0)))

@@ -1,0 +1,273 @@
+"""Anchor models baked into explicit Gaussians: what they must keep, and what cannot be kept."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from support.hand_made_models import camera_above, model_at
+from vdgs.cameras import Camera
+from vdgs.export import baking
+from vdgs.export.baking import Survey, bake, survey
+from vdgs.export.between import between, endless, round_count, rounds
+from vdgs.export.formats.scene import Scene
+from vdgs.export.formats.spool import spooled
+from vdgs.export.refining import refine
+from vdgs.export.refit import Baked, refit
+from vdgs.kernels.reference.ellipsoids import logarithms
+from vdgs.kernels.spherical_harmonics import function_count
+from vdgs.kernels.types import DecoderWeights, HeadWeights
+from vdgs.model.anchor_model import AnchorModel, Part
+from vdgs.model.decoder import Decoder
+from vdgs.model.gaussians import Gaussians, draw_gaussians
+from vdgs.model.render import decode_view, render
+from vdgs.model.world import places, spawned
+
+VIEWS = [camera_above(0.3, -0.2), camera_above(-2.0, 1.0, tilt_deg=30.0), camera_above(1.5, 2.0, tilt_deg=-25.0)]
+
+
+def scattered(n: int = 200, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform((-3, -3, 0), (3, 3, 0.5), (n, 3))
+
+
+def blind(decoder: Decoder) -> Decoder:
+    """The decoder without a view of where it is seen from."""
+
+    def without(head: HeadWeights) -> HeadWeights:
+        w1 = head.w1.clone()
+        w1[:, 32:] = 0.0
+        return replace(head, w1=w1)
+
+    weights = decoder.weights
+    return replace(
+        decoder,
+        weights=DecoderWeights(without(weights.opacity), without(weights.covariance), without(weights.colour)),
+    )
+
+
+def baked(seen: Survey, degree: int = 3, kept: np.ndarray | None = None) -> Gaussians:
+    parts = list(bake(seen, np.flatnonzero(seen.pixels > 0) if kept is None else kept, degree))
+    return Gaussians(**{name: torch.cat([part.tensors()[name] for part in parts]) for name in parts[0].tensors()})
+
+
+def drawn(gaussians: Gaussians, model: AnchorModel, camera) -> np.ndarray:
+    with torch.no_grad():
+        picture, _ = draw_gaussians(gaussians, camera, torch.tensor(model.background), gaussians.degree)
+    return picture.image.numpy()
+
+
+def test_what_is_spawned_is_what_the_kernels_decode():
+    model = model_at(scattered())
+    k = model.anchors.offsets.shape[1]
+    for camera in VIEWS:
+        rows, splats = decode_view(model, camera)
+        world = spawned(model.anchors, rows, model.decoder.weights, camera)
+        row, offset = splats.source.long() // k, splats.source.long() % k
+        assert torch.allclose(world.colours[row, offset], splats.colours, atol=1e-5)
+        assert torch.allclose(world.opacities[row, offset], splats.opacities, atol=1e-5)
+        assert torch.allclose(world.scales[row, offset].prod(-1), splats.volumes, rtol=1e-3)
+        pixels, _ = camera.project(places(model.anchors)[rows][row, offset].double().numpy())
+        assert np.allclose(pixels, splats.means_px.numpy(), atol=1e-2)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("parts", [(), (80, 0, 120)])
+def test_a_model_that_looks_alike_from_everywhere_is_baked_as_it_is(degree, parts):
+    model = model_at(scattered())
+    model = replace(model, decoder=blind(model.decoder), parts=tuple(Part(n, blind(model.decoder)) for n in parts))
+    gaussians = baked(survey(model, VIEWS), degree)
+    assert gaussians.rest.shape[1:] == (function_count(degree) - 1, 3)
+    for camera in VIEWS:
+        assert np.abs(drawn(gaussians, model, camera) - render(model, camera).image.numpy()).max() < 0.01
+
+
+def test_more_harmonics_come_nearer_to_a_model_that_looks_different_from_everywhere():
+    model = model_at(scattered())
+    colour = model.decoder.weights.colour
+    steep = replace(colour, w1=torch.cat([colour.w1[:, :32], 10 * colour.w1[:, 32:]], 1))
+    still = blind(model.decoder)
+    model = replace(model, decoder=replace(still, weights=replace(still.weights, colour=steep)))
+    views = [camera_above(x, y, tilt_deg=tilt) for x in (-2, 0, 2) for y in (-2, 0, 2) for tilt in (-30, 0, 30)]
+    seen = survey(model, views)
+    errors = []
+    for degree in (0, 1, 2, 3):
+        gaussians = baked(seen, degree)
+        errors.append(np.mean([(drawn(gaussians, model, v) - render(model, v).image.numpy()) ** 2 for v in views]))
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 0.1 * errors[0]
+
+
+def test_only_what_views_show_is_kept_and_pixels_count_what_is_drawn():
+    model = model_at(scattered())
+    seen = survey(model, VIEWS)
+    assert 0 < np.count_nonzero(seen.pixels) < seen.pixels.size
+    assert seen.pixels.sum() == pytest.approx(sum(float(render(model, v).alpha.sum()) for v in VIEWS), rel=1e-2)
+    away = survey(model, [camera_above(500.0, 500.0)])
+    assert not away.pixels.any()
+    assert list(bake(away, np.zeros(0, np.int64), 3)) == []
+    with pytest.raises(ValueError, match="cameras"):
+        survey(model, [])
+
+
+def test_parts_do_not_change_what_is_baked(monkeypatch):
+    model = model_at(scattered())
+    seen = survey(model, VIEWS)
+    kept = np.flatnonzero(seen.pixels > 0)[::3]
+    whole, done = baked(seen, 3, kept), list[int]()
+    expected = whole.tensors()
+    monkeypatch.setattr(baking, "ANCHORS_AT_ONCE", 17)
+    parts = list(bake(seen, kept, 3, done.append))
+    assert len(parts) > 5
+    assert done[-1] == len(kept) == len(whole)
+    joined = {name: torch.cat([part.tensors()[name] for part in parts]) for name in whole.tensors()}
+    # Ellipsoids as a whole: where two axes are alike, rounding decides where these two point.
+    shapes = [logarithms(each.pop("log_scales"), each.pop("quaternions")) for each in (joined, expected)]
+    assert torch.allclose(*shapes, atol=1e-5)
+    for name, tensor in expected.items():
+        assert torch.allclose(joined[name], tensor, atol=1e-5), name
+
+
+def test_places_and_numbers_of_what_is_kept():
+    model = model_at(scattered())
+    seen = survey(model, VIEWS)
+    kept = np.flatnonzero(seen.pixels > 0)
+    gaussians = baked(seen, 0, kept)
+    assert torch.equal(gaussians.means, places(model.anchors).reshape(-1, 3)[torch.from_numpy(kept)])
+    assert torch.allclose(gaussians.quaternions.norm(dim=1), torch.ones(len(kept)), atol=1e-5)
+    assert all(bool(torch.isfinite(tensor).all()) for tensor in gaussians.tensors().values())
+
+
+def steep(model: AnchorModel) -> AnchorModel:
+    """The model with colours, opacities and shapes that change much with where it is seen from."""
+
+    def steeper(head: HeadWeights) -> HeadWeights:
+        return replace(head, w1=torch.cat([head.w1[:, :32], 6 * head.w1[:, 32:]], 1))
+
+    weights = model.decoder.weights
+    heads = DecoderWeights(steeper(weights.opacity), steeper(weights.covariance), steeper(weights.colour))
+    return replace(model, decoder=replace(model.decoder, weights=heads))
+
+
+def on_disk(seen: Survey, kept: np.ndarray, folder: Path, degree: int = 3) -> Baked:
+    return Baked(
+        seen.model,
+        kept,
+        spooled(Scene(chunks=bake(seen, kept, degree), count=len(kept), degree=degree), folder / "spool"),
+    )
+
+
+def error(shown: Baked, views: Sequence[Camera]) -> float:
+    """Mean squared, of what is baked against what the model shows by it."""
+    gaussians = shown.spool.rows(np.arange(len(shown.spool.means)))
+    pairs = [(drawn(gaussians, shown.model, view), shown.drawn(view)[0].numpy()) for view in views]
+    return float(np.mean([(mine - wanted) ** 2 for mine, wanted in pairs]))
+
+
+GRID = [camera_above(x, y, tilt_deg=tilt) for x in (-2, 0, 2) for y in (-2, 0, 2) for tilt in (-30, 0, 30)]
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_colours_stand_in_for_opacities_and_shapes_that_change(tmp_path, degree):
+    seen = survey(steep(model_at(scattered())), GRID)
+    shown = on_disk(seen, np.flatnonzero(seen.pixels > 0), tmp_path, degree)
+    errors, others = [error(shown, GRID)], [error(shown, between(GRID, 9))]
+    opacities = shown.spool.rows(np.arange(9)).logits
+    for number in range(2):
+        refit(shown, [*GRID, *between(GRID, number)])
+        errors.append(error(shown, GRID))
+        others.append(error(shown, between(GRID, 9)))
+    assert errors == sorted(errors, reverse=True)
+    assert others == sorted(others, reverse=True)
+    if degree:
+        assert errors[-1] < 0.5 * errors[0]
+    assert torch.equal(shown.spool.rows(np.arange(9)).logits, opacities)
+
+
+def test_a_part_of_a_scene_is_compared_with_that_part(tmp_path):
+    model = model_at(scattered())
+    model = replace(model, decoder=blind(model.decoder))
+    seen = survey(model, VIEWS)
+    part = np.flatnonzero((seen.pixels > 0) & (np.arange(len(seen.pixels)) < len(seen.pixels) // 3))
+    shown = on_disk(seen, part, tmp_path)
+    before = shown.spool.rows(np.arange(len(part)))
+    refit(shown, VIEWS)
+    after = shown.spool.rows(np.arange(len(part)))
+    # Nothing changes with the direction, so nothing is missing: what was left out is not painted onto what stays.
+    assert (after.dc - before.dc).abs().max() < 0.02
+    assert np.array_equal(shown.of_anchors(np.arange(len(model.anchors))), np.arange(len(part)))
+
+
+def test_refining_comes_nearer_and_ends_when_its_time_is_over(tmp_path):
+    seen = survey(steep(model_at(scattered())), GRID)
+    shown = on_disk(seen, np.flatnonzero(seen.pixels > 0), tmp_path, degree=1)
+    refit(shown, GRID)
+    before, means = error(shown, GRID), np.array(shown.spool.means)
+    ticks = iter(range(1000))
+    passed: list[float] = []
+    assert refine(shown, endless(GRID), 80.0, passed.append, clock=lambda: next(ticks)) == 79
+    assert passed == list(range(1, 80))
+    assert error(shown, GRID) < 0.9 * before
+    assert np.array_equal(shown.spool.rows(np.arange(len(means))).means.numpy(), means)
+
+
+def test_cameras_between_lie_among_neighbours_that_look_alike_and_are_never_the_same():
+    turned = camera_above(0.0, 0.0, tilt_deg=80.0)
+    cameras = [*GRID, turned]
+    found = [*between(cameras, 0), *between(cameras, 1)]
+    assert len(found) == 2 * len(GRID)  # nobody looks as that one does
+    assert len({camera.position.tobytes() for camera in found}) == len(found)
+    for camera, own in zip(found, [*GRID, *GRID], strict=True):
+        turn = Rotation.from_matrix(camera.camera_from_world[:3, :3] @ own.camera_from_world[:3, :3].T)
+        assert 0 < turn.magnitude() <= 3**0.5 * 0.5 * np.arctan(own.width / 2 / own.fx)
+        alike = np.array([each.position for each in GRID if own.forward @ each.forward > 0.7])
+        assert (camera.position >= alike.min(0) - 1e-9).all()
+        assert (camera.position <= alike.max(0) + 1e-9).all()
+    assert between(VIEWS[:1], 0) == []
+    assert [each.position.tolist() for each in between(VIEWS, 3)] == [
+        each.position.tolist() for each in between(VIEWS, 3)
+    ]
+
+
+def test_rounds_look_from_between_and_the_last_one_at_the_photographs_too():
+    """A camera without neighbours stays in all of them: nobody else looks there."""
+    cameras = [*GRID, camera_above(0.0, 0.0, tilt_deg=80.0)]
+    planned = rounds(cameras, 4)
+    known = {camera.position.tobytes() for camera in GRID}
+    assert [len(each) for each in planned] == [len(cameras)] * 3 + [len(cameras) + len(GRID)]
+    for each in planned[:3]:
+        assert each[-1].position == pytest.approx(cameras[-1].position)
+        assert not known & {camera.position.tobytes() for camera in each[:-1]}
+    assert list(planned[3][: len(cameras)]) == cameras
+    assert rounds(cameras, 0) == ()
+    assert len(rounds(cameras, 1)) == 1
+    assert (round_count(None, 10**6), round_count(None, 10**7), round_count(3, 10**7)) == (8, 1, 3)
+
+
+def test_more_rounds_come_nearer_where_none_of_them_looked(tmp_path):
+    seen = survey(steep(model_at(scattered())), GRID)
+    errors = []
+    for count in (0, 1, 3, 6):
+        (folder := tmp_path / str(count)).mkdir()
+        shown = on_disk(seen, np.flatnonzero(seen.pixels > 0), folder)
+        for each in rounds(GRID, count):
+            refit(shown, each)
+        errors.append(error(shown, between(GRID, 99)))
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 0.6 * errors[1]
+
+
+def test_cameras_to_refine_by_never_end_nor_come_again_but_for_those_of_photographs():
+    shown = list(islice(endless(GRID), 4 * len(GRID)))
+    places = [camera.position.tobytes() for camera in shown]
+    known = {camera.position.tobytes() for camera in GRID}
+    of_rounds = {camera.position.tobytes() for cameras in rounds(GRID, 6) for camera in cameras} - known
+    others = [place for place in places if place not in known]
+    assert len(others) == len(set(others)) == 2 * len(GRID)
+    assert not of_rounds & set(others)

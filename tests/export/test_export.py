@@ -1,0 +1,284 @@
+"""`vdgs export`: what is chosen, in which coordinates it stands, and what is refused before the work."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from support.captures import look_down
+from support.gaussians import random_gaussians
+from support.hand_made_models import capture_at, ground, model_at
+from vdgs.cameras import Camera
+from vdgs.captures.geodesy import ecef_from_geodetic, enu_axes
+from vdgs.errors import VdgsError
+from vdgs.export import exporting, here
+from vdgs.export.baking import survey
+from vdgs.export.exporting import RECORD, export_run
+from vdgs.export.formats import registry
+from vdgs.export.frame import FAR, frame_of
+from vdgs.model.anchor_model import AnchorModel, Part
+from vdgs.model.gaussians import draw_gaussians
+from vdgs.model.render import render
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import TrainedRun
+from vdgs.runs.status import Status
+from vdgs.settings.requests import ExportRequest
+from vdgs.storage.files import read_json
+
+#: Far from the middle of its UTM zone: grid north is 1.1 degrees off.
+PLACE = (46.95, 7.44, 560.0)
+QUIET = Console(quiet=True)
+
+
+def scattered(parts: tuple[int, ...] = ()) -> AnchorModel:
+    places = np.random.default_rng(0).uniform((-3, -3, 0), (3, 3, 0.5), (200, 3))
+    model = model_at(places)
+    return replace(model, parts=tuple(Part(count, model.decoder) for count in parts))
+
+
+@pytest.fixture
+def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """`vdgs export` of a model that was never trained, into files of these names."""
+
+    def run(
+        *names: str, model: AnchorModel | None = None, origin: tuple[float, float, float] | None = None, **asked: Any
+    ) -> dict[str, Any]:
+        file, shown = tmp_path / "run" / "merged" / "model.safetensors", model or scattered()
+        shown.save(file)
+        opened = TrainedRun(
+            folder=RunFolder(tmp_path / "run"), model=shown, model_path=file, name="merged", status=Status(), key="k",
+            caution="", capture=capture_at(origin),
+        )  # fmt: skip
+        monkeypatch.setattr(exporting, "open_run", lambda *_: opened)
+        request = ExportRequest(
+            run=tmp_path / "run", to=tuple(tmp_path / name for name in names), measure=False, device="cpu", **asked
+        )
+        return export_run(request, QUIET)
+
+    return run
+
+
+def test_all_files_of_one_baking_hold_the_same_scene(export, tmp_path: Path):
+    record = export("a.ply", "b.splat", "c.ply", "d.points.ply", sh_degree=2)
+    whole, small = registry.read(tmp_path / "a.ply"), registry.read(tmp_path / "b.splat")
+    assert record["gaussians"] == len(whole) == len(small)
+    assert whole.degree == 2
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "c.ply").read_bytes()
+    model = scattered()
+    for view in capture_at(None).train_views:
+        with torch.no_grad():
+            drawn = draw_gaussians(whole, view.camera, torch.tensor(model.background), 2)[0].image
+        assert (drawn - render(model, view.camera).image).abs().mean() < 0.01
+    assert read_json(tmp_path / "run" / RECORD) == record
+    assert [Path(file["file"]).name for file in record["files"]] == ["a.ply", "b.splat", "c.ply", "d.points.ply"]
+    assert not list(tmp_path.glob(".baking-*"))
+
+
+def test_the_size_of_tiles_is_theirs_alone(export, tmp_path: Path):
+    (tmp_path / "other.bin").write_bytes(bytes(10_000_000))
+    (tmp_path / "tiles-9").mkdir()
+    (tmp_path / "tiles-9" / "0.glb").write_bytes(bytes(10_000_000))
+    (file,) = export("tileset.json")["files"]
+    (tile,) = (tmp_path / "tiles-10").iterdir()
+    assert file["bytes"] == tile.stat().st_size + (tmp_path / "tileset.json").stat().st_size
+
+
+def test_files_about_a_place_on_earth_keep_its_origin_apart(export, tmp_path: Path):
+    pytest.importorskip("pyproj")
+    export("utm.ply", "enu.ply", origin=PLACE, crs="EPSG:32632")
+    frame = frame_of(ground(PLACE), "EPSG:32632", np.zeros(3))
+    assert max(np.abs(frame.facts.origin)) > FAR
+    assert all(value % 100 == 0 for value in frame.facts.origin)
+    local = registry.read(tmp_path / "utm.ply")
+    assert float(local.means.abs().max()) < 100
+    back = frame.to_ground(local)
+    assert float(back.means[:, :2].abs().max()) < 20
+    text = (tmp_path / "utm.ply").read_bytes()[:6000].decode("ascii", "replace")
+    assert "origin" in text
+    assert "UTM zone 32N" in text
+    # In the default system, metres east and north of the origin, nothing is turned.
+    export("plain.ply", origin=PLACE)
+    export("local.ply")
+    plain, here = registry.read(tmp_path / "plain.ply"), registry.read(tmp_path / "local.ply")
+    assert torch.allclose(plain.means, here.means, atol=1e-4)
+
+
+def on_earth(local: torch.Tensor, geodetic: tuple[float, float, float]) -> np.ndarray:
+    """Earth-centred metres [n, 3] of what lies so far east, north and up of a place."""
+    return local.double().numpy() @ enu_axes(*geodetic[:2]) + ecef_from_geodetic(np.array([geodetic]))
+
+
+@pytest.mark.parametrize("crs", [None, "enu", "EPSG:32632", "source", "local"])
+def test_tiles_stand_on_the_globe_whatever_other_files_are_written_in(export, tmp_path: Path, crs):
+    pytest.importorskip("pyproj")
+    record = export("a.ply", "tileset.json", origin=PLACE, crs=crs)
+    assert not any("centre of the Earth" in note for file in record["files"] for note in file["notes"])
+    matrix = np.array(read_json(tmp_path / "tileset.json")["root"]["transform"]).reshape(4, 4).T
+    np.testing.assert_allclose(matrix[:3, 3], ecef_from_geodetic(np.array([PLACE]))[0], atol=1e-6)
+    np.testing.assert_allclose(matrix[:3, :3], enu_axes(*PLACE[:2]).T, atol=1e-12)
+
+
+def test_tiles_of_nowhere_in_a_map_are_refused(export, tmp_path: Path):
+    with pytest.raises(VdgsError, match="not georeferenced"):
+        export("tileset.json", crs="EPSG:32632")
+    assert not (tmp_path / "tileset.json").exists()
+    (file,) = export("tileset.json")["files"]
+    assert any("centre of the Earth" in note for note in file["notes"])
+
+
+def test_a_scene_far_from_its_origin_stays_where_it_is_on_earth(export, tmp_path, monkeypatch):
+    looking_down_at(monkeypatch, 3000.0)
+    model = moved(scattered(), torch.full((200,), 3000.0))
+    export("a.spz", "a.ply", model=model, origin=PLACE)
+    near, whole = registry.read(tmp_path / "a.spz"), registry.read(tmp_path / "a.ply")
+    facts = read_json(tmp_path / "a.spz.json")
+    assert facts["origin"] == [0, 0, 0]
+    assert facts["geodetic"] != list(PLACE)
+    assert float(near.means.abs().max()) < 100
+    apart = on_earth(near.means, facts["geodetic"]) - on_earth(whole.means, PLACE)
+    assert np.abs(apart).max() < 1e-3
+    # Tiles that are farther away than single precision reaches say so in their transform.
+    looking_down_at(monkeypatch, 30_000.0)
+    model = moved(scattered(), torch.full((200,), 30_000.0))
+    export("tileset.json", model=model, origin=PLACE)
+    root = read_json(tmp_path / "tileset.json")["root"]
+    matrix = np.array(root["transform"]).reshape(4, 4).T
+    middle = (matrix @ [*root["boundingVolume"]["box"][:3], 1.0])[:3]
+    expected = on_earth(torch.tensor([[30_000.0, 0.0, 0.0]]), PLACE)[0]
+    assert np.linalg.norm(middle - expected) < 10
+    assert np.abs(root["boundingVolume"]["box"][:3]).max() < 200
+
+
+def test_a_frame_and_back_is_where_it_was():
+    pytest.importorskip("pyproj")
+    model = scattered()
+    seen = survey(model, [view.camera for view in capture_at(None).train_views])
+    gaussians = next(iter(here.bake(seen, np.flatnonzero(seen.pixels > 0), 3)))
+    for crs in ("EPSG:32632", "enu", "local"):
+        frame = frame_of(ground(PLACE), crs, np.zeros(3))
+        back = frame.to_ground(frame.place(gaussians))
+        for name in ("means", "log_scales", "rest"):
+            assert torch.allclose(getattr(back, name), getattr(gaussians, name), atol=1e-3), (crs, name)
+    frame = frame_of(ground(PLACE), "enu", np.array([5000.0, -3000.0, 20.0]), far=1000.0)
+    back = frame.to_ground(frame.place(gaussians))
+    assert torch.allclose(back.means, gaussians.means, atol=1e-3)
+
+
+def test_boxes_blocks_and_numbers_choose(export, tmp_path: Path):
+    whole = export("all.ply")["gaussians"]
+    assert export("few.ply", max_gaussians=50)["gaussians"] == 50
+    assert export("many.ply", max_gaussians=whole + 1)["gaussians"] == whole
+    box = export("box.ply", bbox=(-1.0, -1.0, 2.0, 0.5))["gaussians"]
+    inside = registry.read(tmp_path / "box.ply").means
+    assert 0 < box < whole
+    assert float(inside[:, 0].min()) >= -1.0
+    assert float(inside[:, 1].max()) <= 0.5
+    parted = scattered((80, 120))
+    first, second = (export(f"{block}.ply", model=parted, block=block)["gaussians"] for block in (0, 1))
+    assert first + second == whole
+    assert min(first, second) > 0
+    # Those that are left out make less of the photographs than those that stay.
+    seen = survey(scattered(), [view.camera for view in capture_at(None).train_views])
+    assert np.sort(seen.pixels)[::-1][:50].sum() > 0.3 * seen.pixels.sum()
+
+
+@pytest.mark.parametrize(
+    ("names", "asked", "said"),
+    [
+        ((), {}, "--to FILE"),
+        (("scene.obj",), {}, "no format is known"),
+        (("a.ply", "a.ply"), {}, "given twice"),
+        (("run/report.html",), {}, "is the report of the run"),
+        (("a.ply", "run/../run/report.html"), {}, "is the report of the run"),
+        (("a.ply",), {"bbox": (50.0, 50.0, 60.0, 60.0)}, "lies within"),
+        (("a.ply",), {"bbox": (1.0, 0.0, 1.0, 5.0)}, "is empty"),
+        (("a.ply",), {"bbox": (float("nan"), 0.0, 1.0, 5.0)}, "is empty"),
+        (("a.ply",), {"block": 3}, "--block 3"),
+        (("a.ply",), {"crs": "EPSG:32632"}, "not georeferenced"),
+    ],
+)
+def test_what_cannot_be_written_is_said_before_anything_is_baked(
+    export, tmp_path: Path, monkeypatch, names, asked, said
+):
+    monkeypatch.setattr(here, "bake", lambda *_: pytest.fail("baked"))
+    with pytest.raises(VdgsError, match=said):
+        export(*names, **asked)
+    assert not list(tmp_path.glob("*.ply"))
+
+
+def looking_down_at(monkeypatch: pytest.MonkeyPatch, *x: float) -> None:
+    """Let captures have training cameras above these places."""
+    capture = capture_at(None)
+    cameras = [
+        Camera(
+            camera_from_world=look_down(np.array([at, 0, 8.0]), 0.0, 90.0),
+            fx=60.0,
+            fy=60.0,
+            cx=32.0,
+            cy=24.0,
+            width=64,
+            height=48,
+        )
+        for at in x
+    ]
+    views = tuple(replace(capture.views[0], camera=camera) for camera in cameras)
+    monkeypatch.setattr(f"{__name__}.capture_at", lambda origin: replace(capture, views=views, ground=ground(origin)))
+
+
+def moved(model: AnchorModel, x: torch.Tensor) -> AnchorModel:
+    positions = model.anchors.positions + torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], 1)
+    return replace(model, anchors=replace(model.anchors, positions=positions))
+
+
+def test_a_scene_too_wide_for_a_format_is_refused_before_it_is_baked(export, monkeypatch):
+    monkeypatch.setattr(here, "bake", lambda *_: pytest.fail("baked"))
+    looking_down_at(monkeypatch, -3000.0, 3000.0)
+    sides = torch.where(torch.arange(200) % 2 == 0, 3000.0, -3000.0)
+    with pytest.raises(VdgsError, match="2048"):
+        export("a.spz", model=moved(scattered(), sides))
+
+
+def test_a_scene_far_from_its_origin_is_placed_near_one(export, tmp_path, monkeypatch):
+    looking_down_at(monkeypatch, 3000.0)
+    export("a.spz", "a.ply", model=moved(scattered(), torch.full((200,), 3000.0)))
+    near, whole = registry.read(tmp_path / "a.spz"), registry.read(tmp_path / "a.ply")
+    origin = torch.tensor(read_json(tmp_path / "a.spz.json")["origin"])
+    assert origin.tolist() == [3000.0, 0.0, 0.0]
+    assert torch.allclose(near.means + origin, whole.means, atol=1e-3)
+
+
+def test_a_file_goes_without_the_few_that_lie_beyond_its_reach(export, tmp_path, monkeypatch):
+    model = scattered()
+    positions = model.anchors.positions.clone()
+    positions[7] = torch.tensor([0.0, 0.0, -5000.0])
+    model = replace(model, anchors=replace(model.anchors, positions=positions))
+    real = survey(model, [view.camera for view in capture_at(None).train_views])
+    pixels = real.pixels.copy()
+    k = model.anchors.offsets.shape[1]
+    there = slice(7 * k, 8 * k)
+    pixels[there] = 0.01
+    monkeypatch.setattr(here, "survey", lambda *_: replace(real, pixels=pixels))
+    monkeypatch.setattr(here, "bake", lambda seen, kept, degree, _: iter([random_gaussians(len(kept), degree)]))
+    monkeypatch.setattr(here, "refit", lambda *_: None)
+    record = export("all.ply", "near.spz", model=model)
+    assert [file["gaussians"] for file in record["files"]] == [record["gaussians"], record["gaussians"] - k]
+    assert len(registry.read(tmp_path / "near.spz")) == record["gaussians"] - k
+    pixels[there] = pixels.sum()
+    with pytest.raises(VdgsError, match="2048"):
+        export("near.spz", model=model)
+
+
+def test_a_disk_that_fills_leaves_nothing(export, tmp_path: Path, monkeypatch):
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(here, "spooled", full)
+    with pytest.raises(VdgsError, match="No space left"):
+        export("a.ply")
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -1,0 +1,143 @@
+"""Training on a device other than the CPU, without one: nothing mixes devices, and the numbers are those of the CPU."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from support.block_training import CONFIG, coarse
+from support.checkerboard import Photographs
+from support.cuda_on_host import ORDERS, host_compiler, needs_nvrtc
+from support.fake_device import CARD, pretended_card
+from support.fake_gsplat import needs_gsplat
+from support.gpu_on_host import build, install
+from vdgs import kernels
+from vdgs.settings.method import CompensationConfig, GrowthConfig
+from vdgs.training import Stage, Surroundings, TrainingState, loop, start_state, to_saved, train_step
+
+pytestmark = [
+    pytest.mark.slow,
+    needs_nvrtc, needs_gsplat, pytest.mark.xdist_group("composition"),
+    pytest.mark.skipif(host_compiler() is None, reason="no C++ compiler"),
+]  # fmt: skip
+CPU = torch.device("cpu")
+#: Growth, compensation, a new order and the mean of models all happen within few steps.
+BUSY = {
+    "growth": GrowthConfig(interval=2, statistics_from=0, start=2, threshold=1e-6, gate=0.1, until=0.5),
+    "compensation": CompensationConfig(enabled=True, t_low=1.0),
+    "iterations": 8,
+    "average": 0.4,
+}
+
+
+def begun(device: torch.device, **changes: Any) -> tuple[TrainingState, Stage]:
+    """A block among frozen surroundings, about to be trained on a device."""
+    anchors, decoder = coarse()
+    away = replace(anchors, positions=anchors.positions + torch.tensor([3.0, 0.0, 0.0]))
+    stage = Stage(
+        config=replace(CONFIG, **changes), images=Photographs(), image_count=8, voxel=0.4, camera_height=5.0,
+        kind="block", background=(0.3, 0.4, 0.5), surroundings=Surroundings(away.to(device), decoder.to(device)),
+        device=device,
+    )  # fmt: skip
+    return start_state(anchors.to(device), decoder.copy().to(device), stage), stage
+
+
+def trained_on(device: torch.device, steps: int, **changes: Any) -> TrainingState:
+    """It after so many steps."""
+    state, stage = begun(device, **changes)
+    for _ in range(steps):
+        train_step(state, stage)
+    return state
+
+
+#: What a step waits for: how many anchors are visible, how many splats they show, how many tiles these reach, whether
+#: the loss is a number, and whether the gradients were.
+WAITS = {
+    "kernels/cuda/cull.py: cull: _local_scalar_dense": 1,
+    "kernels/cuda/decode.py: _decoded: _local_scalar_dense": 1,
+    "training/loop.py: train_step: tolist": 1,
+    "training/loop.py: _move: _local_scalar_dense": 1,
+}
+
+
+@pytest.fixture(scope="module")
+def drivers(tmp_path_factory):
+    return build(tmp_path_factory.mktemp("composition"))
+
+
+@pytest.fixture(params=["gsplat", "cuda"])
+def rasteriser(request, drivers, compiled_code, monkeypatch) -> str:
+    """With each of the rasterisers that may draw on a card."""
+    install(drivers, compiled_code, monkeypatch, "cuda", request.param)
+    return request.param
+
+
+def test_a_step_on_another_device_makes_the_numbers_of_the_processor(monkeypatch, rasteriser):
+    with pretended_card():
+        found = to_saved(trained_on(CARD, 1)).tensors
+    monkeypatch.setenv(kernels.VARIABLE, "reference")
+    expected = to_saved(trained_on(CPU, 1)).tensors
+    assert found.keys() == expected.keys()
+    for name, tensor in expected.items():
+        torch.testing.assert_close(found[name], tensor, rtol=1e-3, atol=1e-5)
+
+
+def test_steps_have_the_same_bits_whichever_block_comes_first(monkeypatch, drivers, compiled_code):
+    """With the own rasteriser: splats stand in another order, among frozen surroundings too."""
+    found = []
+    for order in ORDERS[:3]:
+        install(drivers, compiled_code, monkeypatch, "cuda", "cuda")  # anew: tables are kept for a card
+        for driver in drivers.values():
+            monkeypatch.setattr(driver, "order", order)
+        with pretended_card():
+            found.append(to_saved(trained_on(CARD, 2)).tensors)
+    for other in found[1:]:
+        assert all(torch.equal(tensor, other[name]) for name, tensor in found[0].items())
+
+
+def test_a_step_waits_for_the_card_only_where_it_must(rasteriser):
+    """In the steady state: without growth, and but for every tenth step, in which people are told a PSNR."""
+    with pretended_card() as waits:
+        state, stage = begun(CARD)
+        train_step(state, stage)
+        waits.clear()
+        train_step(state, stage)
+        # gsplat's wait of this kind is in its compiled part.
+        tiles = {"kernels/cuda/rasterise.py: _entries: _local_scalar_dense": 1} if rasteriser == "cuda" else {}
+        surroundings = {
+            "kernels/cuda/cull.py: cull: _local_scalar_dense": 2,
+            "kernels/cuda/decode.py: _decoded: _local_scalar_dense": 2,
+        }
+        assert dict(waits) == WAITS | tiles | surroundings
+
+
+def test_growth_a_new_order_and_the_mean_stay_on_the_device(monkeypatch, rasteriser):
+    monkeypatch.setattr(loop, "REORDER_INTERVAL", 5)
+    with pretended_card():
+        state = trained_on(CARD, 8, **BUSY)
+        devices = {tensor.device.type for group in state.groups().values() for tensor in group.values()}
+        devices |= {tensor.device.type for tensor in to_saved(state).tensors.values()}
+    assert devices == {"cuda"}
+    assert state.average is not None
+    assert len(state.anchors) != len(coarse()[0])  # some have come, others have gone
+
+
+def test_mixed_devices_are_found(monkeypatch, rasteriser):
+    """The check can fail: with a background left in main memory, it does."""
+    monkeypatch.setattr(loop, "background_at", lambda stage, iteration: torch.zeros(3))
+    with (
+        pretended_card(),
+        pytest.raises((RuntimeError, TypeError), match=r"cuda and of shape|a cuda device, not on cpu|is not on cuda"),
+    ):
+        trained_on(CARD, 1)
+
+
+def test_cards_take_the_composed_set_and_the_processor_its_own(monkeypatch):
+    assert kernels.choose(CARD).__name__ == "vdgs.kernels.composed"
+    assert kernels.choose(CPU).__name__ == "vdgs.kernels.native"
+    for name in ("reference", "composed"):
+        monkeypatch.setenv(kernels.VARIABLE, name)
+        assert kernels.choose(CPU).__name__ == f"vdgs.kernels.{name}"

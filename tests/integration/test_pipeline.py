@@ -1,0 +1,502 @@
+"""`vdgs run` as people run it: real processes, stopped, killed, damaged, given other settings and continued."""
+
+import json
+import shutil
+import signal
+from contextlib import suppress
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from support.captures import tiny_scene, write_colmap
+from support.commands import begun, do_tasks_here, entry_point, is_free, vdgs, wait_until
+from vdgs.evaluation.alone import BlocksAlone
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.decoder import Decoder
+from vdgs.model.visibility import visibility_of
+from vdgs.partition.assignment.saving import load_scores
+from vdgs.partition.blocks import load_blocks, places_of
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import open_run
+from vdgs.runs.stereo import PIXELS_A_POINT
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pipeline")]
+
+ITERATIONS, BLOCK_ITERATIONS = 200, 120
+SETTINGS = (
+    "--preset", "laptop", "--iterations", str(ITERATIONS), "--save-every", "20", "--anchors.offsets", "3",
+    "--growth.start", "50", "--growth.interval", "50", "--growth.statistics-from", "25", "--growth.gate", "0.05",
+    "--blocks", "2", "--jobs", "2", "--block.compensation.enabled", "--block.compensation.t-low-quantile", "0",
+    "--assignment.min-cameras", "4", "--block.iterations", str(BLOCK_ITERATIONS), "--block.growth.gate", "0.05",
+    "--block.growth.start", "25", "--block.growth.statistics-from", "0", "--block.growth.interval", "25", "--no-maps",
+)  # fmt: skip
+#: What a block's model is compared by: the whole file.
+MERGED = "merged/model.safetensors"
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("place") / "capture"
+    write_colmap(folder, tiny_scene())
+    origin = {"frame": "ENU", "origin_lat_deg": 47.0, "origin_lon_deg": 8.5, "origin_alt_m": 400.0}
+    (folder / "georef.json").write_text(json.dumps(origin))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def unbroken(capture, tmp_path_factory) -> Path:
+    run = tmp_path_factory.mktemp("unbroken") / "run"
+    done = entry_point("run", capture, "--output", run, *SETTINGS)
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "2 at once" in done.stdout
+    assert "→ merged" in done.stdout
+    return run
+
+
+@pytest.fixture
+def copied(unbroken, tmp_path) -> Path:
+    return Path(shutil.copytree(unbroken, tmp_path / "run", ignore=shutil.ignore_patterns(".lock")))
+
+
+def model(run: Path, name: str = MERGED) -> bytes:
+    return (run / name).read_bytes()
+
+
+def changed_files(run: Path, before: dict[str, int]) -> set[str]:
+    return {name for name, moment in moments(run).items() if before.get(name) != moment}
+
+
+def moments(run: Path) -> dict[str, int]:
+    return {
+        str(path.relative_to(run)): path.stat().st_mtime_ns
+        for path in run.rglob("*")
+        if path.is_file() and path.name != ".lock"
+    }
+
+
+def train_each(run: Path, *settings: str) -> None:
+    """Train every block again, one command each."""
+    for index in range(2):
+        done = vdgs("train", run, "--block", index, *settings, "--redo")
+        assert done.returncode == 0, done.stderr
+
+
+def test_a_run_ends_with_maps_and_its_report_shows_them(copied, capture):
+    asked = ("run", capture, "--output", copied, *[each for each in SETTINGS if each != "--no-maps"])
+    done = vdgs(*asked)
+    assert done.returncode == 0, done.stderr
+    assert {"orthophoto.tif", "dsm.tif", "visibility.tif"} <= {file.name for file in (copied / "maps").iterdir()}
+    assert "The scene as maps." in (copied / "report.html").read_text()
+    assert "already drawn" in vdgs(*asked).stdout
+
+
+def test_a_scene_goes_out_and_says_what_it_loses(copied, tmp_path):
+    scene = tmp_path / "out" / "scene.ply"
+    done = vdgs("export", copied, "--to", scene, "--to", tmp_path / "out" / "scene.splat")
+    assert done.returncode == 0, done.stderr
+    assert "scene.ply, read back, on" in done.stdout
+    assert "scene.splat, read back, on" in done.stdout
+    loss = json.loads((copied / "export.json").read_text())["losses"][0]
+    measured = json.loads((copied / "evaluation" / "metrics.json").read_text())
+    assert loss["psnr"] == pytest.approx(measured["psnr"], abs=1e-6)
+    assert loss["ssim"] == pytest.approx(measured["ssim"], abs=1e-6)
+    assert abs(loss["psnr_baked"] - loss["psnr"]) < 0.5
+    assert {"psnr", "psnr_baked", "ssim_baked", "lower"} <= loss["by_visibility"][0].keys()
+
+
+def test_blocks_draw_parts_of_photographs_and_the_pixels_that_were_asked_for(unbroken, copied):
+    """So many photographs' worth of pixels in more steps, or so many steps with fewer pixels: by the setting."""
+    for index, folder in enumerate(RunFolder(unbroken).block_folders()):
+        status, cameras = folder.status(), load_scores(unbroken / "partition" / "scores.npz")[2].cameras
+        assert status.iteration > 1.04 * BLOCK_ITERATIONS
+        assert status.photographs == pytest.approx(BLOCK_ITERATIONS, abs=1)
+        assert len(json.loads((folder.path / "crops.json").read_text())["crops"]) == cameras[:, index].sum()
+    train_each(copied, "--block.crop", "steps")
+    for folder in RunFolder(copied).block_folders():
+        assert folder.status().iteration == BLOCK_ITERATIONS
+        assert folder.status().photographs < 0.96 * BLOCK_ITERATIONS
+        assert model(copied, folder.model) != model(unbroken, folder.model.relative_to(copied))
+
+
+def test_a_run_leaves_what_the_documents_say(unbroken):
+    expected = [
+        "config.yaml", "capture.json", "coarse/model.safetensors", "coarse/evaluation/metrics.json",
+        "visibility/visibility.json", "visibility/map.png", "partition/blocks.geojson", "partition/scores.npz",
+        "partition/blocks_wgs84.geojson", "partition/partition.json", "partition/blocks.png",
+        "partition/block_facts.png", "partition/scores.png", "blocks/00/model.safetensors", "blocks/01/log.jsonl",
+        "blocks/01/output.log", MERGED, "evaluation/metrics.json", "evaluation/by_block.json",
+        "evaluation/contact_sheet.png", "report.html",
+    ]  # fmt: skip
+    assert [name for name in expected if not (unbroken / name).is_file()] == []
+    assert not list(unbroken.rglob("*.tmp"))
+    metrics = {folder: json.loads((unbroken / folder / "metrics.json").read_text())
+               for folder in ("coarse/evaluation", "evaluation")}  # fmt: skip
+    assert (metrics["coarse/evaluation"]["model"], metrics["evaluation"]["model"]) == ("coarse", "merged")
+    bins = [[each["pixels"] for each in each["by_visibility"]] for each in metrics.values()]
+    assert bins[0] == bins[1]  # both models are measured on the same pixels
+
+
+def test_the_merged_scene_is_the_cores_of_the_blocks(unbroken):
+    blocks, merged = load_blocks(unbroken / "partition/blocks.geojson"), AnchorModel.load(unbroken / MERGED)
+    assert len(blocks) == 2
+    owner = blocks.owner(places_of(merged.anchors.positions))
+    for index in range(2):
+        own = AnchorModel.load(unbroken / f"blocks/{index:02d}/model.safetensors").anchors
+        part = merged.anchors.select(torch.from_numpy(owner == index))
+        assert all(torch.equal(own.tensors()[name], tensor) for name, tensor in part.tensors().items())
+    coarse = AnchorModel.load(unbroken / "coarse/model.safetensors")
+    assert len(merged.anchors) > len(coarse.anchors)
+    assert bits(merged.decoder) == bits(coarse.decoder)
+    blocks_own = [AnchorModel.load(unbroken / f"blocks/{index:02d}/model.safetensors").decoder for index in range(2)]
+    assert [bits(part.decoder) for part in merged.parts] == [bits(own) for own in blocks_own]
+    assert len({tuple(bits(each).values()) for each in (coarse.decoder, *blocks_own)}) == 3
+
+
+def bits(decoder: Decoder) -> dict[str, bytes]:
+    return {name: tensor.detach().numpy().tobytes() for name, tensor in decoder.tensors().items()}
+
+
+def test_blocks_as_printed_leave_one_decoder(unbroken, copied):
+    train_each(copied, "--block.decoder", "frozen", "--block.sampling", "even")
+    assert vdgs("merge", copied).returncode == 0
+    coarse, merged = AnchorModel.load(copied / "coarse/model.safetensors"), AnchorModel.load(copied / MERGED)
+    assert merged.parts == ()
+    assert bits(merged.decoder) == bits(coarse.decoder)
+    for index in range(2):
+        block = AnchorModel.load(copied / f"blocks/{index:02d}/model.safetensors")
+        assert bits(block.decoder) == bits(coarse.decoder)
+        other = AnchorModel.load(unbroken / f"blocks/{index:02d}/model.safetensors")
+        assert bits(other.decoder) != bits(block.decoder)
+
+
+def test_a_block_alone_stands_among_coarse_anchors_with_the_coarse_decoder(unbroken):
+    run, coarse = RunFolder(unbroken), AnchorModel.load(unbroken / "coarse/model.safetensors")
+    alone = BlocksAlone(run, coarse).assembled(1)
+    own = AnchorModel.load(unbroken / "blocks/01/model.safetensors")
+    assert [part.count for part in alone.parts] == [len(own.anchors), len(alone.anchors) - len(own.anchors)]
+    assert [bits(part.decoder) for part in alone.parts] == [bits(own.decoder), bits(coarse.decoder)]
+    assert len(alone.anchors) > len(own.anchors)
+
+
+def test_cycles_of_compensated_growth_are_logged(unbroken):
+    lines = [json.loads(line) for line in (unbroken / "blocks/00/log.jsonl").read_text().splitlines()]
+    cycles = [line for line in lines if line.get("low_share") is not None]
+    until = lines[-1]["iteration"] // 2  # blocks draw parts of photographs: how many steps they make follows from those
+    assert until >= 50
+    assert [line["iteration"] for line in cycles] == list(range(25, until + 1, 25))
+    assert all(0 <= line["low_share"] <= 1 and line["t_low"] == 0.2 for line in cycles)
+    assert all(line["grown_low"] + line["grown_other"] == line["grown"] for line in cycles)
+
+
+def test_every_camera_serves_a_block_and_v_is_brute_force(unbroken):
+    _, _, assignment = load_scores(unbroken / "partition/scores.npz")
+    assert assignment.cameras.any(axis=1).all()
+    assert (assignment.cameras.sum(axis=0) >= 4).all()
+    opened = open_run(unbroken, "coarse")
+    cameras = [view.camera for view in opened.capture.train_views]
+    brute = sum(camera.sees(opened.model.anchors.positions.double().numpy()).astype(int) for camera in cameras)
+    assert np.array_equal(visibility_of(opened.model.anchors.positions, cameras).numpy(), brute)
+
+
+def test_a_finished_run_does_nothing_again(capture, copied):
+    before = moments(copied)
+    again = vdgs("run", capture, "--output", copied, *SETTINGS)
+    assert again.returncode == 0, again.stderr
+    assert again.stdout.count("nothing to do") == 7
+    assert changed_files(copied, before) <= {"report.html"}
+
+
+def test_other_settings_are_refused_where_they_cost_training(capture, copied):
+    before = moments(copied)
+    refused = vdgs("run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0")
+    assert refused.returncode == 1
+    assert "--lambda-vis: 1.0 -> 0.0" in refused.stderr
+    assert "--redo" in refused.stderr
+    assert changed_files(copied, before) == set()
+
+
+def test_a_changed_setting_redoes_exactly_what_depends_on_it(capture, copied):
+    before = moments(copied)
+    redone = vdgs(
+        "run",
+        capture,
+        "--output",
+        copied,
+        *SETTINGS,
+        "--block.compensation.beta-g",
+        "0",
+        "--redo",
+        prepare=do_tasks_here,
+    )
+    assert redone.returncode == 0, redone.stderr
+    changed = {name.split("/")[0] for name in changed_files(copied, before)}
+    assert changed == {"config.yaml", "blocks", "merged", "evaluation", "report.html"}
+
+
+@pytest.mark.parametrize(("number", "blocks"), [(signal.SIGINT, ["00", "01"]), (signal.SIGKILL, ["01"])])
+def test_a_run_that_is_cut_off_while_blocks_train_continues_to_the_same_bits(capture, unbroken, copied, number, blocks):
+    for name in ("merged", "evaluation", *(f"blocks/{block}" for block in blocks)):
+        shutil.rmtree(copied / name)
+    command = ("run", capture, "--output", copied, *SETTINGS)
+    with begun(*command, pause_at=("*/blocks/*/checkpoints/00000040.json", 1)) as process:
+        process.wait_until_paused(processes=len(blocks))
+        process.send_signal(number)
+        cut_off = process.finished()
+    wait_until(lambda: is_free(copied))  # blocks notice that their driver is gone, save and end
+    assert cut_off.returncode == (130 if number == signal.SIGINT else -number)
+    assert ("The same command continues" in cut_off.stderr) == (number == signal.SIGINT)
+    for block in blocks:
+        status = json.loads((copied / "blocks" / block / "status.json").read_text())
+        assert (status["state"], status["iteration"]) == ("stopped", 40)
+    done = vdgs(*command)
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert model(copied) == model(unbroken)
+
+
+def test_a_block_that_is_killed_is_started_again(unbroken, copied):
+    shutil.rmtree(copied / "blocks/01")
+    with begun("train", copied, "--save-every", "20", pause_at=("*/blocks/*/checkpoints/00000040.json", 1)) as process:
+        process.wait_until_paused()
+        process.kill_paused()
+        done = process.finished()
+    assert done.returncode == 0, done.stderr
+    assert "crashed by SIGKILL" in done.stdout
+    assert "continuing at iteration 20" in (copied / "blocks/01/output.log").read_text()
+    assert model(copied, "blocks/01/model.safetensors") == model(unbroken, "blocks/01/model.safetensors")
+
+
+def swallow_ctrl_c() -> None:
+    """Let Ctrl-C come between two stages, inside something that swallows it."""
+    from vdgs import pipeline
+
+    def measure_visibility(*_: object) -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    pipeline.measure_visibility = measure_visibility  # type: ignore[assignment]
+
+
+def test_ctrl_c_between_stages_stops_the_run_and_the_same_command_continues(capture, copied):
+    shutil.rmtree(copied / "merged")
+    stopped = vdgs("run", capture, "--output", copied, *SETTINGS, prepare=swallow_ctrl_c)
+    assert stopped.returncode == 130
+    assert "interrupted. The same command continues" in stopped.stderr
+    assert not (copied / "merged").exists()
+    done = vdgs("run", capture, "--output", copied, *SETTINGS, "--quiet")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    status = vdgs("status", copied)
+    assert status.returncode == 0, status.stdout
+    assert "next: open" in status.stdout
+
+
+def time_few_steps() -> None:
+    """Let a plan be made of fewer steps than take seconds."""
+    from vdgs import planning
+
+    planning.TIMED_SECONDS = 0.0
+
+
+def test_a_dry_run_says_what_it_takes_and_writes_nothing(capture, copied, tmp_path):
+    before = moments(copied)
+    for output, done in ((copied, True), (tmp_path / "new", False)):
+        planned = vdgs("run", capture, "--output", output, *SETTINGS, "--dry-run", prepare=time_few_steps)
+        assert planned.returncode == 0, planned.stderr
+        assert f"{ITERATIONS} iterations" in planned.stdout
+        assert f"2 blocks: about {BLOCK_ITERATIONS} iterations each, 2 at once" in planned.stdout
+        assert planned.stdout.count("done already") == 2 * done
+        assert "stereo" not in planned.stdout  # sparse points suffice
+    changed = vdgs(
+        "run", capture, "--output", copied, *SETTINGS, "--lambda-vis", "0", "--dry-run", prepare=time_few_steps
+    )
+    assert "changed --lambda-vis: 1.0 -> 0.0" in changed.stdout
+    assert changed.stdout.count("done already") == 1
+    shrunk = vdgs(
+        "run", capture, "--output", copied, *SETTINGS, "--downscale", "2", "--dry-run", prepare=time_few_steps
+    )
+    assert "changed --downscale: 1.0 -> 2.0" in shrunk.stdout, shrunk.stderr
+    assert "done already" not in shrunk.stdout
+    assert changed_files(copied, before) == set()
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_dry_run_counts_what_stereo_may_add(tmp_path):
+    write_colmap(tmp_path / "capture", tiny_scene(points=80))
+    planned = vdgs(
+        "run", tmp_path / "capture", "--output", tmp_path / "run", *SETTINGS, "--dry-run", prepare=time_few_steps
+    )
+    assert f"and at most {10 * 64 * 48 // PIXELS_A_POINT - 80} where stereo finds ground" in planned.stdout
+    assert "and with those of stereo" in " ".join(planned.stdout.split())
+
+
+def test_another_cut_leaves_no_old_result_standing(copied):
+    """What was trained and measured for the cut of before is neither merged nor drawn nor reported as this one's."""
+    assert vdgs("partition", copied, "--lambda-vis", "0.5", "--redo").returncode == 0
+    refused = vdgs("merge", copied)
+    assert refused.returncode == 1
+    assert "block 0: trained for another cut" in refused.stderr
+    drawn = vdgs("render", copied, "--output", copied / "views", "--width", "32")
+    assert drawn.returncode == 0, drawn.stderr
+    assert "this is the coarse model, not the merged one" in drawn.stdout
+    assert "coarse model (" in drawn.stdout
+    assert "of 32x" in drawn.stdout
+    assert vdgs("report", copied).returncode == 0
+    assert "Coarse model: PSNR" in (copied / "report.html").read_text()
+    again = vdgs("train", copied, prepare=do_tasks_here)
+    assert again.returncode == 0, again.stderr
+    assert "trained again: blocks 0, 1" in again.stdout
+
+
+def test_one_block_alone_is_the_same_block(unbroken, copied):
+    shutil.rmtree(copied / "blocks/00")
+    done = vdgs("train", copied, "--block", "0", "--threads", "2")
+    assert done.returncode == 0, done.stderr
+    assert model(copied, "blocks/00/model.safetensors") == model(unbroken, "blocks/00/model.safetensors")
+    absent = vdgs("train", copied, "--block", "7")
+    assert absent.returncode == 1
+    assert "has blocks 0 to 1; there is no block 7" in absent.stderr
+
+
+def test_a_missing_block_stops_the_merge_unless_the_coarse_model_may_stand_in(copied):
+    for name in ("blocks/01", "merged"):
+        shutil.rmtree(copied / name)
+    refused = vdgs("merge", copied)
+    assert refused.returncode == 1
+    assert "block 1: not trained yet" in refused.stderr
+    assert "--incomplete" in refused.stderr
+    assert not (copied / MERGED).exists()
+    done = vdgs("merge", copied, "--incomplete")
+    assert done.returncode == 0, done.stderr
+    blocks, merged = load_blocks(copied / "partition/blocks.geojson"), AnchorModel.load(copied / MERGED)
+    coarse = AnchorModel.load(copied / "coarse/model.safetensors").anchors
+    stood_in = coarse.positions[torch.from_numpy(blocks.owner(places_of(coarse.positions)) == 1)]
+    held = merged.anchors.positions[torch.from_numpy(blocks.owner(places_of(merged.anchors.positions)) == 1)]
+    assert torch.equal(stood_in, held)
+
+
+def test_one_block_is_the_whole_scene_and_merging_it_the_identity(copied):
+    for command in (("partition", copied, "--blocks", "1", "--redo"), ("train", copied), ("merge", copied)):
+        done = vdgs(*command, prepare=do_tasks_here)
+        assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in (copied / "blocks").iterdir()) == ["00", "request.json"]
+    merged, block = (AnchorModel.load(copied / name) for name in (MERGED, "blocks/00/model.safetensors"))
+    assert all(torch.equal(t, block.anchors.tensors()[name]) for name, t in merged.anchors.tensors().items())
+
+
+def test_stages_need_those_before_them(capture, tmp_path):
+    run = tmp_path / "run"
+    done = vdgs(
+        "coarse", capture, "--output", run, "--preset", "laptop", "--iterations", "30", "--anchors.offsets", "3"
+    )
+    assert done.returncode == 0, done.stderr
+    for verb, needed in (("train", "vdgs partition"), ("merge", "vdgs partition")):
+        refused = vdgs(verb, run)
+        assert refused.returncode == 1
+        assert needed in refused.stderr
+        assert "Traceback" not in refused.stderr
+    short = ("--block.iterations", "30")
+    commands = (
+        ("visibility", run), ("partition", run, "--blocks", "2"), ("train", run, "--block", "0", *short),
+        ("train", run, "--block", "1"), ("train", run), ("merge", run), ("eval", run), ("report", run),
+    )  # fmt: skip
+    for command in commands:
+        done = vdgs(*command)
+        assert done.returncode == 0, done.stderr
+    assert json.loads((run / "evaluation/metrics.json").read_text())["model"] == "merged"
+
+
+@pytest.mark.parametrize("file", ["partition/blocks.geojson", "partition/scores.npz", "partition/partition.json"])
+def test_damaged_files_of_a_partition_are_named(copied, file):
+    shutil.rmtree(copied / "blocks/00")
+    (copied / file).write_bytes((copied / file).read_bytes()[:50])
+    done = vdgs("train", copied, "--block", "0")
+    assert done.returncode == 1
+    assert Path(file).name in done.stderr
+    assert "Traceback" not in done.stderr
+    assert "vdgs partition" in done.stderr
+    mended = vdgs("partition", copied)  # what the message advises helps
+    assert mended.returncode == 0, mended.stderr
+    assert vdgs("train", copied, "--block", "0").returncode == 0
+
+
+#: Of a change of the coarse stage's settings: they are written, the old model is deleted, it is gone.
+MOMENTS_OF_A_CHANGE = [("*/coarse/key", 2), ("*/coarse/model.safetensors", 1), ("*/coarse/.key.*", 1)]
+OTHER_SEED = (*SETTINGS, "--seed", "7")
+
+
+def change_cut_off(capture: Path, run: Path, moment: tuple[str, int]) -> None:
+    """Ask for another seed, and kill the command before it trains."""
+    with begun("run", capture, "--output", run, *OTHER_SEED, "--redo", pause_at=moment) as process:
+        process.wait_until_paused()
+        process.send_signal(signal.SIGKILL)
+        process.finished()
+    assert "seed: 7" in (run / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize("moment", MOMENTS_OF_A_CHANGE)
+def test_nothing_is_built_on_a_model_of_other_settings(capture, copied, moment):
+    """A change of the coarse stage's settings counts at once, even if training it again never began."""
+    change_cut_off(capture, copied, moment)
+    refused = vdgs("partition", copied)
+    assert refused.returncode == 1
+    assert "no coarse model of its settings" in refused.stderr
+
+
+def test_all_that_was_built_on_a_model_of_other_settings_is_made_again(capture, copied):
+    change_cut_off(capture, copied, MOMENTS_OF_A_CHANGE[0])
+    coarse_settings = OTHER_SEED[: OTHER_SEED.index("--blocks")]
+    commands = (
+        ("coarse", capture, "--output", copied, *coarse_settings, "--seed", "7"),
+        ("visibility", copied), ("partition", copied), ("train", copied, "--block", "0"),
+    )  # fmt: skip
+    for command in commands:
+        done = vdgs(*command)
+        assert done.returncode == 0, done.stderr
+        assert "nothing to do" not in done.stdout
+    stale = vdgs("merge", copied)
+    assert stale.returncode == 1
+    assert "not all blocks are trained:\n  block 1" in stale.stderr
+
+
+def test_figures_of_another_model_are_not_taken_for_this_ones(capture, copied):
+    again = vdgs("eval", copied, "--bins", "2")
+    assert again.returncode == 0, again.stderr
+    done = vdgs("run", capture, "--output", copied, *SETTINGS)
+    assert done.returncode == 0, done.stderr
+    assert len(json.loads((copied / "evaluation/metrics.json").read_text())["views_by_visibility"]) > 0
+    assert done.stdout.count("already measured") == 1  # the coarse one
+
+
+def test_a_block_trained_again_is_merged_again(unbroken, copied):
+    shutil.rmtree(copied / "blocks/01")
+    assert vdgs("merge", copied, "--incomplete").returncode == 0
+    assert model(copied) != model(unbroken)
+    assert vdgs("train", copied, "--block", "1").returncode == 0
+    assert vdgs("merge", copied).returncode == 0
+    assert model(copied) == model(unbroken)
+
+
+def test_why_a_view_was_assigned(copied):
+    told = vdgs("partition", copied, "--why", "frame_001.png")
+    assert told.returncode == 0, told.stderr
+    assert "frame_001.png" in told.stdout
+    assert "threshold" in told.stdout or "best block" in told.stdout or "topped up" in told.stdout
+    unknown = vdgs("partition", copied, "--why", "nobody.png")
+    assert unknown.returncode == 1
+    assert "no training view 'nobody.png'" in unknown.stderr
+
+
+def test_the_report_is_one_file_without_links_out(unbroken):
+    text = (unbroken / "report.html").read_text()
+
+    links: list[str] = []
+
+    class Links(HTMLParser):
+        def handle_starttag(self, tag, attrs):
+            links.extend(value for name, value in attrs if name in ("src", "href") and value)
+
+    Links().feed(text)
+    assert len(links) > 5
+    assert all(link.startswith(("data:", "#")) for link in links)

@@ -1,0 +1,219 @@
+"""Work on a real Ray of several nodes on this machine: whatever is lost, the results are those of the local run."""
+
+import importlib.util
+import os
+import shutil
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from support.clusters import (
+    BLOCKS,
+    FINE,
+    MIDDLE,
+    Cluster,
+    alive,
+    copy_run,
+    evaluated,
+    make_run,
+    models,
+    parent_of,
+    shard_of,
+    train_here,
+)  # fmt: skip
+from support.commands import begun, do_tasks_here, python, vdgs, wait_until
+from vdgs import cli
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.xdist_group("ray"),
+    pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: pip install 'vdgs[ray]'"),
+    pytest.mark.skipif(sys.platform != "linux", reason="who runs on which node is read from /proc"),
+]
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory) -> Path:
+    return make_run(tmp_path_factory.mktemp("ray"))
+
+
+@pytest.fixture(scope="module")
+def local(cut) -> Path:
+    return train_here(cut, cut.parent / "local")
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    cluster = Cluster()
+    cluster.add("a")
+    cluster.add("b")
+    yield cluster
+    cluster.close()
+
+
+def on_ray(run: Path, cluster: Cluster) -> tuple[object, ...]:
+    return ("train", run, *BLOCKS, "--executor", "ray", "--address", cluster.address)
+
+
+def another_code() -> None:
+    """Let this process take itself for another version of vdgs."""
+    from vdgs.executors import fitness
+
+    fitness.code_identity = lambda: "of this machine"  # type: ignore[assignment]
+
+
+def test_a_run_starts_a_ray_of_its_own_for_each_job():
+    """One after the other, in one process, as `vdgs run --executor ray` does without an address."""
+    done = python(
+        """
+from vdgs.executors.on_ray import connected, nodes
+for _ in range(2):
+    with connected(None):
+        print(len(nodes()), "node")
+"""
+    )
+    assert done.stdout.splitlines() == ["1 node", "1 node"], done.stderr
+
+
+def test_nodes_that_cannot_work_on_a_run_are_named_before_anything_starts(cut, cluster, tmp_path):
+    run = copy_run(cut, tmp_path / "run")
+    done = vdgs(*on_ray(run, cluster), prepare=another_code, environment=cluster.token)
+    assert done.returncode == 1
+    assert f"node {os.uname().nodename}: its vdgs" in done.stderr
+    assert "not the same code" in done.stderr
+    assert not list(run.glob("blocks/*/output.log"))
+    assert not list(run.glob(".fitness*"))
+
+
+def test_whatever_is_lost_the_models_are_those_of_the_local_run(cut, local, cluster, tmp_path):
+    """A node dies under a block, one that joins late takes it; a command is killed, then the worker that keeps it."""
+    run = copy_run(cut, tmp_path / "run")
+    with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
+
+        def wait_for(count: int) -> dict[int, int]:
+            """The process of each block that waits now, once so many have waited in all."""
+            driver.wait_until_paused(count)
+            there = [process for process in driver.paused() if Path(f"/proc/{process}/cmdline").exists()]
+            return {shard_of(process): process for process in there}
+
+        processes = wait_for(2)
+        cluster.remove(cluster.node_of(processes[1]))
+        wait_until(lambda: not alive(processes[1]))
+        cluster.add("late")
+        processes = wait_for(3)
+        assert cluster.node_of(processes[1]) == "late"
+        os.kill(processes[0], signal.SIGKILL)
+        processes = wait_for(4)
+        os.kill(parent_of(processes[0]), signal.SIGKILL)
+        wait_for(5)
+        driver.go_on()
+        done = driver.finished()
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert models(run) == models(local)
+    assert "block 01: crashed by the loss of its node" in done.stdout
+    assert "block 00: crashed by SIGKILL; continues from its last checkpoint, attempts left: 2" in done.stdout
+    assert "block 00: crashed by the loss of its worker" in done.stdout
+    assert "2 of 2 blocks done" in done.stdout
+    assert (run / "blocks/00/output.log").read_text().count("--- ") == 3
+
+
+def test_a_driver_that_was_killed_finds_its_blocks_again_and_stops_them_when_asked(cut, local, cluster, tmp_path):
+    run = copy_run(cut, tmp_path / "run")
+    with begun(*on_ray(run, cluster), pause_at=(MIDDLE, 1), environment=cluster.token) as first:
+        first.wait_until_paused(2)
+        first.send_signal(signal.SIGKILL)
+        first.finished()
+        assert all(alive(process) for process in first.paused())
+        with begun(*on_ray(run, cluster), environment=cluster.token) as second:
+            wait_until(lambda: "is watched again" in second.printed())
+            wait_until(lambda: second.printed().count("is watched again") == 2)
+            second.send_signal(signal.SIGINT)
+            done = second.finished()
+        assert done.returncode == 130, done.stderr + done.stdout
+        assert "every block that was training is saved" in done.stderr
+        assert not any(alive(process) for process in first.paused())
+    done = vdgs("train", run, *BLOCKS, prepare=do_tasks_here)  # what was saved leads to the same models anywhere
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert models(run) == models(local)
+    for block in (0, 1):
+        assert "continuing at iteration 20" in (run / f"blocks/{block:02d}/output.log").read_text()
+
+
+def test_views_are_measured_on_nodes_for_whatever_driver_lives(uncut, cluster, tmp_path):
+    """Two shards on two nodes. The driver is killed; the next finds them, and the worker that keeps one is killed."""
+    here, run = (copy_run(uncut, tmp_path / name / "run") for name in ("here", "there"))
+    assert vdgs("eval", here).returncode == 0
+    command = ("eval", run, "--executor", "ray", "--address", cluster.address)
+    with begun(*command, pause_at=("*/shards/*/00000[13].npz", 1), environment=cluster.token) as first:
+        first.wait_until_paused(2)
+        first.send_signal(signal.SIGKILL)
+        first.finished()
+        shards = {shard_of(process): process for process in first.paused()}
+        assert cluster.node_of(shards[0]) != cluster.node_of(shards[1])
+        with begun(*command, environment=cluster.token) as second:
+            wait_until(lambda: second.printed().count("is still at work") == 2)
+            os.kill(parent_of(shards[0]), signal.SIGKILL)
+            wait_until(lambda: "shard 00: crashed by the loss of its worker" in second.printed())
+            first.go_on()
+            done = second.finished()
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "2 of 2 shards done" in done.stdout
+    assert evaluated(run / "coarse/evaluation") == evaluated(here / "coarse/evaluation")
+
+
+def test_tiles_of_several_nodes_are_joined_to_the_maps_of_one_process(uncut, cluster, tmp_path):
+    """Two shards, two nodes."""
+    pytest.importorskip("rasterio")
+    here, there = (copy_run(uncut, tmp_path / name / "run") for name in ("here", "there"))
+    one = vdgs("map", here, *FINE)
+    shards = vdgs(
+        "map", there, *FINE, "--executor", "ray", "--address", cluster.address, environment=cluster.token
+    )  # fmt: skip
+    assert one.returncode == shards.returncode == 0, one.stderr + shards.stderr + shards.stdout
+    assert "2 of 2 shards done" in shards.stdout
+    assert evaluated(there / "maps") == evaluated(here / "maps")
+
+
+def test_nodes_that_join_late_are_avoided_where_they_cannot_work_or_have_no_memory_and_a_slow_one_is_waited_for(
+    cut, local, cluster, tmp_path
+):
+    """One block stands still on the only node. The other goes to a node of another vdgs, which is named and avoided,
+    then to one whose memory Ray takes for full and that ends it itself, then to a larger one."""
+    run = copy_run(cut, tmp_path / "run")
+    for name in cluster.names[1:]:
+        cluster.remove(name)
+    stranger = another_vdgs(tmp_path / "stranger")
+    with begun(*on_ray(run, cluster), "--memory-gb", "1", pause_at=(MIDDLE, 1), environment=cluster.token) as driver:
+        driver.wait_until_paused(1)
+        (slow,) = driver.paused()
+        cluster.add("stranger", {"PYTHONPATH": str(stranger)})
+        wait_until(lambda: "crashed by a node that cannot work on the run" in driver.printed())
+        full = {"RAY_memory_monitor_refresh_ms": "100", "RAY_memory_usage_threshold": "0.001"}
+        cluster.add("small", full, memory=1 << 30)
+        wait_until(lambda: "crashed by Ray, to free memory" in driver.printed())
+        cluster.add("large")
+        wait_until(lambda: any(cluster.has(process, "large") for process in driver.paused()))
+        os.kill(slow, signal.SIGSTOP)
+        driver.go_on()
+        wait_until((run / f"blocks/{1 - shard_of(slow):02d}/model.safetensors").exists)
+        os.kill(slow, signal.SIGCONT)
+        done = driver.finished()
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert models(run) == models(local)
+    assert done.stdout.count("crashed by a node that cannot work on the run") == 1
+    assert "not the same code" in done.stdout
+    assert "(out of memory; it asks for 1.50 GB now)" in done.stdout
+
+
+def another_vdgs(folder: Path) -> Path:
+    """A folder to import a vdgs from that differs by one file."""
+    source = Path(cli.__file__).parent
+    shutil.copytree(source, folder / "vdgs", ignore=shutil.ignore_patterns("*.so", "__pycache__"))
+    (folder / "vdgs/of_another_version.py").touch()
+    # An installation that leads to its sources by a hook would lead there from that node too.
+    (folder / "sitecustomize.py").write_text(
+        "import sys\nsys.meta_path[:] = [each for each in sys.meta_path if 'editable' not in type(each).__module__]\n"
+    )
+    return folder

@@ -1,0 +1,320 @@
+"""Photographs to a capture, all the way: ray cast photographs whose true cameras are known."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+pytest.importorskip("embreex")
+import pycolmap
+
+from support.flights import FOCAL, ORIGIN, Flight, write_photograph
+from vdgs.captures.alignment import Similarity
+from vdgs.captures.geodesy import enu_from_geodetic
+from vdgs.captures.images import load_picture
+from vdgs.captures.loading import load_capture
+from vdgs.captures.reconstruction import facts_rows, read_reconstruction
+from vdgs.errors import CaptureError, RunError, VdgsError
+from vdgs.inspection.soundness import judge
+from vdgs.pipeline import with_capture
+from vdgs.planning import plan_run
+from vdgs.report import write_report
+from vdgs.runs.beginning import begin_run
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.presets import PRESETS
+from vdgs.settings.requests import RunRequest
+from vdgs.settings.sfm import SfmOptions, SfmRequest
+from vdgs.sfm import aligning, features, mapping, matching
+from vdgs.sfm.aligning import Placed, Unplaced, move, place
+from vdgs.sfm.collection import collect
+from vdgs.sfm.positions import find_positions
+from vdgs.sfm.reconstruct import reconstruct
+from vdgs.sfm.work import call
+from vdgs.watching.interrupts import stop_requests
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sfm")]
+
+
+def console() -> Console:
+    return Console(file=io.StringIO(), width=500)
+
+
+@pytest.fixture(scope="module")
+def flight(nine, tmp_path_factory) -> Flight:
+    """Nine photographs; one that shows nothing, one that is cut off, and a text beside them."""
+    flown = Flight(tmp_path_factory.mktemp("flight") / "card", nine.cameras)
+    shutil.copytree(nine.folder, flown.folder)
+    grey = np.full((300, 400, 3), 128, np.uint8)
+    write_photograph(flown.folder / "grey.jpg", grey, 50, np.array([0.0, 3.0, 45.0]))
+    (flown.folder / "cut.jpg").write_bytes((flown.folder / flown.names[0]).read_bytes()[:9000])
+    (flown.folder / "notes.txt").write_text("windy")
+    return flown
+
+
+@pytest.fixture(scope="module")
+def made(flight, tmp_path_factory) -> Path:
+    output = tmp_path_factory.mktemp("made") / "capture"
+    reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1, keep_work=True), console())
+    return output
+
+
+def files(folder: Path) -> dict[str, tuple[int, int]]:
+    found = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
+    return {str(path.relative_to(folder)): (path.stat().st_mtime_ns, path.stat().st_size) for path in sorted(found)}
+
+
+def size(file: Path) -> tuple[int, int]:
+    with Image.open(file) as image:
+        return image.size
+
+
+def test_all_photographs_are_placed_where_they_were_taken(made, flight):
+    capture = load_capture(made)
+    assert [view.name for view in capture.views] == flight.names
+    assert capture.ground.metric
+    origin = capture.ground.origin_geo
+    shift = enu_from_geodetic(np.array([origin]), ORIGIN)[0]
+    for view, truth in zip(capture.views, flight.cameras, strict=True):
+        assert np.linalg.norm(view.camera.position + shift - truth.position) < 0.4  # metres, 45 of them up
+        assert view.camera.forward @ truth.forward > np.cos(np.radians(1.5))
+        assert view.camera.fx == pytest.approx(FOCAL, rel=0.02)
+    assert judge(capture).problems == ()
+    assert judge(capture).reprojection_px < 1
+
+
+def test_photographs_come_in_exact_sizes_and_stay_as_they_were(made, flight):
+    for name in flight.names:
+        whole, half, quarter = (size(made / f"images{suffix}" / name) for suffix in ("", "_2", "_4"))
+        assert whole == tuple(2 * side for side in half) == tuple(4 * side for side in quarter)
+    small = load_capture(made, CaptureOptions(images="images_4")).views[0].camera
+    assert small.fx == pytest.approx(load_capture(made).views[0].camera.fx / 4)
+
+
+def test_facts_name_what_came_out_and_what_was_left_out(made):
+    facts = read_reconstruction(made)
+    assert facts is not None
+    assert (facts.found, facts.registered, facts.components) == (11, 9, (9,))
+    why = {photo.name: photo.left_out for photo in facts.photographs if photo.left_out}
+    assert "cut off" in why["cut.jpg"]
+    assert "features" in why["grey.jpg"]
+    assert max(facts.residual_rms_m) < 0.3
+    assert facts.focal_held
+    assert facts.cameras[0].focal_after_px == pytest.approx(FOCAL)
+    assert any("9 of 11" in value for _, value in facts_rows(facts))
+    assert (made / "reconstruction.png").stat().st_size > 10_000
+
+
+def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(made, flight, monkeypatch, tmp_path):
+    output = tmp_path / "capture"
+    shutil.copytree(made, output, symlinks=True)
+    before = files(output)
+    reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1, keep_work=True), console())
+    assert files(output) == before
+    for room, name in ((features, "find_features"), (matching, "match"), (mapping, "find_models")):
+        monkeypatch.setattr(room, name, lambda *_: pytest.fail("was done already"))
+    asked = SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(max_size=200))
+    reconstruct(asked, console())
+    assert max(load_capture(output).views[0].camera.whole_size) <= 200
+    assert judge(load_capture(output)).reprojection_px < 1
+    assert not (output / "work").exists()
+
+
+def test_what_was_interrupted_goes_on(flight, tmp_path, monkeypatch):
+    output = tmp_path / "capture"
+    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(neighbours=3))
+    with monkeypatch.context() as patch:
+        calls = []
+
+        def stopped(function, *arguments, **named):
+            calls.append(function.__name__)
+            if len(calls) == 3:
+                raise KeyboardInterrupt
+            return call(function, *arguments, **named)
+
+        patch.setattr(features, "call", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(request, console())
+    with pytest.raises(CaptureError, match="is not finished"):
+        load_capture(output)
+    extracted = []
+
+    def counted(function, *arguments, **named):
+        extracted.extend(arguments[2])
+        return call(function, *arguments, **named)
+
+    monkeypatch.setattr(features, "call", counted)
+    facts = reconstruct(request, console())
+    assert facts.registered == 9
+    assert len(extracted) == 10 - 4  # four were searched before, in two calls
+
+
+def test_without_positions_the_scale_is_arbitrary_and_said_so(flight, tmp_path):
+    """One photograph lies on its side, and its mask with it."""
+    card = tmp_path / "card"
+    (card / "masks").mkdir(parents=True)
+    keep = np.ones((300, 400), bool)
+    keep[:50] = False
+    Image.fromarray(np.rot90(keep)).save(card / "masks" / f"{flight.names[2]}.png")
+    for k, name in enumerate(flight.names[:6]):
+        with Image.open(flight.folder / name) as image:
+            pixels = np.array(image)
+        turned = k == 2  # a photograph that lies on its side, as EXIF says
+        write_photograph(card / name, np.rot90(pixels).copy() if turned else pixels, k, None, 6 if turned else 1)
+    before = files(card)
+    said = console()
+    facts = reconstruct(SfmRequest(photographs=(card,), output=tmp_path / "capture", threads=1), said)
+    assert (facts.registered, facts.origin, facts.residual_rms_m) == (6, None, None)
+    assert "scale of the scene is arbitrary" in said.file.getvalue()
+    assert not (tmp_path / "capture/georef.json").exists()
+    capture = load_capture(tmp_path / "capture")
+    assert not capture.ground.metric
+    masks = [load_picture(view).mask for view in capture.views]
+    assert [mask is not None for mask in masks] == [k == 2 for k in range(6)]
+    assert not masks[2][:45].any()
+    assert masks[2][55:].all()
+    sizes = {size(tmp_path / "capture/images" / name) for name in flight.names[:6]}
+    assert len(sizes) == 1  # all stand upright
+    assert files(card) == before
+
+
+def test_photographs_that_do_not_overlap_are_no_scene(tmp_path):
+    rng = np.random.default_rng(0)
+    for k in range(3):
+        pixels = np.kron(rng.integers(0, 255, (30, 40, 3)), np.ones((8, 8, 1))).astype(np.uint8)
+        (tmp_path / "card").mkdir(exist_ok=True)
+        write_photograph(tmp_path / "card" / f"p{k}.jpg", pixels, k, np.array([50.0 * k, 0, 40]))
+    with pytest.raises(CaptureError, match="no two photographs could be joined"):
+        reconstruct(SfmRequest(photographs=(tmp_path / "card",), output=tmp_path / "capture", threads=1), console())
+
+
+def test_other_things_are_not_written_over_and_a_full_disk_is_told_before(flight, tmp_path, monkeypatch):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/thesis.txt").write_text("three years")
+    with pytest.raises(VdgsError, match="holds other things"):
+        reconstruct(SfmRequest(photographs=(flight.folder,), output=tmp_path / "full"), console())
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
+    with pytest.raises(VdgsError, match="GB are free"):
+        reconstruct(SfmRequest(photographs=(flight.folder,), output=tmp_path / "new"), console())
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("attitudes", [True, False])
+def test_one_line_of_photographs_is_placed_by_attitudes_or_views(made, flight, attitudes):
+    """Positions along a line leave a turn about it open."""
+    model = pycolmap.Reconstruction(made / "work" / "models" / "0")
+    move(model, Similarity(0.3, np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([5.0, 6, 7])))
+    line = collect([flight.folder]).photographs[:3]
+    for image in list(model.images.values()):
+        if image.name not in {photo.name for photo in line}:
+            model.deregister_frame(image.frame_id)
+    line = [photo if attitudes else replace(photo, attitude=None) for photo in line]
+    placed = place(model, line, find_positions(line, None, (1.0, 2.0)))
+    assert isinstance(placed, Placed)
+    assert "along one line" in placed.how
+    assert np.abs(placed.residuals).max() < 0.7
+    move(model, placed.similarity)
+    for image in (image for image in model.images.values() if image.has_pose):
+        assert image.viewing_direction()[2] < -np.cos(np.radians(8))
+
+
+@pytest.mark.parametrize("line", [True, False])
+@pytest.mark.parametrize(("smaller", "believed"), [(1, True), (12, False)])
+def test_positions_that_are_wrong_by_as_much_as_the_flight_is_wide_tell_no_scale(made, flight, smaller, believed, line):
+    """Metres wrong, as a phone is: of the nine photographs 9 m apart, and of as many around an object."""
+    photographs = [photo for photo in collect([flight.folder]).photographs if photo.name in flight.names]
+    model = pycolmap.Reconstruction(made / "work" / "models" / "0")
+    positions = find_positions(photographs, None, (3.0, 3.0) if line else (0.1, 0.1))
+    drift = np.random.default_rng(4).normal(0, 0.9, positions.enu.shape)
+    placed = place(model, photographs, replace(positions, enu=positions.enu / smaller + drift))
+    assert isinstance(placed, Placed) == believed
+    if isinstance(placed, Unplaced):
+        assert "disagree" in placed.why
+        assert "over a flight of" in placed.why
+        assert "--gcp" in placed.remedy
+    else:
+        assert placed.similarity.scale == pytest.approx(1, abs=0.15)
+
+
+def test_positions_that_disagree_leave_the_scale_arbitrary_and_say_why(made, flight, tmp_path, monkeypatch):
+    output, said = tmp_path / "capture", console()
+    shutil.copytree(made, output, symlinks=True)
+    found = Unplaced("the positions disagree by 2 m", "give better ones")
+    monkeypatch.setattr(aligning, "place", lambda *_: found)
+    facts = reconstruct(
+        SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(max_size=200)), said
+    )
+    assert (facts.origin, facts.residual_rms_m) == (None, None)
+    assert "disagree by 2 m" in facts.georeferenced
+    assert (
+        "not georeferenced (the positions disagree by 2 m): the scale of the scene is arbitrary" in said.file.getvalue()
+    )
+    assert "next flight: give better ones" in said.file.getvalue()
+    assert not (output / "georef.json").exists()
+    assert not load_capture(output).ground.metric
+
+
+def test_facts_are_plain_json(made):
+    written = json.loads((made / "reconstruction.json").read_text())
+    assert written["registered"] == 9
+    georef = json.loads((made / "georef.json").read_text())
+    assert georef["gps_residual_rms_m_xyz"] == pytest.approx(written["residual_rms_m"])
+
+
+def asked(flight: Flight, output: Path) -> RunRequest:
+    return RunRequest(
+        capture=flight.folder, output=output, preset="laptop", threads=1, training=PRESETS["laptop"].training
+    )
+
+
+def test_a_run_of_photographs_makes_them_a_capture_first_and_reports_how(made, flight, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(made, run / "capture", symlinks=True)  # as the stage leaves it
+    request = with_capture(replace(asked(flight, run), sfm=SfmOptions()), console())
+    assert request.capture == run / "capture"
+    assert with_capture(request, console()) == request  # a capture is taken as it is
+    context = begin_run(request.capture, request.output, request.options, request.method(), redo=False)
+    folder, capture = context.run, context.capture
+    assert capture.ground.metric
+    page = write_report(folder).read_text()
+    assert "From photographs to cameras" in page
+    assert "cut.jpg" in page
+
+
+def test_a_dry_run_of_photographs_looks_and_writes_nothing(flight, tmp_path):
+    said = console()
+    assert plan_run(asked(flight, tmp_path / "run"), said) is None
+    assert "10 of 10" in said.file.getvalue()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_among_other_files_is_refused_before_the_work(flight, tmp_path):
+    (tmp_path / "thesis.txt").write_text("three years")
+    with pytest.raises(RunError, match="holds other files"):
+        with_capture(asked(flight, tmp_path), console())
+
+
+def test_an_interrupted_call_is_waited_for():
+    """What still runs while Python ends would abort the process."""
+    ended = []
+
+    def long(cancellation_token):
+        os.kill(os.getpid(), signal.SIGINT)
+        while not cancellation_token.is_cancelled:
+            Event().wait(0.001)
+        ended.append(True)
+
+    with pytest.raises(KeyboardInterrupt), stop_requests(interrupts=True):
+        call(long)
+    assert ended

@@ -1,0 +1,330 @@
+"""Flights of several folders and cameras, in parts, on full disks, and stopped at every step."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+pytest.importorskip("embreex")
+import pycolmap
+
+from support.flights import ORIGIN, Flight, copy_folder, fly, grid, write_photograph
+from vdgs.cameras import Camera
+from vdgs.captures.geodesy import enu_from_geodetic
+from vdgs.captures.loading import load_capture
+from vdgs.captures.reconstruction import ReconstructionFacts, read_reconstruction
+from vdgs.errors import CaptureError, VdgsError
+from vdgs.pipeline import with_capture
+from vdgs.settings.presets import PRESETS
+from vdgs.settings.requests import RunRequest
+from vdgs.settings.sfm import SfmOptions, SfmRequest
+from vdgs.sfm import features, mapping, matching, writing
+from vdgs.sfm.reconstruct import reconstruct
+from vdgs.sfm.work import Work, call
+from vdgs.watching.interrupts import stop_requests
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sfm")]
+
+
+def console() -> Console:
+    return Console(file=io.StringIO(), width=500)
+
+
+@pytest.fixture
+def flight(nine) -> Flight:
+    return nine
+
+
+@pytest.fixture
+def begun(nine_begun) -> dict[str, Path]:
+    return nine_begun
+
+
+def pixels_of(file: Path) -> np.ndarray:
+    with Image.open(file) as image:
+        return np.array(image)
+
+
+def whole_capture(output: Path, flight: Flight, facts: ReconstructionFacts) -> None:
+    """Everything is there, in all sizes, and lies where it was."""
+    assert facts.registered == len(flight.cameras)
+    capture = load_capture(output)
+    assert [view.name for view in capture.views] == flight.names
+    shift = enu_from_geodetic(np.array([capture.ground.origin_geo]), ORIGIN)[0]
+    for view, truth in zip(capture.views, flight.cameras, strict=True):
+        assert np.linalg.norm(view.camera.position + shift - truth.position) < 0.5
+    for folder, _ in writing.SIZES:
+        assert sorted(path.name for path in (output / folder).iterdir()) == flight.names
+    assert not (output / "work").exists()
+
+
+# ------------------------------------------------------------------------------------- folders and cameras
+
+
+def test_two_folders_two_cameras_landscape_and_portrait_become_one_scene(flight, tmp_path):
+    """The cards of two drones with the same names on them, one of which lay on its side."""
+    for k, name in enumerate(flight.names):
+        pixels, place = pixels_of(flight.folder / name), flight.cameras[k].position
+        folder = tmp_path / ("first" if k % 2 else "second")
+        folder.mkdir(exist_ok=True)
+        if k % 2:
+            write_photograph(folder / f"DJI_{k // 2}.JPG", pixels, k, place)
+        else:
+            turned = np.rot90(pixels, 1 if k % 4 else -1).copy()
+            write_photograph(folder / f"DJI_{k // 2}.JPG", turned, k, place, 6 if k % 4 else 8, model="Other")
+    request = RunRequest(
+        capture=tmp_path / "first", output=tmp_path / "run", preset="laptop", threads=1,
+        training=PRESETS["laptop"].training, photographs=(tmp_path / "second",),
+    )  # fmt: skip
+    said = console()
+    found = with_capture(request, said)
+    assert found.capture == tmp_path / "run" / "capture"
+    assert found.photographs == ()
+    capture = load_capture(found.capture)
+    assert len(capture.views) == 9
+    assert {view.name.split("/")[0] for view in capture.views} == {"first", "second"}
+    facts = read_reconstruction(found.capture)
+    assert [(camera.name, camera.photographs) for camera in facts.cameras] == [("Maker Drone", 4), ("Maker Other", 5)]
+    assert "Maker Drone (4)" in said.file.getvalue()
+    assert "Maker Other (5)" in said.file.getvalue()
+    shift = enu_from_geodetic(np.array([capture.ground.origin_geo]), ORIGIN)[0]
+    for view in capture.views:
+        card, number = view.name.split("/")[0], int(view.name.split("_")[1].split(".")[0])
+        truth = flight.cameras[2 * number + (card == "first")]
+        assert np.linalg.norm(view.camera.position + shift - truth.position) < 0.8
+    assert with_capture(request, console()) == found  # the same command finds it made
+
+
+def test_portrait_and_landscape_stand_beside_each_other(flight, tmp_path):
+    """Photographs that were taken with the camera turned: portrait for EXIF, and for everybody after it."""
+    card = tmp_path / "card"
+    card.mkdir()
+    for k, name in enumerate(flight.names):
+        pixels, place = pixels_of(flight.folder / name), flight.cameras[k].position
+        # the file as the sensor has it, and EXIF says that its right side is up
+        write_photograph(card / name, pixels, k, place, 6 if k in (3, 4, 5) else 1)
+    facts = reconstruct(SfmRequest(photographs=(card,), output=tmp_path / "capture", threads=1), console())
+    assert facts.registered == 9
+    sizes = {view.name: view.camera.whole_size for view in load_capture(tmp_path / "capture").views}
+    assert {name for name, (width, height) in sizes.items() if height > width} == set(flight.names[3:6])
+
+
+def test_more_folders_beside_a_capture_are_refused(flight, tmp_path):
+    (tmp_path / "sparse").mkdir()
+    request = RunRequest(capture=tmp_path, output=tmp_path / "run", preset="laptop", photographs=(flight.folder,))
+    with pytest.raises(VdgsError, match="only folders of photographs alone can be several"):
+        with_capture(request, console())
+
+
+# ------------------------------------------------------------------------------------------------- parts
+
+
+def beside(cameras: list[Camera], east: float) -> list[Camera]:
+    moved = []
+    for camera in cameras:
+        pose = camera.camera_from_world.copy()
+        pose[:3, 3] -= pose[:3, :3] @ [east, 0, 0]
+        moved.append(
+            Camera(
+                camera_from_world=pose,
+                fx=camera.fx,
+                fy=camera.fy,
+                cx=camera.cx,
+                cy=camera.cy,
+                width=camera.width,
+                height=camera.height,
+            )
+        )
+    return moved
+
+
+def test_of_two_parts_the_larger_is_kept_and_the_other_named(tmp_path):
+    flown = fly(tmp_path / "card", [*beside(grid(2, 3, 9.0), -60), *beside(grid(2, 2, 9.0), 60)], 220)
+    said = console()
+    facts = reconstruct(SfmRequest(photographs=(flown.folder,), output=tmp_path / "capture", threads=1), said)
+    assert facts.components == (6, 4)
+    assert facts.registered == 6
+    why = {photo.name: photo.left_out for photo in facts.photographs if photo.left_out}
+    assert sorted(why) == flown.names[6:]
+    assert all("belongs to a part of 4 photographs that nothing joins to the rest" in reason for reason in why.values())
+    assert "parts that do not hold together: 6, 4" in said.file.getvalue()
+    assert [view.name for view in load_capture(tmp_path / "capture").views] == flown.names[:6]
+
+
+# ------------------------------------------------------------------------------------------------ stopped
+
+
+class Stopper:
+    """Sends Ctrl-C once a function was called so many times."""
+
+    def __init__(self, after: int) -> None:
+        self.left = after
+
+    def __call__(self) -> None:
+        self.left -= 1
+        if self.left == 0:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+STEPS = {
+    "features": (features, "_extract", 3),
+    "matching": (matching, "call", 2),
+    "mapping": (mapping, "keep_snapshots", 5),
+    "writing": (writing, "write_bytes", 8),
+}
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
+    flight, begun, tmp_path, monkeypatch, step
+):
+    monkeypatch.setattr(matching, "AT_ONCE", 4)
+    monkeypatch.setattr(mapping, "LEAST_BETWEEN", 2)
+    room, name, after = STEPS[step]
+    output, stop, function = tmp_path / "capture", Stopper(after), getattr(room, name)
+    if step in begun:
+        copy_folder(begun[step], output)
+    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1)
+
+    def then_stopped(*arguments, **named):
+        result = function(*arguments, **named)
+        stop()
+        return result
+
+    with monkeypatch.context() as patch:
+        patch.setattr(room, name, then_stopped)
+        with pytest.raises(KeyboardInterrupt), stop_requests(interrupts=True):
+            reconstruct(request, console())
+    with pytest.raises(CaptureError, match="is not finished"):
+        load_capture(output)
+    mapped, extracted, matched = [], [], []
+
+    def counted(called, *arguments, **named):
+        if called is pycolmap.extract_features:
+            extracted.extend(arguments[2])
+        if called is pycolmap.match_image_pairs:
+            matched.append(named["pairing_options"].match_list_path)
+        if called is pycolmap.incremental_mapping:
+            mapped.append(named["input_path"])
+        return call(called, *arguments, **named)
+
+    for each in (features, matching, mapping):
+        monkeypatch.setattr(each, "call", counted)
+    written = {path: path.stat().st_mtime_ns for path in output.glob("images*/*.JPG")}
+    facts = reconstruct(request, console())
+    whole_capture(output, flight, facts)
+    assert all(path.stat().st_mtime_ns == when for path, when in written.items())
+    here = list(STEPS).index(step)
+    assert len(extracted) == (3 if here == 0 else 0)  # the six of three calls are kept
+    assert bool(matched) == (here <= 1)
+    assert bool(mapped) == (here <= 2)
+    if here == 2:  # goes on from what it had
+        assert int(Path(mapped[0]).name) >= 4
+    if here == 3:
+        assert len(written) >= 8
+
+
+def test_only_whole_snapshots_are_gone_on_from_and_the_largest_of_them(tmp_path):
+    work = Work(tmp_path)
+
+    def snapshot(name: str, placed: int) -> None:
+        (work.snapshots / name).mkdir(parents=True)
+        (work.snapshots / name / "images.bin").write_bytes(placed.to_bytes(8, "little"))
+
+    mapping.keep_snapshots(work)
+    assert mapping._largest_kept(work) is None
+    for name, placed, kept in (("1", 7, 7), ("2", 12, 12), ("3", 5, 12), ("4", 110, 110)):
+        snapshot(name, placed)
+        mapping.keep_snapshots(work)
+        assert [path.name for path in work.kept.iterdir()] == [str(kept)]
+        assert not any(work.snapshots.iterdir())
+    mapping.forget_models(work)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_another_focal_length_begins_mapping_anew(flight, begun, tmp_path, monkeypatch):
+    output, stop = tmp_path / "capture", Stopper(5)
+    copy_folder(begun["mapping"], output)
+    monkeypatch.setattr(mapping, "LEAST_BETWEEN", 2)
+    keep = mapping.keep_snapshots
+    with monkeypatch.context() as patch:
+        patch.setattr(mapping, "keep_snapshots", lambda work: (keep(work), stop()))
+        with pytest.raises(KeyboardInterrupt), stop_requests(interrupts=True):
+            reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1), console())
+    assert any((output / "work" / "kept").iterdir())
+    monkeypatch.setattr(mapping, "find_models", lambda work, *_: pytest.fail("kept") if work.kept.exists() else done())
+
+    def done():
+        raise CaptureError("begun anew")
+
+    with pytest.raises(CaptureError, match="begun anew"):
+        reconstruct(
+            SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(focal="refine")),
+            console(),
+        )
+
+
+# ---------------------------------------------------------------------------------------------- full disks
+
+
+def test_a_disk_that_fills_while_photographs_are_written_is_said_and_nothing_is_lost(
+    flight, begun, tmp_path, monkeypatch
+):
+    output, written = tmp_path / "capture", []
+    copy_folder(begun["writing"], output)
+    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1)
+    write = Path.write_bytes
+
+    def until_full(path: Path, content: bytes) -> int:
+        if path.name.endswith(".tmp") and "images" in path.parent.name:
+            written.append(path)
+            if len(written) > 7:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return write(path, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", until_full)
+        with pytest.raises(VdgsError, match=r"No space left on device\). Free some space .* same command"):
+            reconstruct(request, console())
+    assert len(list(output.glob("images*/*.JPG"))) == 7
+    for room in (features, matching, mapping):
+        monkeypatch.setattr(room, "call", lambda *_, **__: pytest.fail("was done already"))
+    whole_capture(output, flight, reconstruct(request, console()))
+
+
+@pytest.mark.parametrize("step", ["features", "matching"])
+def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight, begun, tmp_path, monkeypatch, step):
+    output, room = tmp_path / "capture", STEPS[step][0]
+    if step in begun:
+        copy_folder(begun[step], output)
+    request = SfmRequest(photographs=(flight.folder,), output=output, threads=1)
+    monkeypatch.setattr(matching, "AT_ONCE", 4)
+
+    def full(function, *arguments, **named):
+        full.calls += 1
+        if full.calls == 3:
+            return call(lambda cancellation_token: fail("SQLite error: database or disk is full"))
+        return call(function, *arguments, **named)
+
+    def fail(why: str):
+        raise RuntimeError(why)
+
+    full.calls = 0
+    with monkeypatch.context() as patch:
+        patch.setattr(room, "call", full)
+        with pytest.raises(VdgsError, match=r"the disk is full .* the same command then goes on"):
+            reconstruct(request, console())
+    calls = []
+    monkeypatch.setattr(room, "call", lambda *a, **n: (calls.append(a[0]), call(*a, **n))[1])
+    whole_capture(output, flight, reconstruct(request, console()))
+    assert len(calls) < (5 if room is features else 9)  # of five, and nine with the four pairs of each
+    shutil.rmtree(output)

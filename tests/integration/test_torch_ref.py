@@ -1,0 +1,64 @@
+"""The whole pipeline on the reference set of operations (plain torch) beside the native one: what one can, both can."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from support.small_pipeline import after_the_coarse_stage, psnr, train_coarse
+from vdgs import kernels
+from vdgs.kernels import reference
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.partition.assignment.saving import load_scores
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import open_run
+from vdgs.runs.visibility import visibility_of_run
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("composition")]
+
+
+@pytest.fixture(scope="module")
+def runs(native_small, tmp_path_factory) -> tuple[Path, Path, Path]:
+    """A run by each set of operations, and one by the reference from the native run's coarse model on."""
+    folder = tmp_path_factory.mktemp("sets")
+    twin, shared = folder / "twin", folder / "shared"
+    shutil.copytree(native_small.coarse, shared)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(kernels.VARIABLE, "reference")
+        assert kernels.choose(torch.device("cpu")) is reference
+        train_coarse(native_small.capture, twin)
+        after_the_coarse_stage(twin)
+        after_the_coarse_stage(shared)
+    return native_small.whole, twin, shared
+
+
+def test_both_sets_learn_the_place_alike(runs):
+    native, twin, _ = runs
+    for ours, theirs in zip(psnr(native), psnr(twin), strict=True):
+        assert ours > 13  # 12.0 for a plain grey picture
+        assert theirs == pytest.approx(ours, abs=0.6)
+    before, after = (len(AnchorModel.load(twin / name / "model.safetensors").anchors) for name in ("coarse", "merged"))
+    assert after != before  # blocks have trained and grown
+    first = json.loads((twin / "coarse" / "log.jsonl").read_text().splitlines()[0])
+    same = json.loads((native / "coarse" / "log.jsonl").read_text().splitlines()[0])
+    assert first["loss"] == pytest.approx(same["loss"], rel=0.05)
+
+
+def test_from_one_coarse_model_both_cut_assign_and_measure_alike(runs):
+    native, _, shared = runs
+    opened = [open_run(run, "coarse") for run in (native, shared)]
+    seen = [visibility_of_run(run, [view.camera for view in run.capture.train_views]) for run in opened]
+    assert torch.equal(*seen)
+    assert (native / "partition" / "blocks.geojson").read_bytes() == (
+        shared / "partition" / "blocks.geojson"
+    ).read_bytes()
+    ours, theirs = (load_scores(RunFolder(run).partition / "scores.npz") for run in (native, shared))
+    np.testing.assert_allclose(theirs.scores.scores, ours.scores.scores, atol=0.02)
+    np.testing.assert_array_equal(theirs.scores.held, ours.scores.held)
+    assert psnr(shared)[0] == pytest.approx(psnr(native)[0], abs=0.01)
+    assert psnr(shared)[1] == pytest.approx(psnr(native)[1], abs=0.6)

@@ -1,0 +1,349 @@
+"""The CUDA decoder without a GPU: its own kernel, run on the processor by a stand-in driver, against the reference."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import fields, replace
+from functools import partial
+
+import pytest
+import torch
+
+from support.cuda_on_host import ORDERS, HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
+from support.decode_scenes import Scene, looking_down, moved_by, turned
+from vdgs.cameras import Camera
+from vdgs.kernels.cuda.camera import PackedCamera
+from vdgs.kernels.cuda.decode import PROGRAM, decode, decode_to_train, sources_of
+from vdgs.kernels.cuda.decode_adam import decode_backward_adam
+from vdgs.kernels.cuda.driver import cuda_driver
+from vdgs.kernels.cuda.launching import Program, read_header, read_source
+from vdgs.kernels.cuda.room import Room
+from vdgs.kernels.reference.decode import decode as reference
+from vdgs.kernels.reference.decode_adam import decode_backward_adam as by_reference
+from vdgs.kernels.runs import Shown
+from vdgs.kernels.types import AdamState, AnchorSplats, SplatGradients, Splats, TrainingSplats
+
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_decode")]
+
+CAMERAS = {
+    "down": looking_down(),
+    "turned": turned(),
+    "orthographic": looking_down("orthographic"),
+    "part": turned(width=96, height=64).cropped(20, 10, 70, 50),
+}
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    return build_on_host(PROGRAM.name, tmp_path_factory.mktemp("host"))
+
+
+def decoded(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order: int = 0) -> AnchorSplats:
+    program = Program(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
+    anchors = scene.positions, scene.features, scene.offsets, scene.log_scales
+    with torch.no_grad():
+        return decode(*anchors, scene.weights, camera, rows, program=program)
+
+
+def scattered(scene: Scene, camera: Camera, library: ctypes.CDLL, rows=None, order: int = 0) -> TrainingSplats:
+    """As a training step is given them."""
+    program = Program(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
+    return decode_to_train(*scene.arguments, camera, rows, program=program)
+
+
+def put_in_order(splats: TrainingSplats, library: ctypes.CDLL) -> dict[str, torch.Tensor]:
+    """All that is known of each splat, in the order of the anchors."""
+    order = splats.runs.order(len(splats.source))
+    program = Program(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers)
+    named = {field.name: getattr(splats, field.name) for field in fields(Splats)}
+    named["source"] = sources_of(splats.source, program=program)
+    return {name: tensor[order] for name, tensor in named.items()}
+
+
+def exactly(scene: Scene, camera: Camera, rows=None) -> AnchorSplats:
+    exact = scene.to(torch.float64)
+    with torch.no_grad():
+        return reference(
+            exact.positions.double(), exact.features, exact.offsets, exact.log_scales, exact.weights, camera, rows
+        )
+
+
+def assert_same(found: AnchorSplats, exact: AnchorSplats) -> None:
+    assert torch.equal(found.source, exact.source)
+    for field in fields(AnchorSplats):
+        ours, theirs = getattr(found, field.name), getattr(exact, field.name)
+        scale = float(theirs.double().abs().max()) if theirs.numel() else 0.0
+        torch.testing.assert_close(ours.double(), theirs.double(), rtol=2e-4, atol=1e-5 * scale, msg=field.name)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize(("k", "with_distance"), [(10, False), (3, True)])
+def test_it_equals_the_reference(name, k, with_distance, library):
+    scene = Scene.random(40, k, with_distance=with_distance)
+    exact = exactly(scene, CAMERAS[name])
+    assert 5 < len(exact.source) < 40 * k
+    assert_same(decoded(scene, CAMERAS[name], library), exact)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize(("v", "k"), [(1, 1), (9, 32), (0, 10)])
+def test_any_number_of_anchors_and_offsets(v, k, library):
+    scene = Scene.random(v, k, log_scale=-0.5)
+    assert_same(decoded(scene, looking_down(), library), exactly(scene, looking_down()))
+
+
+@needs_a_compiler
+def test_rows_are_read_where_they_stand(library):
+    scene, rows = Scene.random(30, 10), torch.tensor([0, 3, 4, 17, 29])
+    assert_same(decoded(scene, turned(), library, rows), exactly(scene, turned(), rows))
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("name", ["positions", "features", "offsets", "log_scales"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_what_is_not_finite_spawns_nothing(name, value, library):
+    scene = Scene.random(20, 4)
+    getattr(scene, name)[7].view(-1)[1] = value
+    found = decoded(scene, looking_down(), library)
+    assert_same(found, exactly(scene, looking_down()))
+    assert all(getattr(found, field.name).isfinite().all() for field in fields(AnchorSplats))
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("order", ORDERS[1:])
+def test_the_order_in_which_threads_take_turns_changes_no_bit(order, library):
+    one, other = (decoded(Scene.random(21, 10), turned(), library, order=turns) for turns in (0, order))
+    assert all(torch.equal(getattr(one, field.name), getattr(other, field.name)) for field in fields(AnchorSplats))
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("order", ORDERS)
+def test_for_training_splats_are_the_same_in_another_order(order, library):
+    """To the bit; and so is the mean of their volumes, whatever comes first."""
+    scene, rows = Scene.random(141, 10), torch.arange(0, 141, 2)
+    splats, expected = scattered(scene, turned(), library, rows, order), decoded(scene, turned(), library, rows)
+    found = put_in_order(splats, library)
+    assert all(torch.equal(tensor, getattr(expected, name)) for name, tensor in found.items())
+    in_rows = sources_of(
+        splats.source, program=Program(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers)
+    )
+    assert torch.equal(in_rows, expected.source) is (order == 0)  # other orders of blocks do give another one
+    torch.testing.assert_close(splats.volume, expected.volumes.mean())
+    assert torch.equal(splats.volume, scattered(scene, turned(), library, rows).volume)
+    again = Shown.of(expected.source, len(rows), 10)
+    assert torch.equal(again.bits, splats.source.bits)
+    assert torch.equal(again.runs.lengths, splats.runs.lengths)
+
+
+@needs_a_compiler
+def test_nothing_to_show_has_no_mean_volume(library):
+    nothing = scattered(Scene.random(9, 4, spread=0.1, log_scale=-9.0), CAMERAS["part"].cropped(0, 0, 1, 1), library)
+    assert len(nothing.source) == len(nothing.depths) == 0
+    assert nothing.volume.isnan()
+    assert len(scattered(Scene.random(9, 4), turned(), library, torch.arange(0)).source) == 0
+
+
+class Narrow(Room):
+    """As if a view had needed less than the next one."""
+
+    def for_anchors(self, count, offsets, device):
+        return 11
+
+
+class Watched(Program):
+    """Looks behind the room that a kernel is told of."""
+
+    spare = 500
+
+    def launch(self, kernel, grid, block, *arguments):
+        tensors = [each for each in arguments[-7:] if each is not None]
+        wider = [torch.full((len(t) + self.spare, *t.shape[1:]), 77, dtype=t.dtype) for t in tensors]
+        given = iter(wider)
+        super().launch(
+            kernel, grid, block, *arguments[:-7], *(None if each is None else next(given) for each in arguments[-7:])
+        )
+        for tensor, room in zip(tensors, wider, strict=True):
+            tensor.copy_(room[: len(tensor)])
+            assert (room[len(tensor) :] == 77).all()
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("order", ORDERS)
+def test_where_there_is_too_little_room_they_are_decoded_once_more(order, library):
+    scene = Scene.random(40, 10)
+    program = Watched(name=PROGRAM.name, driver=HostDriver(library, order), headers=PROGRAM.headers)
+    with torch.no_grad():
+        found = decode(*scene.arguments, turned(), program=program, room=Narrow())
+    assert [name for name, *_ in program.driver.launched] == ["decode_anchors"] * 2
+    expected = decoded(scene, turned(), library)
+    assert all(torch.equal(getattr(found, field.name), getattr(expected, field.name)) for field in fields(AnchorSplats))
+
+
+def test_room_follows_what_views_need():
+    room, device = Room(), torch.device("cpu")
+    assert 5000 < room.for_anchors(1000, 10, device) < 10_000  # half of the offsets, before any view is known
+    assert room.for_anchors(10, 10, device) == 100  # never more than there are offsets
+    room.learn(1000, 10, device, 2000)
+    once = room.for_anchors(1000, 10, device)
+    assert 2000 < once < 3000
+    room.learn(1000, 10, device, 1000)
+    assert 2000 < room.for_anchors(1000, 10, device) < once  # slowly forgotten
+    room.learn(500, 10, device, 4000)
+    assert 8000 < room.for_anchors(1000, 10, device) <= 10_000
+    assert room.for_anchors(1000, 4, device) < 4000  # other models have other offsets
+
+
+@needs_a_compiler
+def test_barriers_that_are_missing_are_noticed(tmp_path):
+    """Those of blocks: before splats are added up, and before a block's place is read."""
+    first, second, third = read_source(PROGRAM.name).split("__syncthreads();")
+    for number, (one, other) in enumerate((("", "__syncthreads();"), ("__syncthreads();", ""))):
+        (folder := tmp_path / str(number)).mkdir()
+        without = build_on_host(PROGRAM.name, folder, first + one + second + other + third)
+        found = [decoded(Scene.random(61, 10), turned(), without, order=turns) for turns in (0, 1)]
+        assert not all(torch.equal(*(getattr(each, field.name) for each in found)) for field in fields(AnchorSplats))
+
+
+@needs_a_compiler
+def test_where_autograd_follows_the_reference_decodes(library):
+    scene = Scene.random(10, 4).to(torch.float32)
+    program = Program(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers)
+    anchors = scene.positions, scene.features, scene.offsets, scene.log_scales
+    splats = decode(*anchors, scene.weights, turned(), program=program)
+    assert splats.opacities.requires_grad
+    assert program.driver.launched == []
+
+
+def test_unsuitable_anchors_are_refused():
+    for scene, error in ((Scene.random(2, 33), ValueError), (Scene.random(2, 4).to(torch.float64), TypeError)):
+        with pytest.raises(error), torch.no_grad():
+            decode(scene.positions, scene.features, scene.offsets, scene.log_scales, scene.weights, turned())
+
+
+def test_the_camera_is_laid_out_as_the_header_says():
+    """Field by field, in the header's own order."""
+    text = read_header("gaussian_math.h").split("struct Camera {")[1].split("};")[0]
+    named = [name for line in text.splitlines() if ";" in line for name in _names(line.split("//")[0])]
+    assert named == [name for name, _ in PackedCamera._fields_]
+
+
+def _names(declaration: str) -> list[str]:
+    return [each.strip().split()[-1] for each in declaration.strip().rstrip(";").split(",")]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", CAMERAS)
+def test_a_card_gives_what_the_reference_gives(name):
+    cuda_driver()
+    scene = Scene.random(500, 10)
+    weights = scene.weights.map(lambda t: t.cuda())
+    anchors = (t.cuda() for t in (scene.positions, scene.features, scene.offsets, scene.log_scales))
+    with torch.no_grad():
+        found = decode(*anchors, weights, CAMERAS[name])
+    here = AnchorSplats(**{field.name: getattr(found, field.name).cpu() for field in fields(AnchorSplats)})
+    assert_same(here, exactly(scene, CAMERAS[name]))
+
+
+@needs_a_compiler
+class TestMoving:
+    @pytest.fixture
+    def moving(self, library):
+        return partial(
+            decode_backward_adam,
+            program=Program(name=PROGRAM.name, driver=HostDriver(library), headers=PROGRAM.headers),
+        )
+
+    @pytest.mark.parametrize("name", CAMERAS)
+    @pytest.mark.parametrize(("k", "with_distance"), [(10, False), (3, True)])
+    def test_anchors_move_as_by_the_reference(self, name, k, with_distance, moving):
+        scene, rows = Scene.random(45, k, with_distance=with_distance), torch.arange(0, 45, 2)
+        ours, theirs = (moved_by(kernels, scene, CAMERAS[name], rows) for kernels in (moving, by_reference))
+        assert ours[0] is theirs[0] is True
+        assert torch.equal(ours[2], theirs[2])
+        for found, expected in zip((*ours[1], *ours[3]), (*theirs[1], *theirs[3]), strict=True):
+            error = float((found - expected).norm() / expected.norm().clamp(min=1e-6))
+            assert error < 1e-4, error
+
+    @pytest.mark.parametrize("order", ORDERS)
+    def test_wherever_splats_stand_anchors_move_to_the_same_bits(self, order, library, moving):
+        scene, rows = Scene.random(141, 10), torch.arange(0, 141, 2)
+        expected = moved_by(moving, scene, turned(), rows)
+        shown = scattered(scene, turned(), library, rows, order).source
+        found = moved_by(moving, scene, turned(), rows, shown=shown)
+        assert found[0] is True
+        assert all(torch.equal(one, other) for one, other in zip(found[1], expected[1], strict=True))
+        assert all(torch.equal(one, other) for one, other in zip(found[3], expected[3], strict=True))
+
+    def test_with_gradients_by_depth_torch_moves_them(self, library, moving):
+        """It asks for the sources, which only now are written."""
+        scene, rows = Scene.random(20, 4), torch.arange(20)
+
+        def with_depths(kernels):
+            def kernel(positions, states, weights, camera, rows, gradients, updates):
+                deep = replace(gradients, depths=gradients.opacities)
+                return kernels(positions, states, weights, camera, rows, deep, updates)
+
+            return kernel
+
+        shown = scattered(scene, turned(), library, rows, 1).source
+        expected = moved_by(with_depths(by_reference), scene, turned(), rows)
+        found = moved_by(with_depths(moving), scene, turned(), rows, shown=shown)
+        for one, other in zip((*found[1], *found[3]), (*expected[1], *expected[3]), strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+        with pytest.raises(TypeError, match="on that card"):
+            moved_by(by_reference, scene, turned(), rows, shown=shown)
+
+    def test_piece_by_piece_anchors_move_to_the_same_bits(self, moving):
+        """The decoder's gradients are sums of those of pieces."""
+        scene, rows = Scene.random(45, 10), torch.arange(0, 45, 2)
+        whole = moved_by(moving, scene, turned(), rows)
+        program = moving.keywords["program"]
+        program.driver.launched.clear()
+        pieces = moved_by(partial(moving, piece=16), scene, turned(), rows)
+        assert [grid for _, grid, _ in program.driver.launched] == [(2, 1, 1), (1, 1, 1)]
+        assert all(torch.equal(one, other) for one, other in zip(whole[1], pieces[1], strict=True))
+        for one, other in zip(whole[3], pieces[3], strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6 * float(one.abs().max()))
+
+    def test_a_frozen_decoder_costs_nothing(self, moving):
+        scene, rows = Scene.random(20, 4), torch.arange(20)
+        assert moved_by(moving, scene, turned(), rows, frozen=True)[3] is None
+
+    def test_a_gradient_that_is_no_number_is_told_and_moves_nothing_of_its_anchor(self, moving):
+        scene, rows = Scene.random(20, 4), torch.arange(20)
+        finite, tensors, updates, _ = moved_by(moving, scene, looking_down(), rows, spoil=True)
+        assert not finite
+        assert all(tensor.isfinite().all() for tensor in tensors)
+        assert int(updates[5]) == 26
+
+    @pytest.mark.parametrize("order", ORDERS[1:])
+    def test_the_order_in_which_threads_take_turns_changes_no_bit(self, order, library):
+        results = []
+        for turns in (0, order):
+            program = Program(name=PROGRAM.name, driver=HostDriver(library, turns), headers=PROGRAM.headers)
+            moving = partial(decode_backward_adam, program=program)
+            results.append(moved_by(moving, Scene.random(17, 10), turned(), torch.arange(17)))
+        assert all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
+        assert all(torch.equal(one, other) for one, other in zip(results[0][3], results[1][3], strict=True))
+
+    def test_a_missing_barrier_would_be_noticed(self, tmp_path):
+        """The only one, of warps: it keeps a lane from counting up what others have not read yet."""
+        before, after = read_source(PROGRAM.name).split("__syncwarp();")
+        without = build_on_host(PROGRAM.name, tmp_path, before + after)
+        scene, results = Scene.random(9, 4), []
+        for turns in (0, 1):
+            program = Program(name=PROGRAM.name, driver=HostDriver(without, turns), headers=PROGRAM.headers)
+            results.append(moved_by(partial(decode_backward_adam, program=program), scene, turned(), torch.arange(9)))
+        assert not all(torch.equal(one, other) for one, other in zip(results[0][1], results[1][1], strict=True))
+
+    def test_states_that_anneal_apart_are_refused(self, moving):
+        scene = Scene.random(4, 3)
+        states = [AdamState(t, t, t, 0.1, early) for t, early in zip(scene.trainable[:3], (1.0, 2.0, 1.0), strict=True)]
+        nothing = torch.zeros(0)
+        none = SplatGradients(
+            means_px=torch.zeros(0, 2), conics=torch.zeros(0, 3), colours=torch.zeros(0, 3), opacities=nothing,
+            volume=0.0, source=nothing.int(), colour_values=torch.zeros(0, 3), opacity_values=nothing,
+        )  # fmt: skip
+        with pytest.raises(ValueError, match="annealed alike"):
+            moving(scene.positions, states, scene.weights, turned(), torch.arange(4), none, torch.zeros(4).int())

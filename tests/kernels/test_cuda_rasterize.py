@@ -1,0 +1,241 @@
+"""The CUDA rasteriser without a GPU: its kernels, run on the processor by a stand-in driver, against the reference."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+from support.cuda_on_host import ORDERS, HostDriver, Stuck, build_on_host, needs_a_compiler, needs_nvrtc
+from support.rasterize_scenes import (
+    Scene,
+    assert_close,
+    assert_first_gradients_are_those_of_all,
+    assert_same_picture,
+    in_runs,
+    loss_of,
+    make_scene,
+    splats_of,
+)
+from vdgs.kernels.cuda.driver import cuda_driver
+from vdgs.kernels.cuda.launching import Program, read_source
+from vdgs.kernels.cuda.rasterise import PROGRAM, rasterise, rasterise_vjp
+from vdgs.kernels.reference.rasterise import rasterise as reference
+from vdgs.kernels.types import Raster, Splats
+
+pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_rasterise")]
+
+#: Whatever makes the threads of a block wait for each other.
+BARRIER = re.compile(r"__syncthreads(?:_and|_or)?\(")
+BARRIERS = 5
+SCENES = {
+    "ordinary": make_scene(150, 37, 29),
+    "dense": make_scene(700, 20, 18, opacity=2.0),
+    "huge": make_scene(40, 33, 33, size=200.0, opacity=-2.0),
+    "tiny": make_scene(200, 20, 20, size=0.05),
+    "edge-on": make_scene(120, 25, 35, size=4.0, thinness=2.0),
+    "off-screen": make_scene(100, 20, 20, margin=4.0),
+    "opaque": make_scene(200, 33, 17, size=6.0, opacity=30.0),
+    "empty": make_scene(0, 20, 10),
+    "one pixel": make_scene(10, 1, 1, size=1.0),
+}
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    return build_on_host("rasterise.cu", tmp_path_factory.mktemp("host"))
+
+
+@pytest.fixture(scope="module")
+def numbered(tmp_path_factory):
+    """The kernels, of whose barriers one can be left out: that of the number `left_out`."""
+    text, number = read_source("rasterise.cu"), iter(range(BARRIERS))
+    text = BARRIER.sub(lambda found: f"{found[0][:-1].replace('__', 'maybe_')}({next(number)}, ", text)
+    assert next(number, None) is None
+    text = text.replace(", )", ")")
+    before = """
+extern "C" int left_out;
+int left_out = -1;
+void maybe_syncthreads(int number) { if (number != left_out) __syncthreads(); }
+int maybe_syncthreads_and(int number, int mine) { return number == left_out ? mine : __syncthreads_and(mine); }
+int maybe_syncthreads_or(int number, int mine) { return number == left_out ? mine : __syncthreads_or(mine); }
+"""
+    return build_on_host("rasterise.cu", tmp_path_factory.mktemp("numbered"), before + text)
+
+
+def drawn(scene: Scene, library: ctypes.CDLL, order: int = 0, depth: bool = True) -> Raster:
+    program = Program(name="rasterise.cu", driver=HostDriver(library, order), headers=PROGRAM.headers)
+    return rasterise(*splats_of(scene.tensors), scene.width, scene.height, depth=depth, program=program)
+
+
+def bits_of(scene: Scene, library: ctypes.CDLL, order: int) -> list[bytes]:
+    """Everything that drawing and the way back give."""
+    scene = scene.to(torch.float32)
+    raster = drawn(scene, library, order)
+    gradients = torch.autograd.grad(loss_of(raster), scene.tensors)
+    return [tensor.detach().numpy().tobytes() for tensor in (*raster, *gradients)]
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("name", SCENES)
+def test_picture_and_gradients_equal_the_reference(name, library):
+    scene, exact_scene = SCENES[name].to(torch.float32), SCENES[name].to(torch.float64)
+    exact = reference(*splats_of(exact_scene.tensors), scene.width, scene.height, depth=True)
+    found = drawn(scene, library)
+    assert_same_picture(found, exact, 2e-5)
+    gradients = torch.autograd.grad(loss_of(found), scene.tensors)
+    for actual, expected in zip(gradients, torch.autograd.grad(loss_of(exact), exact_scene.tensors), strict=True):
+        # A mean or conic is known to 6e-8; a splat seen edge-on multiplies that.
+        assert_close(actual, expected, 2e-3 if name == "edge-on" else 1e-4)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("order", ORDERS[1:])
+def test_no_barrier_is_missing(order, library):
+    """The order in which threads and warps take turns changes no bit."""
+    assert bits_of(SCENES["ordinary"], library, order) == bits_of(SCENES["ordinary"], library, 0)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_wherever_splats_stand_picture_and_gradients_have_the_same_bits(seed, library):
+    """Where depths are equal, the order that splats are given with decides."""
+    program = Program(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers)
+    scene = SCENES["ordinary"]
+    splats, background = splats_of(scene.tensors)
+    level = replace(splats, depths=(splats.depths / 40).floor() + 1)
+    moved, order = in_runs(level, 7, seed)
+    assert torch.equal(moved.runs.order(len(order)).long(), order)
+    assert not torch.equal(order, order.sort()[0])
+    size, wanted = (scene.width, scene.height), torch.randn(scene.height, scene.width, 3)
+
+    def found(drawn: Splats) -> tuple[torch.Tensor, ...]:
+        raster, pullback = rasterise_vjp(drawn, background, *size, program=program)
+        gradients = pullback(wanted)
+        return raster.image, *gradients[:4], gradients.background
+
+    image, *of_splats, of_background = found(level)
+    other, *of_moved, of_background_then = found(moved)
+    assert torch.equal(image, other)
+    assert torch.equal(of_background, of_background_then)
+    assert all(torch.equal(one, two[order]) for one, two in zip(of_splats, of_moved, strict=True))
+    # It is by the order: as rows alone, they make another picture.
+    rows = Splats(*(getattr(moved, field.name) for field in fields(Splats)))
+    assert not torch.equal(image, found(rows)[0])
+    assert torch.equal(image, rasterise(moved, background, *size, program=program).image)
+
+
+def test_splats_joined_with_others_keep_the_order_of_each():
+    one, first = in_runs(splats_of(SCENES["ordinary"].tensors)[0], 5)
+    other, second = in_runs(splats_of(SCENES["tiny"].tensors)[0], 4, 1)
+    both = one.joined(other)
+    expected = torch.cat([first, second + len(first)])
+    assert torch.equal(both.runs.order(len(expected)).long(), expected)
+    alone = replace(one, runs=None).joined(other)
+    assert torch.equal(
+        alone.runs.order(len(expected)).long(), torch.cat([torch.arange(len(first)), expected[len(first) :]])
+    )
+    assert replace(one, runs=None).joined(replace(other, runs=None)).runs is None
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("barrier", range(BARRIERS))
+def test_a_missing_barrier_would_be_noticed(barrier, numbered):
+    """And every barrier is needed: without any one of them the order of turns changes the result, or threads wait in
+    vain for others."""
+    scene = make_scene(600, 17, 5, opacity=-1.0)  # more than fit into shared memory at once
+    left_out = ctypes.c_int.in_dll(numbered, "left_out")
+
+    def results(left: int) -> set[tuple[bytes, ...] | str]:
+        left_out.value = left
+        found: set[tuple[bytes, ...] | str] = set()
+        for order in ORDERS:
+            try:
+                found.add(tuple(bits_of(scene, numbered, order)))
+            except Stuck:
+                found.add("stuck")
+        return found
+
+    whole = results(-1)
+    assert len(whole) == 1
+    assert results(barrier) != whole
+
+
+@needs_a_compiler
+class TestMeaning:
+    def test_without_depth_there_is_none_and_the_picture_is_the_same(self, library):
+        scene = SCENES["ordinary"]
+        plain, whole = drawn(scene, library, depth=False), drawn(scene, library)
+        assert (plain.depth, plain.median_depth) == (None, None)
+        assert torch.equal(plain.image, whole.image)
+        assert torch.equal(plain.alpha, whole.alpha)
+
+    @pytest.mark.parametrize("column", range(5))
+    def test_rows_that_are_not_finite_are_not_drawn_and_get_no_gradient(self, column, library):
+        scene = SCENES["ordinary"].to(torch.float32)
+        with torch.no_grad():
+            scene.tensors[column].view(len(scene.tensors[column]), -1)[3, 0] = torch.nan
+        raster = drawn(scene, library)
+        assert all(tensor.isfinite().all() for tensor in raster)
+        gradients = torch.autograd.grad(loss_of(raster), scene.tensors)
+        assert all(tensor.isfinite().all() for tensor in gradients)
+        assert all((tensor[3] == 0).all() for tensor in gradients[:5])
+
+    def test_depths_of_either_sign_and_equal_ones_keep_the_order_of_the_rows(self, library):
+        scene = make_scene(60, 16, 16, opacity=2.0)
+        depths = torch.tensor([-3.0, -0.0, 0.0, 2.0, 2.0]).repeat(12)
+        scene = Scene((*scene.tensors[:4], depths, scene.tensors[5]), 16, 16)
+        exact = reference(*splats_of(scene.to(torch.float64).tensors), 16, 16)
+        assert_close(drawn(scene, library, depth=False).image, exact.image, 1e-5)
+
+    def test_the_way_back_overwrites_what_it_may(self, library):
+        scene, program = (
+            SCENES["ordinary"],
+            Program(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers),
+        )
+        splats, background = splats_of([tensor.detach().clone() for tensor in scene.tensors])
+        by_alpha = torch.randn(scene.height, scene.width, generator=torch.Generator().manual_seed(0))
+        expected = rasterise_vjp(splats, background, scene.width, scene.height, program=program)[1](None, by_alpha)
+        _, pullback = rasterise_vjp(splats, background, scene.width, scene.height, program=program)
+        found = pullback(None, by_alpha, over=(splats.means_px, splats.conics))
+        assert found.means_px is splats.means_px
+        assert found.depths is expected.depths is None
+        for ours, theirs in zip(found, expected, strict=True):
+            assert ours is theirs is None or torch.equal(ours, theirs)
+
+    @pytest.mark.parametrize("name", SCENES)
+    def test_gradients_of_the_first_splats_alone_have_the_bits_that_they_have_among_all(self, name, library):
+        scene, program = SCENES[name], Program(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers)
+        size, (splats, background) = (scene.width, scene.height), splats_of([each.detach() for each in scene.tensors])
+        assert_first_gradients_are_those_of_all(
+            lambda: rasterise_vjp(splats, background, *size, program=program)[1], len(splats.depths), *size
+        )
+
+    def test_unsuitable_tensors_are_refused(self, library):
+        splats, background = splats_of(SCENES["ordinary"].to(torch.float64).tensors)
+        program = Program(name="rasterise.cu", driver=HostDriver(library), headers=PROGRAM.headers)
+        with pytest.raises(TypeError, match="float32"):
+            rasterise(splats, background, 37, 29, program=program)
+        with pytest.raises(ValueError, match="width"):
+            rasterise(*splats_of(SCENES["ordinary"].tensors), 0, 29, program=program)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", SCENES)
+def test_a_card_gives_what_the_reference_gives(name):
+    cuda_driver()
+    scene, exact_scene = SCENES[name].to(torch.float32), SCENES[name].to(torch.float64)
+    there = [tensor.detach().cuda().requires_grad_() for tensor in scene.tensors]
+    found = rasterise(*splats_of(there), scene.width, scene.height, depth=True)
+    exact = reference(*splats_of(exact_scene.tensors), scene.width, scene.height, depth=True)
+    here = Raster(*(tensor.cpu() for tensor in found))
+    assert_same_picture(here, exact, 1e-4)
+    gradients = torch.autograd.grad(loss_of(here), there)
+    once_more = rasterise(*splats_of(there), scene.width, scene.height, depth=True)
+    again = torch.autograd.grad(loss_of(Raster(*(tensor.cpu() for tensor in once_more))), there)
+    for ours, expected in zip(gradients, torch.autograd.grad(loss_of(exact), exact_scene.tensors), strict=True):
+        assert_close(ours.cpu(), expected, 2e-3 if name == "edge-on" else 1e-3)
+    assert all(torch.equal(one, other) for one, other in zip(gradients, again, strict=True))

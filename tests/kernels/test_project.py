@@ -1,0 +1,150 @@
+"""Laws of the projection of Gaussians: the twin against calculus, the native kernel against the twin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from support.decode_scenes import looking_down, turned
+from vdgs.cameras import Camera
+from vdgs.kernels import constants
+from vdgs.kernels.constants import DILATION_PX2
+from vdgs.kernels.native import module
+from vdgs.kernels.native.project import project as native_project
+from vdgs.kernels.reference.project import project as twin_project
+from vdgs.kernels.rotations import rotation_matrices
+
+CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
+
+
+def gaussians(m: int, seed: int = 0, log_sigma: float = -2.0) -> tuple[torch.Tensor, ...]:
+    """Random Gaussians under the cameras above, some of them out of the picture, float64."""
+    g = torch.Generator().manual_seed(seed)
+    means = torch.randn(m, 3, generator=g, dtype=torch.float64) * torch.tensor([3.0, 3.0, 1.0])
+    scales = torch.exp(torch.randn(m, 3, generator=g, dtype=torch.float64) + log_sigma)
+    return means, scales, torch.randn(m, 4, generator=g, dtype=torch.float64)
+
+
+def monte_carlo_covariance(mean: np.ndarray, scales, quaternion, camera: Camera) -> np.ndarray:
+    rotation = rotation_matrices(quaternion[None])[0].numpy()
+    samples = np.random.default_rng(0).normal(size=(200_000, 3)) * scales.numpy() @ rotation.T + mean
+    return np.cov(camera.project(samples)[0].T) + DILATION_PX2 * np.eye(2)
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_small_gaussians_have_the_covariance_of_their_projected_samples(camera):
+    means, scales, quaternions = gaussians(4, log_sigma=-3.0)
+    means = means * 0.3  # near the axis, where nothing is clamped
+    projected = twin_project(means, scales, quaternions, camera)
+    pixels, depths = camera.project(means.numpy())
+    np.testing.assert_allclose(projected.means_px.numpy(), pixels, rtol=1e-12)
+    np.testing.assert_allclose(projected.depths.numpy(), depths, rtol=1e-12)
+    for i in range(4):
+        xx, xy, yy = projected.conics[i].tolist()
+        covariance = np.linalg.inv([[xx, xy], [xy, yy]])
+        sampled = monte_carlo_covariance(means[i].numpy(), scales[i], quaternions[i], camera)
+        assert np.abs(covariance - sampled).max() < 0.02 * np.abs(sampled).max()
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_gradients_of_the_twin_are_those_of_finite_differences(camera):
+    means, scales, quaternions = gaussians(12, seed=1)
+    means = torch.cat([means, means[:3] * torch.tensor([20.0, 20.0, 1.0])])  # beyond the clamp
+    scales, quaternions = torch.cat([scales, scales[:3]]), torch.cat([quaternions, quaternions[:3]])
+    arguments = [t.requires_grad_() for t in (means, scales, quaternions)]
+
+    def f(*gaussian):
+        projected = twin_project(*gaussian, camera)
+        return projected.means_px, projected.conics, projected.depths
+
+    assert torch.autograd.gradcheck(f, arguments, eps=1e-6, atol=1e-6, rtol=1e-5)
+
+
+def awkward() -> tuple[torch.Tensor, ...]:
+    """Behind the camera, on its plane, nearly edge-on, huge, tiny, no rotation, not a number."""
+    means, scales, quaternions = gaussians(40, seed=2)
+    means[0, 2], means[1, 2] = 50.0, 10.0
+    means[2] = torch.tensor([40.0, 0.0, 9.9])
+    scales[3], scales[4], scales[5] = 1e3, 1e-6, 1e39
+    scales[6] = torch.tensor([10.0, 1e-7, 1e-7])
+    quaternions[7] = 0.0
+    means[8, 0] = scales[9, 1] = quaternions[10, 2] = float("nan")
+    means[11, 1] = scales[12, 0] = float("inf")
+    return means, scales, quaternions
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_what_is_not_valid_is_zero_and_has_no_gradient(camera):
+    arguments = [t.float().requires_grad_() for t in awkward()]
+    for project in (twin_project, native_project):
+        projected = project(*arguments, camera)
+        bad = ~projected.valid
+        assert set(range(7, 13)) | {5} <= set(bad.nonzero()[:, 0].tolist())
+        numbers = torch.cat([projected.means_px, projected.conics, projected.depths[:, None]], 1)
+        assert torch.isfinite(numbers).all()
+        assert (numbers[bad] == 0).all()
+        for gradient in torch.autograd.grad((numbers * torch.randn_like(numbers)).sum(), arguments):
+            assert torch.isfinite(gradient).all()
+            assert (gradient[bad] == 0).all()
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("make", [awkward, lambda: gaussians(333, seed=3), lambda: gaussians(0)])
+@pytest.mark.parametrize("isa", module.supported())
+def test_native_equals_the_twin(camera, make, isa, monkeypatch):
+    monkeypatch.setattr(module, "native", lambda: module.load(isa))
+    exact = [t.float().double().requires_grad_() for t in make()]
+    single = [t.detach().float().requires_grad_() for t in exact]
+    twin = twin_project(*exact, camera)
+    ours = native_project(*single, camera)
+    assert torch.equal(ours.valid, twin.valid)
+    generator = torch.Generator().manual_seed(0)
+    losses = []
+    for name in ("means_px", "conics", "depths"):
+        a, b = getattr(ours, name), getattr(twin, name)
+        torch.testing.assert_close(a.double(), b, rtol=2e-5, atol=1e-4)
+        weight = torch.randn(b.shape, generator=generator, dtype=torch.float64)
+        losses.append(((a * weight.float()).sum(), (b * weight).sum()))
+    gradients = torch.autograd.grad(sum(a for a, _ in losses), single)
+    expected = torch.autograd.grad(sum(b for _, b in losses), exact)
+    for ours_g, twin_g in zip(gradients, expected, strict=True):
+        # Relative to each Gaussian's largest component: they span many magnitudes.
+        size = twin_g.abs().amax(-1, keepdim=True).clamp(min=1e-3)
+        torch.testing.assert_close(ours_g.double() / size, twin_g / size, rtol=1e-3, atol=2e-3)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10**6), angle=st.floats(-3, 3))
+def test_moving_the_world_and_the_camera_together_changes_nothing(seed, angle):
+    means, scales, quaternions = gaussians(5, seed=seed)
+    camera = looking_down()
+    turn = torch.tensor([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
+    rotation = rotation_matrices(turn[None])[0]
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = rotation.numpy(), [1.0, -2.0, 3.0]
+    moved = Camera(
+        camera_from_world=camera.camera_from_world @ np.linalg.inv(motion), fx=camera.fx, fy=camera.fy, cx=camera.cx,
+        cy=camera.cy, width=64, height=48,
+    )  # fmt: skip
+    w, x, y, z = quaternions.unbind(-1)
+    c, s = turn[0], turn[3]
+    turned_quaternions = torch.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], -1)
+    a = twin_project(means, scales, quaternions, camera)
+    b = twin_project(means @ rotation.T + torch.from_numpy(motion[:3, 3]), scales, turned_quaternions, moved)
+    torch.testing.assert_close(a.means_px, b.means_px)
+    torch.testing.assert_close(a.conics, b.conics)
+
+
+@pytest.mark.parametrize("isa", module.supported())
+def test_the_constants_of_the_kernels_are_those_of_the_twins(isa):
+    for name, value in module.load(isa).constants.items():
+        assert value == pytest.approx(getattr(constants, name), rel=1e-6), name
+
+
+def test_shapes_that_do_not_belong_together_are_refused():
+    means, scales, quaternions = gaussians(3)
+    with pytest.raises((ValueError, TypeError)):
+        native_project(means, scales, quaternions[:, :3], CAMERAS[0])

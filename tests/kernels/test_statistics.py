@@ -1,0 +1,62 @@
+"""Growth's statistics: the native sums equal the twin's, for any number of threads."""
+
+import pytest
+import torch
+
+import vdgs.kernels.native.statistics as native
+import vdgs.kernels.reference.statistics as reference
+from support.decode_scenes import view_statistics
+from support.instruction_sets import every_instruction_set, on_threads, using
+from vdgs.kernels.types import Statistics
+
+
+@every_instruction_set
+@pytest.mark.parametrize("seed", [0, 1])
+def test_native_equals_twin(instructions, seed):
+    inputs, sums = view_statistics(seed)
+    expected = [s.clone() for s in sums]
+    reference.add_view_statistics(Statistics(*expected), *inputs)
+    results = []
+    for threads in (1, 2, 3):
+        ours = [s.clone() for s in sums]
+        with using(instructions), on_threads(threads):
+            native.add_view_statistics(Statistics(*ours), *inputs)
+        results.append(ours)
+    for ours in results:
+        for mine, twin, first in zip(ours, expected, results[0], strict=True):
+            torch.testing.assert_close(mine, twin)
+            assert torch.equal(mine, first)
+
+
+@pytest.mark.parametrize("room", [native, reference])
+def test_nothing_drawn_counts_only_the_visible_that_are_inside(room):
+    sums = [torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4), torch.zeros(4)]
+    nothing = torch.zeros(0, dtype=torch.int32)
+    visible, inside = torch.tensor([0, 1, 3]), torch.tensor([True, False, True])
+    room.add_view_statistics(Statistics(*sums), visible, inside, nothing, torch.zeros(0), torch.zeros(0, 2), 8, 8)
+    assert not any(bool(s.any()) for s in sums[:3])
+    assert sums[3].tolist() == [1, 0, 0, 1]
+
+
+@pytest.mark.parametrize("room", [native, reference])
+def test_a_source_beyond_the_visible_is_refused(room):
+    sums = [torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4), torch.zeros(4)]
+    source = torch.tensor([0, 6], dtype=torch.int32)
+    with pytest.raises(IndexError):
+        room.add_view_statistics(
+            Statistics(*sums), torch.tensor([1, 3]), torch.ones(2, dtype=torch.bool), source, torch.zeros(2),
+            torch.zeros(2, 2), 8, 8,
+        )  # fmt: skip
+    assert float(sums[3].sum()) == 0
+
+
+@pytest.mark.parametrize("room", [native, reference])
+def test_a_mask_that_does_not_fit_is_refused(room):
+    sums = [torch.zeros(4, 3), torch.zeros(4, 3), torch.zeros(4), torch.zeros(4)]
+    nothing = torch.zeros(0, dtype=torch.int32)
+    for inside in (torch.ones(3, dtype=torch.bool), torch.ones(2)):
+        with pytest.raises((ValueError, TypeError), match="inside"):
+            room.add_view_statistics(
+                Statistics(*sums), torch.tensor([1, 3]), inside, nothing, torch.zeros(0), torch.zeros(0, 2), 8, 8
+            )
+    assert float(sums[3].sum()) == 0

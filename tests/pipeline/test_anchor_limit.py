@@ -1,0 +1,97 @@
+"""The limit of anchors of all blocks together: their shares, and what comes of them in a real run."""
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from experiments.bench.plan import Choices, make_plan
+from support.captures import tiny_scene, write_colmap
+from vdgs.runs.beginning import begin_run
+from vdgs.runs.folder import RunFolder
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.checks import validate
+from vdgs.settings.method import BlockConfig, GrowthConfig, MethodConfig, block_limit
+from vdgs.settings.watching import WatchOptions
+from vdgs.stages.block import train_block
+from vdgs.stages.coarse import train_coarse
+from vdgs.stages.merge import merge_run
+from vdgs.stages.partition import partition_run
+from vdgs.stages.visibility import measure_visibility
+
+counts = st.lists(st.integers(0, 10**6), min_size=1, max_size=16).filter(any)
+
+
+@given(owned=counts, total=st.integers(1, 10**8))
+def test_shares_hold_the_total_whatever_the_blocks(owned, total):
+    limits = [block_limit(BlockConfig(max_anchors_total=total), each, sum(owned)) for each in owned]
+    # Growth stops at the limit and removes nothing.
+    held = [max(each, limit) for each, limit in zip(owned, limits, strict=True) if each]
+    assert sum(held) <= max(total, sum(owned))
+    assert min(limits) >= 1  # 0 would be no limit at all
+    assert all(limit >= each for each, limit in zip(owned, limits, strict=True)) or total < sum(owned)
+
+
+def test_no_total_is_no_limit_and_a_block_may_have_one_of_its_own():
+    assert block_limit(BlockConfig(), 10, 30) == 0
+    alone = BlockConfig(growth=GrowthConfig(max_anchors=50))
+    assert block_limit(alone, 10, 30) == 50
+    assert block_limit(replace(alone, max_anchors_total=90), 10, 30) == 30
+    assert block_limit(replace(alone, max_anchors_total=900), 10, 30) == 50
+    assert validate(MethodConfig(block=BlockConfig(max_anchors_total=-1)))
+
+
+def eager(max_anchors: int) -> MethodConfig:
+    """The full method of a table with that limit, in four blocks that grow wherever they may from the first step on."""
+    choices = Choices(seeds=1, scenes=("copr",), methods=("full",), max_anchors=max_anchors)
+    (planned,) = make_plan("table1", choices).runs
+    config, growth = planned.config, planned.config.block.growth
+    growth = replace(
+        growth, interval=4, statistics_from=0, start=1, until=1.0, threshold=1e-12, gate=0.0, coarsest_cell=2.0,
+        prune_views=1e9,
+    )  # fmt: skip
+    return replace(
+        config,
+        training=replace(config.training, iterations=1, resolutions=((0.0, 1),)),
+        assignment=replace(config.assignment, min_cameras=4, longest_side_px=32),
+        block=replace(
+            config.block, iterations=16, growth=growth, average=0.0, crop="off", sampling="even",
+            resolutions=((0.0, 1),),
+        ),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("place") / "capture"
+    write_colmap(folder, tiny_scene(points=150))
+    return folder
+
+
+def merged(capture: Path, output: Path, max_anchors: int) -> tuple[RunFolder, int, int]:
+    """A run, and how many anchors its coarse model and its merged scene have."""
+    console = Console(file=io.StringIO())
+    context = begin_run(capture, output, CaptureOptions(), eager(max_anchors))
+    run = context.run
+    train_coarse(context, WatchOptions(), console)
+    measure_visibility(context, console)
+    partition_run(context, console)
+    for index in range(len(run.partition_record().blocks)):
+        train_block(context, index, WatchOptions(), console)
+    merge_run(context, False, console)
+    return run, run.coarse.status().anchors, run.merged.status().anchors
+
+
+def test_a_merged_scene_keeps_to_the_limit_of_all_its_blocks(place, tmp_path):
+    limit = 160  # a little more than the coarse model has
+    run, coarse, grown = merged(place, tmp_path / "run", limit)
+    owned = [each.anchors_core for each in run.partition_record().blocks]
+    trained = [run.block(index).status().anchors for index in range(len(owned))]
+    shares = [limit * each // coarse for each in owned]
+    assert max(owned) > -(-limit // len(owned))  # equal shares would leave the largest above its own
+    assert trained == shares  # all of them wanted more
+    assert coarse < grown == sum(shares) <= limit

@@ -1,0 +1,99 @@
+"""What the coarse stage hands on: a model with anchors or none at all, on whatever device it is opened."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+
+from support.captures import tiny_scene, write_colmap
+from support.fake_device import CARD, pretended_card
+from support.hand_made_models import model_at
+from vdgs.captures.capture import Capture
+from vdgs.captures.facts import capture_facts
+from vdgs.errors import RunError
+from vdgs.model.anchor_model import AnchorModel, ModelMetadata
+from vdgs.runs.beginning import begin_run
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import open_run
+from vdgs.runs.run_context import RunContext
+from vdgs.runs.standing import standing_of
+from vdgs.runs.status import Status
+from vdgs.runs.visibility import keep_visibility
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.method import AnchorConfig, GrowthConfig, MethodConfig, TrainConfig
+from vdgs.settings.watching import WatchOptions
+from vdgs.stages.coarse import train_coarse
+from vdgs.stages.visibility import measure_visibility
+from vdgs.storage.files import write_json
+from vdgs.storage.tensors import identity
+
+UP, QUIET = CaptureOptions(up="z"), Console(quiet=True)
+#: Some steps, at the end of which all that was seen is taken for transparent.
+LAST = GrowthConfig(
+    interval=20, statistics_from=0, start=20, levels=0, prune_opacity=1e6, prune_views=0.0, until=1.0
+)  # fmt: skip
+METHOD = MethodConfig(
+    TrainConfig(iterations=20, anchors=AnchorConfig(offsets=2, fill_gaps=False), growth=LAST, average=0.0)
+)
+
+
+def begin(folder: Path, method: MethodConfig, redo: bool | None = None) -> tuple[RunFolder, Capture]:
+    context = begin_run(folder / "place", folder / "run", UP, method, redo=redo)
+    return context.run, context.capture
+
+
+def train(run: RunFolder, capture: Capture) -> None:
+    train_coarse(RunContext(run, capture), WatchOptions(), QUIET)
+
+
+def finished(run: RunFolder, capture: Capture, model: AnchorModel) -> None:
+    """A coarse stage that is done with a model."""
+    write_json(run.capture_file, capture_facts(capture))
+    run.coarse.discard_unless(run.keys().coarse)
+    metadata = ModelMetadata(key=run.keys().coarse, capture=capture_facts(capture))
+    replace(model, metadata=metadata).save(run.coarse.model)
+    count = len(model.anchors)
+    run.coarse.set_status(Status(state="done", iteration=6, anchors=count, model=identity(run.coarse.model)))
+
+
+def test_training_that_leaves_no_anchors_is_not_done_and_says_what_to_change(tmp_path):
+    scene = tiny_scene()
+    below = ((scene.points[:, :2] > 0) & (scene.points[:, :2] < (9, 6))).all(axis=1)  # of the flight: all are seen
+    write_colmap(tmp_path / "place", replace(scene, points=scene.points[below], colours=scene.colours[below]))
+    run, capture = begin(tmp_path, METHOD)
+    for _ in range(2):  # the same command says the same
+        with pytest.raises(RunError, match=r"coarse: .*no anchors(?s:.*)--growth\.prune-opacity(?s:.*)--redo"):
+            train(run, capture)
+        assert not run.coarse.model.exists()
+        assert standing_of(run).of("coarse").state == "failed"
+    kept = replace(METHOD, training=replace(METHOD.training, growth=replace(LAST, prune_opacity=0.0)))
+    with pytest.raises(RunError, match="--redo"):
+        begin(tmp_path, kept, redo=False)
+    train(*begin(tmp_path, kept, redo=True))  # as it advised
+    assert run.coarse.is_done(run.keys().coarse)
+
+
+def test_a_model_without_anchors_of_an_earlier_version_is_refused_too(tmp_path):
+    write_colmap(tmp_path / "place", tiny_scene())
+    run, capture = begin(tmp_path, METHOD)
+    finished(run, capture, model_at(torch.zeros(0, 3).numpy()))
+    with pytest.raises(RunError, match="no anchors"):
+        train(run, capture)
+    with pytest.raises(RunError, match="no anchors"):
+        measure_visibility(RunContext(run), QUIET)
+
+
+def test_visibility_that_is_counted_on_a_card_is_handed_on_in_main_memory(tmp_path):
+    """As `vdgs partition --device cuda` does, where nothing has counted it before."""
+    write_colmap(tmp_path / "place", tiny_scene())
+    run, capture = begin(tmp_path, METHOD)
+    finished(run, capture, model_at([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [90.0, 0.0, 0.0]]))
+    with pretended_card():
+        counted = keep_visibility(open_run(run.path, "coarse", CARD)).numpy()
+        kept = keep_visibility(open_run(run.path, "coarse", CARD)).numpy()
+    assert counted[2] == 0 < counted[0]
+    assert kept.tolist() == counted.tolist() == keep_visibility(open_run(run.path, "coarse")).tolist()

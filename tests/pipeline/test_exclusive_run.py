@@ -1,0 +1,171 @@
+"""A run that one command takes from stage to stage is neither changed nor lost by another."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from experiments.bench.worker import Job, work
+from support.captures import tiny_scene, write_colmap
+from support.flights import write_photograph
+from vdgs.captures.facts import capture_facts
+from vdgs.cli import main
+from vdgs.errors import RunError
+from vdgs.pipeline import with_capture
+from vdgs.runs.beginning import begin_run, driven_run
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.status import Status
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.plain import to_dict
+from vdgs.settings.presets import PRESETS
+from vdgs.settings.requests import RunRequest
+from vdgs.storage.files import write_json
+
+#: Another process that drives a run: it holds the lock of which it is told until its input ends.
+DRIVER = (
+    "import fcntl, sys; lock = open(sys.argv[1], 'a'); fcntl.flock(lock, fcntl.LOCK_EX); print(flush=True); "
+    "sys.stdin.read()"
+)
+#: As `--preset laptop --block.ring free` gives them: blocks may be merged by either rule.
+METHOD = replace(PRESETS["laptop"], block=replace(PRESETS["laptop"].block, ring="free"))
+OPTIONS = ("--preset", "laptop", "--block.ring", "free")
+AT_WORK = "another vdgs process works on this run"
+
+
+@contextmanager
+def driven_elsewhere(run: RunFolder) -> Iterator[None]:
+    """Another process takes the run from stage to stage; at the moment it is between two of them."""
+    lock = run.path / ".run" / ".lock"
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-S", "-c", DRIVER, str(lock)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as driver:
+        assert driver.stdout is not None
+        driver.stdout.readline()
+        yield
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    write_colmap(tmp_path / "place", tiny_scene())
+    return tmp_path / "place"
+
+
+@pytest.fixture
+def run(place: Path, tmp_path: Path) -> RunFolder:
+    """A run with a finished coarse model and a block, as far as its files say so."""
+    context = begin_run(place, tmp_path / "run", CaptureOptions(), METHOD, redo=False)
+    run, capture = context.run, context.capture
+    write_json(run.capture_file, capture_facts(capture))
+    for stage in (run.coarse, run.block(0)):
+        stage.discard_unless(run.keys().coarse if stage == run.coarse else run.keys().blocks)
+        stage.model.write_bytes(b"a model")
+        stage.set_status(Status(state="done", iteration=3000, model="7-any"))
+    return run
+
+
+def contents(run: RunFolder) -> dict[Path, bytes]:
+    return {file: file.read_bytes() for file in run.path.rglob("*") if file.is_file()}
+
+
+def command_line(*arguments: object) -> object:
+    with pytest.raises(SystemExit) as ended:
+        main([str(each) for each in arguments])
+    return ended.value.code
+
+
+#: Commands that would give the run other settings, or remove what was trained for those that it has.
+CHANGES: dict[str, Callable[[Path, Path], list[object]]] = {
+    "other blocks": lambda place, run: ["run", place, "--output", run, *OPTIONS, "--blocks", "4"],
+    "another coarse model": lambda place, run: [
+        "run", place, "--output", run, *OPTIONS, "--iterations", "50", "--redo",
+    ],
+    "read otherwise": lambda place, run: [
+        "run", place, "--output", run, *OPTIONS, "--downscale", "2", "--redo",
+    ],
+    "the coarse stage": lambda place, run: ["coarse", place, "--output", run, "--preset", "laptop"],
+    "another cut": lambda _, run: ["partition", run, "--blocks", "4", "--redo"],
+    "other training": lambda _, run: ["train", run, "--block.iterations", "7", "--redo"],
+    "another block": lambda _, run: ["train", run, "--block", "0", "--block.iterations", "7", "--redo"],
+    "another merge": lambda _, run: ["merge", run, "--rule", "best_seen"],
+    "moved, for visibility": lambda place, run: ["visibility", run, "--capture", moved(place)],
+    "moved, for figures": lambda place, run: ["eval", run, "--capture", moved(place)],
+    "moved, for a run": lambda place, run: ["run", moved(place), "--output", run, *OPTIONS],
+}  # fmt: skip
+
+
+def moved(place: Path) -> Path:
+    return Path(shutil.move(place, place.with_name("moved")))
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_another_process_drives_is_not_touched(run, place, capsys, change):
+    arguments = [*CHANGES[change](place, run.path), "--quiet"]
+    with driven_elsewhere(run):
+        before = contents(run)
+        assert command_line(*arguments) == 1
+        assert contents(run) == before
+    assert AT_WORK in capsys.readouterr().err
+
+
+def test_a_block_is_trained_beside_who_drives_the_run(run, capsys):
+    """Commands that change nothing are those that executors begin, on whatever machine."""
+    with driven_elsewhere(run):
+        assert command_line("train", run.path, "--block", "0") == 1
+    assert "vdgs partition" in capsys.readouterr().err  # it is not refused for its driver
+
+
+def test_who_takes_a_run_up_drives_it(place, tmp_path):
+    method = PRESETS["laptop"]
+    with driven_run(place, tmp_path / "run", CaptureOptions(), method, redo=False) as context:
+        run = context.run
+        assert run.is_driven()
+        with pytest.raises(RunError, match=AT_WORK):
+            begin_run(place, run.path, CaptureOptions(), method, redo=True)
+    assert not run.is_driven()
+    begin_run(place, run.path, CaptureOptions(), method, redo=False)
+
+
+def test_a_bench_does_not_begin_what_another_process_drives(run, place):
+    job = Job(
+        place, to_dict(CaptureOptions()), to_dict(PRESETS["laptop"]), ("coarse",), run.path, None, "key", None, 4, 1, 1,
+        redo=True,
+    )  # fmt: skip
+    with driven_elsewhere(run):
+        before = contents(run)
+        with pytest.raises(RunError, match=AT_WORK):
+            work(job)
+        assert contents(run) == before
+
+
+def test_photographs_are_not_made_a_capture_under_a_run_that_is_driven(tmp_path):
+    photographs, run = tmp_path / "card", RunFolder(tmp_path / "run")
+    photographs.mkdir()
+    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+    for k in range(6):
+        place = np.array([10.0 * (k % 3), 12.0 * (k // 3), 40.0 + k % 2])
+        write_photograph(photographs / f"p{k}.jpg", np.roll(noise, k, axis=0), k, place)
+    request = RunRequest(
+        capture=photographs, output=run.path, preset="laptop", threads=1, training=PRESETS["laptop"].training
+    )
+    with driven_elsewhere(run), pytest.raises(RunError, match=AT_WORK):
+        with_capture(request, Console(file=io.StringIO()))
+    assert not run.own_capture.exists()
+
+
+def test_a_run_among_other_files_leaves_nothing_there(place, tmp_path):
+    thesis = tmp_path / "work" / "thesis.txt"
+    thesis.parent.mkdir()
+    thesis.write_text("three years")
+    with pytest.raises(RunError, match="holds other files"):
+        begin_run(place, thesis.parent, CaptureOptions(), PRESETS["laptop"])
+    assert list(thesis.parent.iterdir()) == [thesis]

@@ -1,0 +1,216 @@
+"""Runs whose capture is read with other options, lies elsewhere, or is gone: what is blamed, and what still works."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from support.captures import tiny_scene, write_colmap
+from vdgs.cli import main
+from vdgs.errors import CaptureError, RunError, VdgsError
+from vdgs.films.film import render_run
+from vdgs.runs.beginning import begin_run
+from vdgs.runs.flight import flight_of, kept_flight
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import open_capture, open_model, open_run, remember_capture
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.method import AnchorConfig, MethodConfig, TrainConfig
+from vdgs.settings.requests import RenderRequest
+from vdgs.settings.watching import WatchOptions
+from vdgs.stages.coarse import train_coarse
+
+pytestmark = pytest.mark.xdist_group("moved_capture")
+
+METHOD = MethodConfig(TrainConfig(iterations=3, anchors=AnchorConfig(offsets=2)))
+UP = CaptureOptions(up="z")
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """A folder with a capture, `place`, and a coarse model of it, `run`."""
+    folder = tmp_path_factory.mktemp("moved")
+    write_colmap(folder / "place", tiny_scene())
+    train_coarse(begin_run(folder / "place", folder / "run", UP, METHOD), WatchOptions(), QUIET)
+    return folder
+
+
+@pytest.fixture
+def folder(trained, tmp_path) -> Path:
+    """The same to change; the run still knows its capture by its old place, where nothing is."""
+    shutil.copytree(trained, tmp_path / "there")
+    file = tmp_path / "there" / "run" / "config.yaml"
+    file.write_text(file.read_text().replace(str(trained), str(tmp_path / "gone")))
+    return tmp_path / "there"
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (replace(UP, downscale=2.0), r"--downscale: 1\.0 -> 2\.0"),
+        (replace(UP, test_every=4), "--test-every: 8 -> 4"),
+        (replace(UP, up="y"), "--up: z -> y"),
+    ],
+)
+def test_another_option_is_named_and_not_the_capture(trained, options, line):
+    for redo in (None, False):
+        with pytest.raises(RunError, match=line) as caught:
+            begin_run(trained / "place", trained / "run", options, METHOD, redo=redo)
+        assert "is not the capture" not in str(caught.value)
+
+
+def test_redo_takes_another_option(folder):
+    context = begin_run(folder / "place", folder / "run", replace(UP, downscale=2.0), METHOD, redo=True)
+    run = context.run
+    assert not run.coarse.holds_work()
+    train_coarse(context, WatchOptions(), QUIET)
+    assert open_run(run.path).capture.views[0].camera.width == 32
+    begin_run(folder / "place", folder / "run", replace(UP, downscale=2.0), METHOD, redo=False)
+
+
+@pytest.mark.parametrize("redo", [None, False])
+def test_a_capture_that_moved_is_taken_where_it_is_given(folder, redo):
+    run = begin_run(folder / "place", folder / "run", UP, METHOD, redo=redo).run
+    assert open_run(run.path).capture.root == folder / "place"
+    assert run.coarse.is_done(run.keys().coarse)
+
+
+def test_what_needs_the_capture_says_how_to_name_it(folder):
+    run = RunFolder(folder / "run")
+    with pytest.raises(CaptureError, match=r"gone/place: the capture of .* is not there.*--capture PATH"):
+        open_run(run.path)
+    remember_capture(run, folder / "place")
+    assert open_run(run.path).capture.root == folder / "place"
+
+
+def test_another_capture_is_not_remembered(folder, tmp_path):
+    write_colmap(tmp_path / "other", tiny_scene(points=300))
+    with pytest.raises(RunError, match="is not the capture that"):
+        remember_capture(RunFolder(folder / "run"), tmp_path / "other")
+    assert "gone" in (folder / "run" / "config.yaml").read_text()
+
+
+def test_the_kept_flight_is_that_of_the_capture(trained):
+    run = RunFolder(trained / "run")
+    kept = kept_flight(run, open_model(run).model.metadata.capture)
+    assert kept is not None
+    read = flight_of(open_capture(run))
+    assert [name for name, _ in kept.train + kept.test] == [name for name, _ in read.train + read.test]
+    for (_, ours), (_, theirs) in zip(kept.train, read.train, strict=True):
+        assert (ours.packed == theirs.packed).all()
+    assert (kept.middle == read.middle).all()
+    assert (kept.ground.translation == read.ground.translation).all()
+
+
+def test_views_and_orbits_are_drawn_without_the_photographs(trained, folder, tmp_path):
+    for views, extra in (("test", {}), ("orbit", {"seconds": 0.1})):
+        for run in (trained / "run", folder / "run"):
+            render_run(
+                RenderRequest(run=run, output=tmp_path / run.parent.name / views, views=views, **extra, device="cpu"),
+                QUIET,
+            )
+        ours, theirs = (sorted((tmp_path / each.name / views).glob("*.png")) for each in (trained, folder))
+        assert [file.read_bytes() for file in ours] == [file.read_bytes() for file in theirs]
+        assert ours
+
+
+def test_maps_are_drawn_without_the_photographs_too(trained, folder, tmp_path):
+    for kind in ("depth", "visibility", "alpha"):
+        for run in (trained / "run", folder / "run"):
+            render_run(RenderRequest(run=run, output=tmp_path / run.parent.name / kind, kind=kind, device="cpu"), QUIET)
+        ours, theirs = (sorted((tmp_path / each.name / kind).glob("*.png")) for each in (trained, folder))
+        assert ours
+        assert [file.read_bytes() for file in ours] == [file.read_bytes() for file in theirs]
+
+
+def test_nothing_is_drawn_among_the_photographs_though_they_are_not_read(trained, tmp_path):
+    shutil.copytree(trained / "place", tmp_path / "place")
+    (tmp_path / "place" / "images").rename(tmp_path / "place" / "photos")
+    options = replace(UP, images="photos")
+    context = begin_run(tmp_path / "place", tmp_path / "run", options, METHOD)
+    run, capture = context.run, context.capture
+    train_coarse(context, WatchOptions(), QUIET)
+    flight = kept_flight(run, open_model(run).model.metadata.capture)
+    assert flight is not None
+    assert flight.inputs == flight_of(capture).inputs
+    assert flight.height == flight_of(capture).height
+    (tmp_path / "place").rename(tmp_path / "moved")
+    remember_capture(run, tmp_path / "moved")
+    for inside in ("", "new", "film.mp4"):
+        with pytest.raises(VdgsError, match="photos, which is for inputs of the capture"):
+            render_run(RenderRequest(run=run.path, output=tmp_path / "moved" / "photos" / inside, device="cpu"), QUIET)
+
+
+def test_the_command_that_is_advised_names_the_capture_where_it_lies_now(folder, tmp_path):
+    run = RunFolder(folder / "run")
+    settings, gone = run.settings(), tmp_path / "gone" / "place"
+    for command, moved in (
+        (f"vdgs run {gone} --output 'a run' --redo", f"vdgs run {folder}/place --output 'a run' --redo"),
+        ("vdgs run place --output run", None),
+        (None, None),
+    ):
+        run.config.write(settings, command)
+        run.move_capture(gone)  # where it was
+        assert run.config.command() == command
+        run.move_capture(folder / "place")
+        assert run.config.command() == moved
+
+
+def test_a_run_without_cameras_takes_the_capture_that_is_named(folder, tmp_path):
+    (folder / "run" / "cameras.json").unlink()
+    asked = RenderRequest(run=folder / "run", output=tmp_path / "o", device="cpu")
+    with pytest.raises(CaptureError, match="--capture PATH"):
+        render_run(asked, QUIET)
+    render_run(replace(asked, capture=folder / "place"), QUIET)
+    assert len(list((tmp_path / "o").glob("*.png"))) == 2
+    assert "gone" in (folder / "run" / "config.yaml").read_text()  # looking at a run changes nothing in it
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", '{"fingerprint": 3, "views": 1}', "{"])
+def test_damaged_cameras_are_said_or_read_anew(folder, tmp_path, text):
+    (folder / "run" / "cameras.json").write_text(text)
+    with pytest.raises(VdgsError, match=r"cameras\.json: is damaged|--capture PATH"):
+        render_run(RenderRequest(run=folder / "run", output=tmp_path / "o", device="cpu"), QUIET)
+
+
+def test_pictures_too_large_for_memory_are_refused_before_they_are_drawn(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr("vdgs.films.film.available_bytes", lambda: 1_000_000)
+    with pytest.raises(VdgsError, match=r"a picture of 1000x750 takes about \d+ MB.*smaller --width"):
+        render_run(RenderRequest(run=trained / "run", output=tmp_path / "o", width=1000, device="cpu"), QUIET)
+    with pytest.raises(VdgsError, match=r"pictures of 12000x\d+ are too large|takes about"):
+        render_run(RenderRequest(run=trained / "run", output=tmp_path / "o", width=12_000, device="cpu"), QUIET)
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("iterations: 3", "iterations: many"), "training.iterations is 'many'; it must be a whole number"),
+        (("lambda_vis: 1.0", "lambda_vis: .nan"), "partition.lambda_vis is nan; it must be at least 0"),
+        (("test_every: 8", "test_every: often"), "capture.test_every is 'often'; it must be a whole number"),
+        (("blocks: 8", "block: 8"), "partition has no 'block'; did you mean 'blocks'?"),
+    ],
+)
+def test_a_setting_in_the_file_that_cannot_be_is_named(folder, change, says, tmp_path, capsys):
+    file = folder / "run" / "config.yaml"
+    text = file.read_text()
+    assert change[0] in text
+    file.write_text(text.replace(*change))
+    with pytest.raises(SystemExit) as ended:
+        main(["eval", str(folder / "run"), "--capture", str(folder / "place")])
+    assert ended.value.code == 1
+    assert f"config.yaml: {says}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", ["run", "eval"])
+def test_weights_that_are_not_there_are_said_before_any_work(trained, tmp_path, verb, capsys):
+    first = [str(trained / "place"), "--output", str(tmp_path / "new")] if verb == "run" else [str(trained / "run")]
+    with pytest.raises(SystemExit) as ended:
+        main([verb, *first, "--device", "cpu", "--threads", "1", "--lpips-weights", "nowhere.pth"])
+    assert ended.value.code == 1
+    assert "--lpips-weights nowhere.pth: no such file" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()

@@ -1,0 +1,509 @@
+"""Maps: every pixel where it says it is, heights of surfaces and of nothing between, files whole or absent."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections import namedtuple
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from rich.console import Console
+
+from support.captures import look_down
+from support.hand_made_models import model_at, opaque_plane
+from vdgs.cameras import Camera
+from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.errors import VdgsError
+from vdgs.maps import folder, mapping, sharpening, tiles
+from vdgs.maps.geotiff import CACHE_BYTES, bounded_cache
+from vdgs.maps.grid import TILE_PX, Grid, extent_of, grid_over, ground_sampling
+from vdgs.maps.overhead import Overhead
+from vdgs.maps.pictures import hillshade, round_length
+from vdgs.maps.sharpening import Sharpener
+from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Surveyor, samples_for
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.decoder import Decoder
+from vdgs.model.render import render
+from vdgs.placing.placement import Placement
+from vdgs.runs.run_context import RunContext
+from vdgs.settings.requests import MapRequest
+
+rasterio = pytest.importorskip("rasterio")
+pytest.importorskip("pyproj")
+
+#: Far from the middle of its zone: grid north is 1.1 degrees off.
+PLACE = (46.95, 7.44, 560.0)
+SPACING, ROOF = 0.25, 5.0
+#: Where the house stands, in the ground frame: x0, y0, x1, y1.
+HOUSE = (2.0, -3.0, 6.0, 1.0)
+
+
+def surface(x0: float, y0: float, x1: float, y1: float, z: float) -> np.ndarray:
+    x, y = np.meshgrid(np.arange(x0 + SPACING / 2, x1, SPACING), np.arange(y0 + SPACING / 2, y1, SPACING))
+    # Not quite level: which of two splats at one depth comes first is a matter of rounding.
+    return np.column_stack([x.ravel(), y.ravel(), z + np.random.default_rng(0).uniform(-0.02, 0.02, x.size)])
+
+
+def model_of(places: np.ndarray) -> AnchorModel:
+    """Opaque splats at these places, each of its own colour, flat enough that roofs stay roofs."""
+    plane = opaque_plane(spacing=SPACING)
+    anchors = model_at(places).anchors
+    anchors = replace(
+        anchors,
+        offsets=torch.zeros_like(anchors.offsets),
+        log_scales=torch.full_like(anchors.log_scales, float(np.log(SPACING))),
+    )
+    return replace(plane, anchors=anchors)
+
+
+def surveyor_of(model: AnchorModel, capture: Capture, placement: Placement, *given, **named) -> Surveyor:
+    return Surveyor(model, Overhead.of(capture, placement), *given, **named)
+
+
+GROUND, TOP = surface(-10, -10, 10, 10, 0.0), surface(*HOUSE, ROOF)
+
+
+def capture_of(points: np.ndarray, origin: tuple[float, float, float] | None = PLACE, flying: float = 20.0) -> Capture:
+    """Cameras in a row over the scene, looking down; the sparse points as given."""
+    views = []
+    for number, x in enumerate((-6.0, -2.0, 2.0, 6.0)):
+        camera = Camera(
+            camera_from_world=look_down(np.array([x, 0.0, flying]), 5.0, 90.0), fx=80.0, fy=80.0, cx=32.0, cy=24.0,
+            width=64, height=48,
+        )  # fmt: skip
+        views.append(
+            View(
+                name=f"{number}.png",
+                camera=camera,
+                image_path=Path("images") / f"{number}.png",
+                mask_path=None,
+                split="train",
+            )
+        )
+    ground = GroundFrame(
+        scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how="hand-made", origin_geo=origin
+    )
+    return Capture(
+        root=Path("place"), source="colmap", images="images", views=tuple(views), points=points,
+        point_colours=np.zeros((len(points), 3), np.uint8), ground=ground,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """`vdgs map` of a model and a capture that were never trained; returns the folder of the maps."""
+
+    def run(capture: Capture, model: AnchorModel, **asked) -> Path:
+        folder = SimpleNamespace(path=tmp_path / "run")
+        status = SimpleNamespace(model="1-2")
+        opened = SimpleNamespace(folder=folder, capture=capture, model=model, name="coarse", status=status)
+        monkeypatch.setattr(RunContext, "open_model", lambda *_: opened)
+        request = MapRequest(run=tmp_path / "run", device="cpu", **asked)
+        return mapping.map_run(RunContext.from_path(request.run), request, Console(file=sys.stderr, soft_wrap=True))
+
+    run.path = tmp_path / "run"
+    return run
+
+
+@pytest.fixture(scope="module")
+def house() -> tuple[Capture, AnchorModel]:
+    places = np.concatenate([GROUND, TOP])
+    return capture_of(places), model_of(places)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:2056", "enu", "local", "source"])
+@pytest.mark.parametrize("away", [(0.0, 0.0), (900.0, -700.0)])
+def test_every_place_falls_on_its_pixel_to_a_tenth(crs, away):
+    """Through the camera that draws a tile, against the exact coordinates; 512 pixels of 4 cm, and 5 m high things."""
+    centre = np.array([*away, 0.0])
+    places = centre + np.random.default_rng(1).uniform(-1, 1, (200, 3)) * (10, 10, 5)
+    capture = capture_of(places)
+    placement = Placement.of(capture.ground, crs)
+    exact = placement.places(places)
+    x, y = placement.places(centre[None])[0, :2]
+    grid = Grid(float(x) - 10.24, float(y) + 10.24, 0.04, 512, 512)
+    pixels, _ = Overhead.of(capture, placement).camera(grid).project(places)
+    expected = np.stack([(exact[:, 0] - grid.left) / grid.gsd, (grid.top - exact[:, 1]) / grid.gsd], axis=1)
+    assert np.abs(pixels - expected).max() < 0.1
+
+
+def test_files_open_at_the_right_place_with_the_right_heights(house, make):
+    capture, model = house
+    folder = make(capture, model, gsd=0.1)
+    corners = np.array([[HOUSE[0], HOUSE[1], ROOF], [HOUSE[2], HOUSE[3], ROOF]])
+    easting, northing, height = Placement.of(capture.ground).places(corners.mean(axis=0, keepdims=True))[0]
+    with rasterio.open(folder / "dsm.tif") as file:
+        assert file.crs.to_epsg() == 32632
+        heights = file.read(1)
+        roof = np.argwhere(heights > height - ROOF / 2)
+        middle = file.xy(*roof.T)
+    # To a tenth of a pixel: the middle of a roof of 1600 pixels.
+    assert np.mean(middle[0]) == pytest.approx(easting, abs=0.01)
+    assert np.mean(middle[1]) == pytest.approx(northing, abs=0.01)
+    assert np.median(heights[tuple(roof.T)]) == pytest.approx(height, abs=0.02)
+    # What a photograph shows in some pixel is there in the map.
+    camera = capture.views[2].camera
+    depth = render(model, camera, depth=True).median_depth
+    place = Placement.of(capture.ground).places(camera.unproject(depth.numpy())[24, 32][None])[0]
+    with rasterio.open(folder / "dsm.tif") as file:
+        assert file.read(1)[file.index(*place[:2])] == pytest.approx(place[2], abs=0.05)
+
+
+def test_files_are_cloud_optimised_and_say_what_they_are(house, make):
+    folder = make(*house, gsd=0.03)
+    names = {file.name for file in folder.iterdir()}
+    assert names == {"orthophoto.tif", "dsm.tif", "visibility.tif", "hillshade.png", "preview.png", "map.json"}
+    layers = {"orthophoto": (4, "uint8", None), "dsm": (1, "float32", NO_HEIGHT), "visibility": (1, "uint16", NO_COUNT)}
+    for name, (count, dtype, nodata) in layers.items():
+        with rasterio.open(folder / f"{name}.tif") as file:
+            assert (file.count, file.dtypes[0], file.nodata) == (count, dtype, nodata)
+            structure = file.tags(ns="IMAGE_STRUCTURE")
+            assert (structure["LAYOUT"], structure["COMPRESSION"]) == ("COG", "DEFLATE")
+            assert structure["PREDICTOR"] == ("3" if dtype == "float32" else "2")
+            assert file.overviews(1)
+            assert "ellipsoidal" in file.tags()["HEIGHTS"]
+            assert file.tags()["MODEL"] == "coarse"
+    with rasterio.open(folder / "dsm.tif") as file:
+        assert file.units == ("m",)
+        assert "ellipsoidal" in file.descriptions[0]
+
+
+def test_overviews_have_no_height_between_roof_and_street_either(house, make):
+    folder = make(*house, gsd=0.03)
+    for name, nothing in (("dsm", NO_HEIGHT), ("visibility", NO_COUNT)):
+        with rasterio.open(folder / f"{name}.tif") as file:
+            whole, factors = file.read(1), file.overviews(1)
+        assert factors
+        for level in range(len(factors)):
+            with rasterio.open(folder / f"{name}.tif", overview_level=level) as file:
+                values = file.read(1)
+            assert set(np.unique(values)) <= set(np.unique(whole))
+            assert (values != nothing).mean() == pytest.approx((whole != nothing).mean(), abs=0.02)
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+def test_walls_do_not_smear(house, samples):
+    """No pixel has a height between ground and roof: not at an edge, not where samples are put together."""
+    capture, model = house
+    surveyor = surveyor_of(model, capture, Placement.of(capture.ground, "local"), samples)
+    tile = surveyor.tile(Grid(-4.0, 5.0, 0.1, 130, 100))
+    heights = tile.heights[tile.alpha > 0]
+    assert tile.alpha.mean() > 250
+    between = (heights > 0.2) & (heights < ROOF - 0.2)
+    assert between.mean() < 0.001
+    roof = np.count_nonzero(heights > ROOF / 2) * 0.01
+    assert roof == pytest.approx((HOUSE[2] - HOUSE[0]) * (HOUSE[3] - HOUSE[1]), rel=0.15)
+
+
+def test_a_map_ends_with_the_scene_and_not_with_what_cameras_see_behind_it(house):
+    """Photographs of a house from all sides; a tenth of the points lies on hills at the horizon."""
+    capture, _ = house
+    turns = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    views = tuple(replace(capture.views[0], camera=looking_in(30.0, turn)) for turn in turns)
+    hills = np.array([(600 * np.cos(turn), 600 * np.sin(turn), 5.0) for turn in np.linspace(0, 6, len(GROUND) // 9)])
+    around, placement = replace(capture, views=views), Placement.of(capture.ground, "local")
+    assert np.mean([view.camera.sees(hills) for view in views]) > 2 / len(views)  # each is in two and more
+    behind = replace(around, points=np.concatenate([capture.points, hills]))
+    assert extent_of(behind, placement) == pytest.approx(extent_of(around, placement), abs=0.5)
+
+
+def looking_in(distance: float, turn: float) -> Camera:
+    """A camera beside the scene, level, that looks over its middle."""
+    out = np.array([np.cos(turn), np.sin(turn), 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = [[-out[1], out[0], 0.0], [0.0, 0.0, -1.0], -out]
+    pose[:3, 3] = -pose[:3, :3] @ (distance * out + [0, 0, 5.0])
+    return Camera(camera_from_world=pose, fx=40.0, fy=40.0, cx=32.0, cy=24.0, width=64, height=48)
+
+
+def test_tiles_show_what_one_picture_shows(house):
+    capture, model = house
+    surveyor = surveyor_of(model, capture, Placement.of(capture.ground))
+    x0, y0, x1, y1 = extent_of(capture, surveyor.above.placement)
+    grid = grid_over((x0, y0, x1, y1), 0.2)
+    whole = surveyor.tile(grid)
+    for column, row, part in grid.tiles(40):
+        tile = surveyor.tile(part)
+        at = np.s_[row : row + part.height, column : column + part.width]
+        # Grid north turns by a millionth from tile to tile; what lies between two splats may fall to the other.
+        assert (np.abs(tile.colours.astype(int) - whole.colours[at]) <= 3).mean() > 0.995
+        assert (np.abs(tile.heights - whole.heights[at]) < 0.01).mean() > 0.995
+        assert (tile.visibility == whole.visibility[at]).mean() > 0.995
+
+
+def test_visibility_counts_cameras_and_what_none_sees_is_blank(house):
+    capture, model = house
+    surveyor = surveyor_of(model, capture, Placement.of(capture.ground, "local"))
+    grid = Grid(-10.0, 10.0, 0.25, 80, 80)
+    tile = surveyor.tile(grid)
+    x, y = np.meshgrid(grid.left + (np.arange(80) + 0.5) * 0.25, grid.top - (np.arange(80) + 0.5) * 0.25)
+    shown = tile.alpha > 0
+    places = np.stack([x[shown], y[shown], tile.heights[shown]], axis=1)
+    count = sum(view.camera.sees(places).astype(int) for view in capture.train_views)
+    assert (tile.visibility[shown] == count).mean() > 0.999
+    assert tile.visibility[shown].min() >= 1
+    assert not shown.all()  # beyond all pictures, though the model is opaque there
+    assert set(np.unique(tile.visibility[~shown])) == {NO_COUNT}
+    assert set(np.unique(tile.heights[~shown])) == {np.float32(NO_HEIGHT)}
+
+
+def test_what_hangs_as_high_as_cameras_is_not_in_the_map_and_a_tower_is():
+    veil, tower = surface(-3, -3, 0, 0, 21.0), surface(4, 4, 6, 6, 24.0)
+    # The tower has sparse points, as what is solid has; the veil has none.
+    capture = capture_of(np.concatenate([GROUND, TOP, tower]))
+    model = model_of(np.concatenate([GROUND, TOP, tower, veil]))
+    tower_seen = replace(capture, views=(*capture.views, replace(capture.views[0], camera=_above(5.0, 5.0, 60.0))))
+    surveyor = surveyor_of(model, tower_seen, Placement.of(capture.ground, "local"))
+    grid = Grid(-3.0, 6.5, 0.25, 40, 40)
+    heights = surveyor.tile(grid).heights
+    assert heights.max() == pytest.approx(24.0, abs=0.1)
+    low = surveyor_of(model, capture, Placement.of(capture.ground, "local")).tile(Grid(-3.0, 0.0, 0.25, 12, 12))
+    assert low.heights[low.alpha > 0].max() < 1.0
+
+
+def _above(x: float, y: float, z: float) -> Camera:
+    return Camera(
+        camera_from_world=look_down(np.array([x, y, z])), fx=80.0, fy=80.0, cx=32.0, cy=24.0, width=64, height=48
+    )
+
+
+def test_a_capture_without_georeference_has_a_map_that_says_so(house, make, capsys):
+    capture, model = house
+    folder = make(replace(capture, ground=replace(capture.ground, origin_geo=None, metric=False)), model, gsd=0.2)
+    assert "units without known size" in capsys.readouterr().err
+    with rasterio.open(folder / "dsm.tif") as file:
+        assert file.crs.to_epsg() is None
+        assert "local units" in file.crs.to_wkt()
+        assert file.units == ("units",)
+        assert "units without known size" in file.tags()["CRS_NAME"]
+        assert file.read(1).max() == pytest.approx(ROOF, abs=0.05)
+        assert file.bounds.left < -6
+
+
+def test_without_options_pixels_are_those_of_the_photographs(house, make):
+    capture, model = house
+    assert ground_sampling(capture, 1.0) == pytest.approx(20 / 80, rel=0.1)
+    with rasterio.open(make(capture, model) / "orthophoto.tif") as file:
+        assert file.res[0] == pytest.approx(0.25, rel=0.1)
+    assert [samples_for(gsd, 0.1) for gsd in (0.02, 0.1, 0.3, 5.0)] == [1, 1, 3, 4]
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"gsd": 0.0}, "--gsd 0.0: a pixel needs a size"),
+        ({"gsd": float("nan")}, "--gsd nan"),
+        ({"bbox": (5.0, 0.0, 1.0, 3.0)}, "--bbox 5 0 1 3: must be"),
+        ({"gsd": 1e-6}, r"more than 1e\+10\. Give --gsd 0\.00018 or larger"),
+        (
+            {"bbox": (0.0, 0.0, 10.0, 10.0), "gsd": 0.5},
+            "0 0 10 10: lies beside the scene, which spans 3812",
+        ),
+        ({"crs": "EPSG:4978"}, "does not point up"),
+        ({"crs": "EPSG:4326"}, "degrees"),
+        ({"crs": "EPSG:3857", "gsd": 0.02}, "stretches north and east unlike"),
+    ],
+)
+def test_what_makes_no_map_is_refused_and_leaves_nothing(house, make, tmp_path, asked, message):
+    with pytest.raises(VdgsError, match=message):
+        make(*house, **asked)
+    assert not (tmp_path / "run" / "maps").exists()
+
+
+def test_a_folder_shards_beside_the_maps_is_not_ours(house, make, tmp_path):
+    for name in ("shards/king.png", "shards/white/queen.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"theirs")
+    make(*house, gsd=0.5, output=tmp_path)
+    assert (
+        (tmp_path / "shards/king.png").read_bytes() == (tmp_path / "shards/white/queen.png").read_bytes() == b"theirs"
+    )
+
+
+def test_photographs_of_any_folder_are_no_place_for_maps(house, make, tmp_path):
+    capture, model = house
+    views = [replace(view, image_path=tmp_path / "card" / view.name) for view in capture.views]
+    (tmp_path / "card").mkdir()
+    with pytest.raises(VdgsError, match=r"is for inputs of the capture.*Nothing was written"):
+        make(replace(capture, views=tuple(views)), model, gsd=0.5, output=tmp_path / "card" / "maps")
+    assert not list((tmp_path / "card").iterdir())
+
+
+@pytest.mark.parametrize("facts", [None, "{}", '{"software": "GIS 3", "layers": 2}'])
+def test_maps_of_others_are_not_written_over(house, make, tmp_path, monkeypatch, facts):
+    monkeypatch.setattr(RunContext, "open_model", lambda *_: pytest.fail("opened"))
+    context = RunContext.from_path(tmp_path / "run")
+    (tmp_path / "dsm.tif").write_bytes(b"a month in the field")
+    if facts is not None:
+        (tmp_path / "map.json").write_text(facts)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    with pytest.raises(VdgsError, match=r"holds dsm\.tif.*Nothing was drawn"):
+        mapping.map_run(context, MapRequest(run=tmp_path / "run", output=tmp_path), Console(quiet=True))
+    with pytest.raises(VdgsError, match="is a file"):
+        mapping.map_run(context, MapRequest(run=tmp_path / "run", output=tmp_path / "dsm.tif"), Console(quiet=True))
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_a_map_killed_while_its_files_take_their_places_is_known_as_ours_and_as_unfinished(house, make, monkeypatch):
+    class Killed(BaseException):
+        pass
+
+    def kill(source: Path, target: Path) -> None:
+        if target.name == "orthophoto.tif":
+            raise Killed
+        shutil.move(source, target)
+
+    capture, model = house
+    with monkeypatch.context() as patch:
+        patch.setattr(folder.os, "replace", kill)
+        with pytest.raises(Killed):
+            make(capture, model, gsd=0.5)
+    run = SimpleNamespace(path=make.path, merged=SimpleNamespace(status=lambda: SimpleNamespace(model="1-2")))
+    assert (make.path / "maps" / "dsm.tif").exists()
+    assert not mapping.is_mapped(run)
+    make(capture, model, gsd=0.4)
+    assert mapping.is_mapped(run)
+
+
+def test_a_disk_without_room_is_named_before_anything_is_drawn(house, make, monkeypatch):
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 9, 1))
+    monkeypatch.setattr(tiles.Surveyor, "tile", lambda *_: pytest.fail("drawn"))
+    with pytest.raises(VdgsError, match=r"0 MB are free\. Give a larger --gsd"):
+        make(*house, gsd=0.2)
+
+
+def test_a_map_that_fails_leaves_the_old_one_whole(house, make, monkeypatch):
+    folder = make(*house, gsd=0.5)
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(mapping, "preview_png", full)
+    with pytest.raises(VdgsError, match=r"No space left on device.*maps that were there are kept"):
+        make(*house, gsd=0.4)
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+
+
+def test_without_rasterio_the_remedy_is_named(house, make, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    with pytest.raises(VdgsError, match=r"pip install 'vdgs\[geo\]'"):
+        make(*house)
+
+
+def test_lines_of_a_grid_are_at_multiples_of_its_pixels():
+    grid = grid_over((100.03, 50.0, 101.97, 51.0), 0.1)
+    np.testing.assert_allclose(grid.bounds, (100.0, 50.0, 102.0, 51.0), atol=1e-9)
+    assert (grid.width, grid.height, grid.tile_count(8)) == (20, 10, 6)
+    assert sum(part.width * part.height for _, _, part in grid.tiles(8)) == 200
+
+
+def test_light_of_a_hillshade():
+    x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
+    assert hillshade(np.zeros((5, 5)), 1.0) == pytest.approx(np.sin(np.pi / 4))
+    # Rising to the south-east, a slope looks at the sun in the north-west; the same in pixels of another size.
+    facing, away = hillshade(0.3 * (x + y), 1.0), hillshade(-0.3 * (x + y), 1.0)
+    assert facing.min() > 0.9 > 0.5 > away.max()
+    np.testing.assert_allclose(hillshade(0.6 * (x + y), 2.0), facing)
+    holed = np.where((x > 5) & (x < 9), np.nan, 0.0)
+    assert np.isnan(hillshade(holed, 1.0)).sum() == np.isnan(holed).sum()
+
+
+@pytest.mark.parametrize(("about", "length"), [(10.0, 10.0), (9.9, 5.0), (0.23, 0.2), (499.0, 200.0)])
+def test_scale_bars_are_round(about, length):
+    assert round_length(about) == pytest.approx(length)
+
+
+def pattern(places: np.ndarray) -> np.ndarray:
+    """A fine weave of the ground, -1 or 1, by x and y."""
+    return np.sign(np.sin(places[..., 0] * 2 * np.pi / 0.9) * np.sin(places[..., 1] * 2 * np.pi / 0.9))
+
+
+def photographed(capture: Capture, model: AnchorModel, folder: Path, woven: float) -> Capture:
+    """Photographs of the model on disk, the ground (not the roof) woven with detail that the model does not have."""
+    views = []
+    for view in capture.views:
+        sharp = view.camera.resized(320, 240)
+        drawn = render(model, sharp, depth=True)
+        places = sharp.unproject(drawn.median_depth.numpy())
+        low = (places[..., 2] < 1.0)[..., None]
+        image = (drawn.image.numpy() + woven * low * pattern(places)[..., None]).clip(0, 1)
+        Image.fromarray((image * 255 + 0.5).astype(np.uint8)).save(folder / view.name)
+        views.append(replace(view, camera=sharp, image_path=folder / view.name))
+    return replace(capture, views=tuple(views))
+
+
+@pytest.mark.parametrize("woven", [0.0, 0.06])
+def test_detail_comes_from_the_photographs_where_they_see_the_place(house, tmp_path, woven):
+    capture, model = house
+    capture = photographed(capture, model, tmp_path, woven)
+    grid = Grid(-3.0, 5.0, 0.08, 120, 100)
+    placement, sharpener = Placement.of(capture.ground, "local"), Sharpener(model, capture)
+    plain = surveyor_of(model, capture, placement).tile(grid)
+    sharp = surveyor_of(model, capture, placement, sharpener=sharpener).tile(grid)
+    sharpener.close()
+    np.testing.assert_array_equal(sharp.heights, plain.heights)
+    gained = (sharp.colours.astype(float) - plain.colours).mean(axis=-1) / 255
+    x = grid.left + (np.arange(120) + 0.5) * 0.08
+    y = grid.top - (np.arange(100) + 0.5) * 0.08
+    ground = plain.heights < 1.0
+    if not woven:
+        assert np.abs(gained).mean() < 0.01
+        return
+    detail = pattern(np.stack(np.meshgrid(x, y), axis=-1))
+    assert np.corrcoef(gained[ground], detail[ground])[0, 1] > 0.7
+    assert np.abs(gained[~ground]).mean() < 0.35 * np.abs(gained[ground]).mean()
+
+
+def grey(places: np.ndarray) -> AnchorModel:
+    """The same splats, all of one grey."""
+    model = model_of(places)
+    tensors = {name: tensor.clone() for name, tensor in model.decoder.tensors().items()}
+    tensors["colour_w2"].zero_()
+    tensors["colour_b2"].zero_()
+    return replace(model, decoder=Decoder.from_tensors(tensors))
+
+
+def misted(capture: Capture, folder: Path) -> Capture:
+    """Photographs, whose own brightness waves smoothly with the place and is another in each."""
+    views = []
+    for number, view in enumerate(capture.views):
+        sharp = view.camera.resized(320, 240)
+        x, y, _ = np.moveaxis(sharp.unproject(np.full((240, 320), sharp.position[2])), -1, 0)
+        light = 0.5 + 0.1 * np.sin(2 * np.pi * (x + 0.3 * number) / 4.1) * np.cos(2 * np.pi * y / 5.3)
+        Image.fromarray((light[..., None].repeat(3, axis=2) * 255 + 0.5).astype(np.uint8)).save(folder / view.name)
+        views.append(replace(view, camera=sharp, image_path=folder / view.name))
+    return replace(capture, views=tuple(views))
+
+
+@pytest.mark.parametrize("most", [12, 2])
+def test_detail_knows_no_borders_of_tiles(house, tmp_path, monkeypatch, most):
+    """Also where only some of the photographs are looked up."""
+    monkeypatch.setattr(sharpening, "_MOST_VIEWS", most)
+    capture, _ = house
+    capture, model = misted(capture, tmp_path), grey(GROUND)
+    sharpener = Sharpener(model, capture)
+    surveyor = surveyor_of(model, capture, Placement.of(capture.ground, "local"), sharpener=sharpener)
+    grid = Grid(-8.0, 4.0, 0.08, 200, 100)
+    whole = surveyor.tile(grid).colours
+    joined = np.zeros_like(whole)
+    for column, row, part in grid.tiles(50):
+        joined[row : row + part.height, column : column + part.width] = surveyor.tile(part).colours
+    sharpener.close()
+    assert np.ptp(whole[..., 0].astype(int)) > 10
+    off = np.abs(joined.astype(int) - whole)
+    assert off.max() <= 1
+    assert (off > 0).mean() < 0.01
+
+
+def test_gdal_may_keep_megabytes_of_a_map_and_not_bytes():
+    """With less than a row of tiles, each row of a preview decodes them again: minutes for a small map."""
+    with bounded_cache():
+        assert rasterio.env.get_gdal_config("GDAL_CACHEMAX") == CACHE_BYTES > 100 * TILE_PX * TILE_PX * 4

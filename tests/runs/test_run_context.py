@@ -1,0 +1,107 @@
+"""What a command reads of a run: the capture once, each model once while stages hand it on."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import torch
+
+from support.captures import tiny_scene, write_colmap
+from support.clusters import copy_run
+from support.commands import CommandsHere
+from vdgs.cli import main
+from vdgs.errors import VdgsError
+from vdgs.executors import choosing
+from vdgs.executors.executor import Listener, Outcome, Task
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.runs import beginning, opening
+from vdgs.runs.run_context import RunContext
+
+SETTINGS = (
+    "--preset", "laptop", "--iterations", "12", "--anchors.offsets", "2", "--growth.start", "50", "--no-maps",
+    "--blocks", "2", "--assignment.min-cameras", "4", "--block.iterations", "6", "--quiet",
+)  # fmt: skip
+
+
+class Reads:
+    """Counts what is read, by the process that would read it: the driver or one of its tasks."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.process = "driver"
+        self.captures, self.models = Counter[str](), Counter[tuple[str, str]]()
+        load_capture, load_model = opening.load_capture, AnchorModel.load
+
+        def read_capture(*given):
+            self.captures[self.process] += 1
+            return load_capture(*given)
+
+        def read_model(path: Path) -> AnchorModel:
+            self.models[self.process, path.parent.name] += 1
+            return load_model(path)
+
+        for module in (opening, beginning):
+            monkeypatch.setattr(module, "load_capture", read_capture)
+        monkeypatch.setattr(AnchorModel, "load", read_model)
+        reads = self
+
+        class TasksHere(CommandsHere):
+            def run(self, tasks: Sequence[Task], listener: Listener) -> list[Outcome]:
+                outcomes = []
+                for task in tasks:
+                    reads.process = task.name
+                    outcomes += super().run([task], listener)
+                reads.process = "driver"
+                return outcomes
+
+        monkeypatch.setattr(choosing, "LocalExecutor", TasksHere)
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> Reads:
+    return Reads(monkeypatch)
+
+
+def command(*arguments: object) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([str(each) for each in arguments])
+    assert ended.value.code == 0
+
+
+def test_one_run_reads_its_capture_once_and_each_block_once(tmp_path, reads):
+    write_colmap(tmp_path / "capture", tiny_scene())
+    command("run", tmp_path / "capture", "--output", tmp_path / "run", *SETTINGS)
+    assert reads.captures == {"driver": 1, "block 00": 1, "block 01": 1}
+    # The driver holds no model while blocks train: it reads the coarse one again to merge.
+    assert (reads.models["driver", "coarse"], reads.models["driver", "merged"]) == (2, 1)
+    assert [reads.models[f"block {index:02d}", "coarse"] for index in range(2)] == [1, 1]
+
+
+def test_a_stage_alone_reads_a_capture_that_moved_once(uncut, tmp_path, reads):
+    run = copy_run(uncut, tmp_path / "run")
+    shutil.copytree(uncut.parent / "capture", tmp_path / "moved")
+    command("visibility", run, "--capture", tmp_path / "moved", "--quiet")
+    assert reads.captures == {"driver": 1}
+    assert RunContext.from_path(run).capture.root == tmp_path / "moved"
+
+
+def test_a_model_is_read_once_until_it_is_released_or_its_file_is_another(uncut, tmp_path, reads):
+    context = RunContext.from_path(copy_run(uncut, tmp_path / "run"))
+    file = context.run.coarse.model
+    first, count = context.open_model("coarse"), lambda: reads.models["driver", "coarse"]
+    assert context.open_model("best").model.anchors.positions is first.model.anchors.positions
+    assert context.open_model("coarse", torch.device("cpu")).capture is first.capture
+    assert count() == 1
+    context.release_models("merged")
+    context.open_model("coarse")
+    assert count() == 1
+    context.release_models()
+    context.open_model("coarse")
+    assert count() == 2
+    file.write_bytes(file.read_bytes()[:-1] + b"\0")
+    with pytest.raises(VdgsError, match="its checksum does not agree"):
+        context.open_model("coarse")
+    assert count() == 3

@@ -1,0 +1,268 @@
+"""The run folder refuses what would lose or mix results, and says why."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import yaml
+
+from support.captures import tiny_scene, write_colmap
+from vdgs.captures.facts import capture_facts
+from vdgs.errors import RunError
+from vdgs.runs.beginning import begin_run
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.keys import NEEDS, counted, stage_keys
+from vdgs.runs.run_settings import RunSettings
+from vdgs.runs.stage_folder import StageFolder
+from vdgs.runs.status import Status
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.checks import validate
+from vdgs.settings.method import BlockConfig, GrowthConfig, MethodConfig, TrainConfig, with_iterations
+from vdgs.settings.plain import differences, from_dict, to_dict
+from vdgs.settings.presets import PRESETS
+from vdgs.storage.files import write_json, write_text
+
+
+def settings(**changes) -> RunSettings:
+    laptop = PRESETS["laptop"]
+    return RunSettings.of("/data/a", CaptureOptions(), replace(laptop, training=replace(laptop.training, **changes)))
+
+
+def test_the_same_settings_continue(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    run.begin(settings())
+    run.begin(settings())
+    assert run.settings() == settings()
+
+
+def test_changed_settings_are_refused_with_the_difference(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    run.begin(settings())
+    with pytest.raises(RunError, match="seed: 0 -> 5"):
+        run.begin(settings(seed=5))
+
+
+def test_a_folder_with_other_files_is_refused(tmp_path):
+    (tmp_path / "holiday.jpg").write_bytes(b"x")
+    with pytest.raises(RunError, match=r"holiday\.jpg"):
+        RunFolder(tmp_path).begin(settings())
+
+
+def test_one_process_at_a_time(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    with run.locked(), pytest.raises(RunError, match="another vdgs process"), run.locked():
+        pass
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "capture: [", "- 1\n- 2", "\x00\x01", "capture: 2026-13-45", pytest.param("[" * 100_000, id="nested deeply")],
+)
+def test_a_damaged_config_is_named(tmp_path, text):
+    (tmp_path / "config.yaml").write_text(text)
+    with pytest.raises(RunError, match=r"config\.yaml"):
+        RunFolder(tmp_path).settings()
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"capture": {"path": "/data/a", "imagse": "x"}}, r"capture has no 'imagse'; did you mean 'images'\?"),
+        ({"capture": {"path": "/data/a", "images": 5}}, r"capture\.images is 5; it must be text"),
+        ({"capture": {"images": None}}, "`capture` must be a group of settings with a path"),
+        ({"merge": {"rule": "mine"}}, r"merge\.rule is 'mine'; it must be owner or best_seen"),
+        ({"blocks": 4}, "this file has no 'blocks'"),
+    ],
+)
+def test_a_setting_that_is_none_is_named(tmp_path, change, complaint):
+    run = RunFolder(tmp_path)
+    write_text(run.config_file, yaml.safe_dump(settings().to_dict() | change))
+    with pytest.raises(RunError, match=complaint):
+        run.settings()
+
+
+def test_settings_are_read_anew_where_the_file_changes(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    run.begin(settings())
+    assert run.settings() == settings()
+    run.config.write(settings(seed=7))
+    assert run.settings() == settings(seed=7)
+
+
+def test_not_a_run(tmp_path):
+    with pytest.raises(RunError, match="not a run folder"):
+        RunFolder(tmp_path).settings()
+
+
+def test_the_log_is_cut_at_the_state_that_training_continues_from(tmp_path):
+    folder = StageFolder(tmp_path)
+    lines = [json.dumps({"iteration": i}) for i in (50, 100, 150)]
+    folder.log.write_text("\n".join(lines) + '\n{"iterat')
+    folder.truncate_log(100)
+    assert folder.log.read_text() == lines[0] + "\n" + lines[1] + "\n"
+
+
+def test_differences_name_nested_settings():
+    assert differences({"a": {"b": 1, "c": 2}}, {"a": {"b": 1, "c": 3}}) == ["a.c: 2 -> 3"]
+
+
+def test_presets_are_valid():
+    assert all(validate(preset) == [] for preset in PRESETS.values())
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_settings_survive_a_file(preset):
+    method = PRESETS[preset]
+    assert from_dict(MethodConfig, json.loads(json.dumps(to_dict(method)))) == method
+
+
+def test_an_unknown_setting_is_named():
+    with pytest.raises(ValueError, match=r"settings\.block has no 'rings'"):
+        from_dict(MethodConfig, {"block": {"rings": "frozen"}})
+
+
+def test_a_change_that_costs_trained_work_needs_redo(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    run.begin(settings())
+    other = replace(settings(), partition=replace(settings().partition, lambda_vis=0.7))
+    run.change_settings(other, redo=False)  # nothing is trained yet
+    run.block(0).discard_unless(run.keys().blocks)
+    run.block(0).model.write_bytes(b"a trained block")
+    with pytest.raises(RunError, match=r"--lambda-vis: 0\.7 -> 1\.0(?s:.*)a block useless. Add --redo"):
+        run.change_settings(settings(), redo=False)
+    assert run.settings() == other
+    assert run.change_settings(settings(), redo=True) == ["--lambda-vis: 0.7 -> 1.0"]
+    assert run.settings() == settings()
+
+
+def test_a_stage_deletes_what_was_made_for_other_settings_and_nothing_else(tmp_path):
+    folder = StageFolder(tmp_path / "stage")
+    folder.discard_unless("a")
+    folder.model.write_bytes(b"model")
+    folder.set_status(Status(state="done", iteration=3))
+    folder.discard_unless("a")
+    assert folder.is_done("a")
+    assert not folder.is_done("b")
+    folder.discard_unless("b")
+    assert not folder.model.exists()
+    assert folder.status() == Status(state="new")
+    assert folder.key() == "b"
+
+
+def test_work_of_unknown_settings_is_not_taken_over(tmp_path):
+    folder = StageFolder(tmp_path / "stage")
+    folder.discard_unless("a")
+    folder.model.write_bytes(b"model")
+    folder.set_status(Status(state="done"))
+    folder.status_file.unlink()  # as the message about a damaged one advises: the key stays known
+    folder.discard_unless("a")
+    assert folder.model.exists()
+    folder.key_file.unlink()
+    folder.discard_unless("a")
+    assert not folder.model.exists()
+
+
+def test_what_is_built_on_the_coarse_model_depends_on_the_very_model():
+    ours, theirs = stage_keys(settings(), "1-a"), stage_keys(settings(), "1-b")
+    assert ours.coarse == theirs.coarse
+    assert ours.partition != theirs.partition
+    assert ours.merge != theirs.merge
+
+
+def test_each_setting_invalidates_the_stages_that_depend_on_it_and_no_others():
+    order = ["coarse", "partition", "assignment", "blocks", "merge"]
+    before = stage_keys(settings())
+    changes: list[tuple[str, dict[str, object], int]] = [
+        ("capture", {"images": "other"}, 0), ("training", {"seed": 5}, 0), ("partition", {"lambda_vis": 0.7}, 1),
+        ("assignment", {"tau": 0.1}, 2), ("block", {"offset_rate": 0.5}, 3), ("merge", {"rule": "best_seen"}, 4),
+    ]  # fmt: skip
+    for section, change, first in changes:
+        section_changed = replace(getattr(settings(), section), **change)
+        changed = stage_keys(replace(settings(), **{section: section_changed}))
+        same = [getattr(before, stage) == getattr(changed, stage) for stage in order]
+        assert same == [index < first for index in range(5)], section
+    moved = stage_keys(replace(settings(), capture_path="/elsewhere"))
+    assert moved == before
+
+
+def test_blocks_share_the_run_and_one_process_works_on_each(tmp_path):
+    run = RunFolder(tmp_path / "run")
+    with run.locked(shared=True), run.locked(shared=True), run.block(1).locked():
+        with pytest.raises(RunError, match="another vdgs process"), run.locked():
+            pass
+        with pytest.raises(RunError, match="another vdgs process"), run.block(1).locked():
+            pass
+
+
+def test_validation_names_each_problem():
+    bad = MethodConfig(TrainConfig(iterations=-1, resolutions=((0.5, 2),)))
+    assert len(validate(bad)) == 2
+
+
+def test_automatic_iterations_follow_the_number_of_photographs():
+    automatic = TrainConfig(iterations=0)
+    assert [with_iterations(automatic, views).iterations for views in (5, 145, 9000)] == [3000, 8700, 30_000]
+    assert with_iterations(TrainConfig(iterations=7), 9000).iterations == 7
+
+
+def test_every_setting_counts_beside_the_one_that_it_needs():
+    settings = {"capture": {"images": None}} | to_dict(MethodConfig())
+    for path in _leaves(settings):
+        beside = _changed(settings, (path[0], NEEDS[path])) if path in NEEDS else settings
+        assert _counted(_changed(beside, path)) != _counted(beside), path
+
+
+def _counted(settings: dict) -> dict:
+    return {section: counted(section, values) for section, values in settings.items()}
+
+
+def _leaves(settings: dict, above: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    """Where the single settings are in a tree of them."""
+    paths = []
+    for name, value in settings.items():
+        paths += _leaves(value, (*above, name)) if isinstance(value, dict) else [(*above, name)]
+    return paths
+
+
+def _changed(settings: dict, path: tuple[str, ...]) -> dict:
+    """Settings with another value of one."""
+    name, *below = path
+    return {**settings, name: _changed(settings[name], tuple(below)) if below else "other"}
+
+
+def test_a_ramp_needs_a_frozen_decoder():
+    ramp = BlockConfig(ring="ramp", decoder="own")
+    assert any("ramp needs --block.decoder frozen" in each for each in validate(MethodConfig(block=ramp)))
+    assert validate(MethodConfig(block=replace(ramp, decoder="frozen"))) == []
+
+
+@pytest.mark.parametrize(
+    ("average", "until", "problems"), [(0.0, 1.0, 0), (0.3, 0.99, 0), (0.3, 1.0, 1), (1.0, 0.5, 1), (-0.1, 0.5, 1)]
+)
+def test_a_mean_needs_an_end_of_growth(average, until, problems):
+    growth = GrowthConfig(until=until)
+    coarse = MethodConfig(training=TrainConfig(average=average, growth=growth))
+    block = MethodConfig(block=BlockConfig(average=average, growth=growth))
+    assert [len(validate(each)) for each in (coarse, block)] == [problems, problems]
+    assert all("growth.until" in each or "average" in each for each in validate(coarse) + validate(block))
+
+
+@pytest.mark.parametrize(("begins", "problems"), [(0.5, 0), (0.51, 1)])
+def test_a_mean_is_of_models_of_one_image_size(begins, problems):
+    settings = {"average": 0.5, "growth": GrowthConfig(until=0.4), "resolutions": ((0.0, 2), (begins, 1))}
+    assert len(validate(MethodConfig(training=TrainConfig(**settings)))) == problems
+    assert len(validate(MethodConfig(block=BlockConfig(**settings)))) == problems
+
+
+def test_a_run_whose_blocks_are_at_work_is_taken_up_again_but_not_changed(tmp_path):
+    """Blocks that a driver began which died since share the run with the next."""
+    place, method = tmp_path / "capture", PRESETS["laptop"]
+    other = replace(method, partition=replace(method.partition, lambda_vis=0.7))
+    write_colmap(place, tiny_scene())
+    context = begin_run(place, tmp_path / "run", CaptureOptions(), method, redo=False)
+    run, capture = context.run, context.capture
+    write_json(run.capture_file, capture_facts(capture))
+    with run.locked(shared=True):
+        begin_run(place, run.path, CaptureOptions(), method, redo=False)
+        with pytest.raises(RunError, match="another vdgs process"):
+            begin_run(place, run.path, CaptureOptions(), other, redo=True)

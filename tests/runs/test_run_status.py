@@ -1,0 +1,304 @@
+"""How far a run is: every stage is judged by the settings it was made with, and all that shows results agrees."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import shlex
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import yaml
+
+from support.hand_made_models import model_at
+from vdgs.cli import main
+from vdgs.errors import RunError
+from vdgs.model.anchor_model import ModelMetadata
+from vdgs.report import write_report
+from vdgs.report.terminal import NOT_WHOLE, next_step, whole_standing
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.locks import hold, is_locked
+from vdgs.runs.opening import open_model, open_run
+from vdgs.runs.run_settings import RunSettings
+from vdgs.runs.standing import OTHER_BLOCKS, OTHER_CUT, OTHER_MODEL, OTHER_SETTINGS, standing_of
+from vdgs.runs.status import Status
+from vdgs.runs.vouching import load_vouched
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.method import MergeConfig, MethodConfig
+from vdgs.storage.files import write_json
+from vdgs.storage.tensors import identity
+
+PLACES = [[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]
+COMMAND = "vdgs run here --output there"
+
+
+def trained(folder, key: str, seed: int, block: int | None = None) -> str:
+    """A finished stage with a model of its own; what tells the model from others."""
+    folder.discard_unless(key)
+    replace(model_at(PLACES, seed), metadata=ModelMetadata(key=key, block=block)).save(folder.model)
+    folder.set_status(
+        Status(state="done", iteration=40, iterations=40, anchors=2, seconds=3.0, model=identity(folder.model))
+    )
+    return identity(folder.model)
+
+
+def measured(folder: Path, model: str, psnr: float, name: str) -> None:
+    write_json(folder / "metrics.json", {"model": name, "psnr": psnr, "ssim": 0.5})
+    write_json(folder / "per_view.json", [{"name": f"{name}.jpg", "psnr": psnr}])
+    write_json(folder / "status.json", {"model": model, "lpips_weights": "None", "bins": 4})
+
+
+@pytest.fixture
+def run(tmp_path) -> RunFolder:
+    """A whole run of two blocks, by hand, with its report."""
+    run = RunFolder(tmp_path / "run")
+    run.begin(RunSettings.of("/nowhere", CaptureOptions(), MethodConfig()), command=COMMAND)
+    coarse = trained(run.coarse, run.keys().coarse, 0)
+    measured(run.coarse.path / "evaluation", coarse, 21.25, "coarse")
+    keys = run.keys()
+    write_json(run.visibility / "visibility.json", {"key": keys.visibility, "anchors": 2})
+    zeros = dict.fromkeys(("cameras", "above_threshold", "best_block", "topped_up", "anchors_core"), 3)
+    rows = [{"block": i, **zeros, "anchors_expanded": 4, "mean_v": 1.0, "std_v": 0.5, "area": 2.0} for i in (0, 1)]
+    record = {"key": keys.partition, "assignment_key": keys.assignment, "lambda_vis": 1.0, "blocks": rows}
+    write_json(run.partition / "partition.json", record)
+    models = [trained(run.block(index), keys.blocks, 1 + index, block=index) for index in (0, 1)]
+    merged = trained(run.merged, keys.merge, 5)
+    write_json(run.merged.status_file, {"state": "done", "model": merged, "block_models": models, "anchors": 2})
+    measured(run.evaluation, merged, 24.75, "merged")
+    write_report(run)
+    return run
+
+
+def states(run: RunFolder) -> dict[str, str]:
+    return {stage.name: stage.state for stage in whole_standing(run).stages if stage.state != "done"}
+
+
+def change(run: RunFolder, section: str, **settings: object) -> None:
+    """Edit config.yaml by hand."""
+    config = yaml.safe_load(run.config_file.read_text())
+    config[section].update(settings)
+    run.config_file.write_text(yaml.safe_dump(config))
+
+
+def command_line(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(each) for each in arguments])
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+def test_a_whole_run_is_whole(run, capsys):
+    assert states(run) == {}
+    assert command_line("status", run.path) == 0
+    said = capsys.readouterr().out
+    assert "10 done" in said
+    assert "next: open" in said
+    assert "vdgs render" in said
+
+
+@pytest.mark.parametrize(
+    ("section", "setting", "stale", "then"),
+    [
+        ("merge", {"rule": "best_seen"}, ["merge", "evaluation"], "merge"),
+        ("block", {"iterations": 7}, ["block 0", "block 1", "merge", "evaluation"], "train"),
+        ("assignment", {"tau": 0.3}, ["cameras", "block 0", "block 1", "merge", "evaluation"], "partition"),
+        ("partition", {"lambda_vis": 0.9}, ["partition", "cameras", "block 0", "block 1", "merge", "evaluation"],
+         "partition"),
+    ],
+)  # fmt: skip
+def test_what_other_settings_make_out_of_date_is_shown_nowhere_as_done(run, section, setting, stale, then, capsys):
+    change(run, section, **setting)
+    assert states(run) == dict.fromkeys([*stale, "report"], "stale")
+    assert command_line("status", run.path) == NOT_WHOLE
+    assert f"next: vdgs {then} {run.path}" in capsys.readouterr().out
+    page = write_report(run).read_text()
+    assert "24.75" not in page  # of the merged model
+    assert "merged.jpg" not in page
+    assert "Coarse model: PSNR 21.25 dB" in page
+    assert f"evaluation: {OTHER_MODEL}; it is left out" in page
+    assert (f"out of date: {OTHER_CUT}" in page) == ("block 0" in stale)
+    assert states(run) == dict.fromkeys(stale, "stale")  # but the report, which says so
+
+
+def test_other_settings_of_the_coarse_stage_leave_nothing(run):
+    change(run, "training", seed=4)
+    assert set(states(run)) == {stage.name for stage in whole_standing(run).stages}
+    assert standing_of(run).next_command() == COMMAND
+    assert "Nothing is evaluated yet." in write_report(run).read_text()
+
+
+def test_a_coarse_model_trained_again_makes_all_that_was_built_on_it_out_of_date(run):
+    trained(run.coarse, run.keys().coarse, seed=9)
+    assert [stage.name for stage in standing_of(run).stages if stage.state == "done"] == ["coarse"]
+
+
+def test_a_block_trained_again_makes_the_merged_model_out_of_date(run):
+    trained(run.block(1), run.keys().blocks, seed=9, block=1)
+    standing = standing_of(run)
+    assert (standing.of("merge").state, standing.of("merge").why) == ("stale", OTHER_BLOCKS)
+    assert standing.of("evaluation").state == "stale"
+    assert standing.next_command() == COMMAND  # which merges and measures again
+
+
+def test_figures_of_another_model_are_out_of_date(run):
+    measured(run.evaluation, "12-abc", 30.5, "merged")
+    assert states(run) == {"evaluation": "stale", "report": "stale"}
+    assert "30.5" not in write_report(run).read_text()
+
+
+def test_figures_that_nothing_vouches_for_are_shown_with_a_caution(run):
+    (run.evaluation / "status.json").unlink()
+    assert states(run) == {"evaluation": "unknown", "report": "stale"}
+    page = write_report(run).read_text()
+    assert "24.75" in page
+    assert "It cannot be told whether these were made with the settings of the run: evaluation" in page
+
+
+def test_what_fails_and_stops_is_said_with_its_reason(run):
+    run.block(0).set_status(Status(state="failed", iteration=7, iterations=40, why="out of memory\nmore of it"))
+    run.block(1).set_status(Status(state="running", iteration=9, iterations=40))
+    standing = standing_of(run)
+    assert (standing.of("block 0").state, standing.of("block 0").why) == ("failed", "out of memory")
+    assert standing.of("block 1").state == "stopped"  # no process works on it
+    assert standing.next_command() == COMMAND  # which takes it to its end
+    with run.block(1).locked():
+        assert is_locked(run.block(1).path)
+        standing = standing_of(run)
+        assert standing.of("block 1").state == "running"
+        assert standing.next_command() == ""
+        assert "at work" in next_step(standing)
+
+
+def test_a_run_is_at_work_between_two_stages_too(run):
+    run.merged.model.unlink()
+    with run.driven():
+        assert next_step(whole_standing(run)) == "nothing to type: it is at work"
+        with pytest.raises(RunError, match="another vdgs process"), run.driven():
+            pass
+
+
+def test_looking_changes_nothing_and_survives_damage(run):
+    run.coarse.status_file.write_text('{"state": ')
+    (run.partition / "partition.json").write_text("[")
+    before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
+    standing = standing_of(run)
+    assert {standing.of(name).state for name in ("coarse", "partition", "block 0", "merge")} == {"unknown"}
+    assert {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])
+def test_a_run_is_read_where_no_file_can_be_locked(run, monkeypatch, capsys, number):
+    """Lustre without `-o flock`, some of FUSE: finished runs are looked at there, and nothing works on one."""
+    run.block(1).set_status(Status(state="running", iteration=9, iterations=40))
+    for folder in (run.block(1).path, run.path / ".run"):
+        with hold(folder):
+            pass
+
+    def refuse(*_: object) -> None:
+        raise OSError(number, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    assert standing_of(run).of("block 1").state == "stopped"
+    assert not run.is_driven()
+    assert command_line("status", run.path) == NOT_WHOLE
+    assert command_line("report", run.path) == 0
+    assert open_model(run, "coarse").name == "coarse"
+    with pytest.raises(OSError, match="not implemented"):
+        is_locked(run.path / ".run")
+    for held in (run.driven(), run.locked()):
+        with pytest.raises(RunError, match=r"file system locks no files \(Function not implemented\)\. Mount"), held:
+            pass
+
+
+def test_a_folder_without_a_run_is_an_error(tmp_path, capsys):
+    assert command_line("status", tmp_path / "nowhere") == 1
+    assert "is not a run folder" in capsys.readouterr().err
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_programs_read_the_same(run, capsys):
+    change(run, "merge", rule="best_seen")
+    assert command_line("status", run.path, "--json") == NOT_WHOLE
+    facts = json.loads(capsys.readouterr().out)
+    assert not facts["whole"]
+    assert facts["next"] == f"vdgs merge {shlex.quote(str(run.path))}"
+    assert {row["stage"]: row["state"] for row in facts["stages"]}["merge"] == "stale"
+
+
+def test_models_that_were_copied_to_where_they_do_not_belong_are_refused(run):
+    key, zero, one = run.keys().blocks, run.block(0), run.block(1)
+    assert len(load_vouched(zero, key, 0).anchors) == len(PLACES)
+    own, other = zero.model.read_bytes(), one.model.read_bytes()
+    zero.model.write_bytes(other)
+    with pytest.raises(RunError, match=r"is the model of block 1\. Put back .* or delete"):
+        load_vouched(zero, key, 0)
+    assert standing_of(run).of("block 0").state == "stale"
+    assert standing_of(run).next_command().startswith("delete ")
+    zero.model.write_bytes(own)
+    model = model_at(PLACES, seed=8)  # of the right block, but not what was trained here
+    replace(model, metadata=ModelMetadata(key=key, block=0)).save(zero.model)
+    with pytest.raises(RunError, match=r"not the model that status\.json beside it speaks of"):
+        load_vouched(zero, key, 0)
+    with pytest.raises(RunError, match="of other settings or of another run"):
+        load_vouched(one, "0123", 1)
+    with pytest.raises(RunError, match="a model of the whole scene"):
+        load_vouched(run.merged, run.keys().merge, 0)
+
+
+@pytest.fixture
+def opened_without_photographs(monkeypatch):
+    monkeypatch.setattr("vdgs.runs.opening.open_capture", lambda run: SimpleNamespace(test_views=(), train_views=()))
+    monkeypatch.setattr("vdgs.runs.opening.refuse_another_capture", lambda *_: None)
+
+
+def test_the_model_that_is_opened_says_what_it_is(run, opened_without_photographs):
+    opened = open_run(run.path)
+    assert (opened.name, opened.caution) == ("merged", "")
+    assert opened.line.startswith("merged model (2 anchors, ")
+    change(run, "partition", lambda_vis=0.9)
+    opened = open_run(run.path)
+    assert opened.name == "coarse"
+    assert f"this is the coarse model, not the merged one: there is one that was {OTHER_SETTINGS}" in opened.caution
+    assert f"vdgs partition {run.path}" in opened.caution
+    assert open_run(run.path, "coarse").caution == ""  # as was asked for
+    with pytest.raises(RunError, match=f"no merged model of its settings yet .*{OTHER_SETTINGS}.*vdgs partition"):
+        open_run(run.path, "merged")
+    change(run, "partition", lambda_vis=1.0)
+    run.merged.model.unlink()
+    assert "there is none yet" in open_run(run.path).caution
+
+
+def test_a_merged_model_of_other_blocks_is_opened_with_a_caution(run, opened_without_photographs):
+    trained(run.block(1), run.keys().blocks, seed=9, block=1)
+    opened = open_run(run.path)
+    assert opened.name == "merged"
+    assert OTHER_BLOCKS in opened.caution
+    assert f"vdgs merge {run.path}" in opened.caution
+
+
+def test_the_command_that_began_a_run_is_advised_while_the_settings_are_its_own(run):
+    run.merged.model.unlink()
+    assert standing_of(run).next_command() == COMMAND
+    other = replace(run.settings(), merge=MergeConfig("best_seen"))
+    run.change_settings(other, redo=True)
+    assert run.config.command() is None
+    assert standing_of(run).next_command() == f"vdgs merge {run.path}"
+    run.change_settings(replace(run.settings(), merge=MergeConfig()), redo=True, command="vdgs run anew")
+    assert standing_of(run).next_command() == "vdgs run anew"
+
+
+def test_a_copy_of_a_run_is_not_continued_where_the_run_lies(run, tmp_path):
+    run.config.write(run.settings(), f"vdgs run place --output {run.path}")
+    assert run.config.command() is not None
+    copy = RunFolder(tmp_path / "a copy")
+    shutil.copytree(run.path, copy.path)
+    assert copy.config.command() is None
+
+
+def test_settings_that_cannot_be_read_are_to_be_mended(run):
+    run.config_file.write_text(run.config_file.read_text().replace("iterations: ", "iterations: many #", 1))
+    assert standing_of(run).next_command() == f"mend {run.config_file}"

@@ -1,0 +1,286 @@
+"""Surveyed points: read with care, hold a model where they were surveyed, and measure it where they are held out."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageOps
+from rich.console import Console
+
+pytest.importorskip("embreex")
+pytest.importorskip("pyproj")
+import pyproj
+
+from support.flights import ALTITUDE_M, HEIGHT, ORIGIN, WIDTH, Flight, copy_folder, sightings, write_photograph
+from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
+from vdgs.captures.loading import load_capture
+from vdgs.captures.reconstruction import facts_rows, read_reconstruction, survey_table
+from vdgs.errors import CaptureError, VdgsError
+from vdgs.settings.sfm import SfmOptions, SfmRequest
+from vdgs.sfm.collection import Collection, LeftOut, collect
+from vdgs.sfm.control import Control, check_near, read_control
+from vdgs.sfm.preparing import prepare
+from vdgs.sfm.reconstruct import reconstruct
+
+pytestmark = pytest.mark.xdist_group("sfm")
+
+PLACES = np.array([[-8.0, -8], [9, -7], [8, 9], [-9, 8], [0, 0], [-4, 5], [5, -2]])
+NAMES = ("north_west", "north_east", "gate", "barn", "well", "fence", "stone")
+#: The survey is of another height system and a little beside what GPS says.
+SURVEY_OFF = np.array([3.0, -2.0, 12.0])
+
+
+def console() -> Console:
+    return Console(file=io.StringIO(), width=500)
+
+
+@pytest.fixture(scope="module")
+def flight(nine) -> Flight:
+    return nine
+
+
+@pytest.fixture(scope="module")
+def points(flight) -> list[dict[int, np.ndarray]]:
+    return sightings(flight.cameras, PLACES)
+
+
+@pytest.fixture(scope="module")
+def made(flight, nine_begun, tmp_path_factory) -> Path:
+    """Placed by GPS; its features, matches and model are kept."""
+    output = tmp_path_factory.mktemp("made") / "capture"
+    copy_folder(nine_begun["writing"], output)
+    reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1, keep_work=True), console())
+    return output
+
+
+def projected(enu: np.ndarray, system: str) -> np.ndarray:
+    """Metres about ORIGIN to x, y of a system and the height as it is."""
+    latitude, longitude, height = geodetic_from_enu(enu[None], ORIGIN)[0]
+    x, y = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True).transform(longitude, latitude)
+    return np.array([x, y, height])
+
+
+def write_list(file: Path, flight: Flight, points, header="EPSG:32719", system=None, off=SURVEY_OFF) -> Path:
+    lines = [header, "# surveyed with care", ""]
+    for name, seen in zip(NAMES, points, strict=True):
+        place = projected(seen[-1] + off, system or header)
+        for k, pixel in seen.items():
+            if k >= 0:
+                words = [f"{place[0]:.9f}", f"{place[1]:.9f}", f"{place[2]:.4f}", *(f"{v:.3f}" for v in pixel)]
+                lines.append(" ".join([*words, flight.names[k], name]))
+    file.write_text("\n".join(lines) + "\n")
+    return file
+
+
+# ------------------------------------------------------------------------------------------------- reading
+
+
+@pytest.mark.parametrize(
+    ("header", "system"),
+    [
+        ("EPSG:32719", None),
+        ("WGS84 UTM 19S", "EPSG:32719"),
+        ("+proj=utm +zone=19 +south +datum=WGS84 +units=m +no_defs", None),
+        ("EPSG:4326", None),
+        ("WGS84", "EPSG:4326"),
+    ],
+)
+def test_all_ways_to_name_a_system_lead_to_the_same_places(flight, points, tmp_path, header, system):
+    control = read_control(
+        write_list(tmp_path / "gcp_list.txt", flight, points, header, system), collect([flight.folder]), ()
+    )
+    assert [point.name for point in control.points] == list(NAMES)
+    truth = np.array([seen[-1] + SURVEY_OFF for seen in points])
+    assert np.abs(control.enu(ORIGIN) - truth).max() < 0.001
+    assert control.places_the_model
+    for point, seen in zip(control.points, points, strict=True):
+        for sighting in point.sightings:
+            number = flight.names.index(sighting.photograph)
+            assert sighting.pixel == pytest.approx(seen[number], abs=0.001)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pixels_are_those_of_the_file_before_it_is_turned(tmp_path, orientation):
+    pixels = np.zeros((120, 160, 3), np.uint8)
+    pixels[30, 100] = 255
+    (tmp_path / "card").mkdir()
+    for k in range(3):
+        write_photograph(tmp_path / "card" / f"p{k}.jpg", pixels, k, None, orientation)
+    photo = collect([tmp_path / "card"]).photographs[0]
+    with Image.open(photo.path) as image:
+        upright = np.array(ImageOps.exif_transpose(image).convert("L"))
+    row, column = np.unravel_index(int(upright.argmax()), upright.shape)
+    assert photo.upright((100.5, 30.5)) == pytest.approx((column + 0.5, row + 0.5))
+    assert (photo.stored_size, (photo.height, photo.width)) == ((160, 120), upright.shape)
+
+
+LINE = "{x:.3f} {y:.3f} {z:.3f} 100 80 {photograph} {name}"
+
+
+def listed(flight: Flight, *changes: dict[str, object], header: str = "EPSG:32719") -> str:
+    """A sound list of three points in two photographs each, its lines changed one after the other."""
+    lines = []
+    for name, x, y in (("a", -9, -9), ("b", 9, -9), ("c", 0, 9)):
+        place = projected(np.array([x, y, 0.0]), "EPSG:32719")
+        for photograph in flight.names[:2]:
+            lines.append({"x": place[0], "y": place[1], "z": place[2], "photograph": photograph, "name": name})
+    for line, change in zip(lines, changes, strict=False):
+        line.update(change)
+    return "\n".join([header, *(str(line.get("text", LINE.format(**line))) for line in lines)])
+
+
+BAD = {
+    "nothing": ("", "is empty"),
+    "no system": (None, "must name the coordinate system"),
+    "no such system": ({"header": "EPSG:999999"}, "must name the coordinate system"),
+    "a word for a number": ([{"text": "1 2 three 4 5 DJI_0001.JPG"}], "line 2: .* is not `x y z px py photograph"),
+    "too few words": ([{"text": "1 2 3 4 5"}], "line 2: .* is not `x y z px py photograph"),
+    "not finite": ([{"text": "nan 2 3 4 5 DJI_0001.JPG"}], "line 2: numbers must be finite"),
+    "unknown photograph": ([{"photograph": "DJI_0999.JPG"}], "line 2: there is no photograph 'DJI_0999.JPG'"),
+    "outside": ([{"text": "1 2 3 401 5 DJI_0001.JPG"}], "line 2: pixel 401, 5 is outside .* 400 x 300"),
+    "two places": ([{}, {"x": 5.0}], "line 3: the point a has another place in line 2"),
+    "too few points": ([{"name": "c"}] * 4, "another place"),
+    "no place on Earth": ([{"x": 1e12}, {"x": 1e12}], "line 2: .* is no place in"),
+    "height of the Moon": ([{"z": 4e8}, {"z": 4e8}], "line 2: .* is no place in"),
+}
+
+
+@pytest.mark.parametrize(("what", "said"), BAD.values(), ids=BAD)
+def test_bad_lists_are_refused_with_the_line_and_the_remedy(flight, tmp_path, what, said):
+    file = tmp_path / "gcp_list.txt"
+    if what is None:
+        file.write_text("\n".join(listed(flight).splitlines()[1:]))
+    elif isinstance(what, dict):
+        file.write_text(listed(flight, **what))
+    else:
+        file.write_text(what if isinstance(what, str) else listed(flight, *what))
+    with pytest.raises(CaptureError, match=said) as refused:
+        read_control(file, collect([flight.folder]), ())
+    assert str(file) in str(refused.value)
+
+
+def test_files_that_are_no_lists_are_refused(flight, tmp_path):
+    collection = collect([flight.folder])
+    with pytest.raises(CaptureError, match="cannot be read"):
+        read_control(tmp_path / "none.txt", collection, ())
+    with pytest.raises(CaptureError, match="not a text file"):
+        read_control(flight.folder / flight.names[0], collection, ())
+    (tmp_path / "two.txt").write_text("\n".join(listed(flight).splitlines()[:5]))
+    with pytest.raises(CaptureError, match=r"2 points .* and 3 are needed.*--check-points all"):
+        read_control(tmp_path / "two.txt", collection, ())
+    assert len(read_control(tmp_path / "two.txt", collection, ("all",)).points) == 2
+    (tmp_path / "sound.txt").write_text(listed(flight))
+    with pytest.raises(CaptureError, match=r"--check-points gate: .* has a, b, c"):
+        read_control(tmp_path / "sound.txt", collection, ("gate",))
+    with pytest.raises(VdgsError, match="give it with --gcp"):
+        prepare(
+            SfmRequest(photographs=(flight.folder,), output=tmp_path / "out", options=SfmOptions(check_points=("a",)))
+        )
+
+
+def test_points_along_a_line_and_in_another_zone_are_refused(flight, tmp_path):
+    collection = collect([flight.folder])
+    row = [{"x": 300_000.0 + k // 2, "y": 6_290_000.0 + k // 2, "z": 1.0} for k in range(6)]
+    (tmp_path / "row.txt").write_text(listed(flight, *row))
+    with pytest.raises(CaptureError, match="along one line"):
+        read_control(tmp_path / "row.txt", collection, ())
+    (tmp_path / "zone.txt").write_text(listed(flight, header="EPSG:32718"))
+    with pytest.raises(CaptureError, match=r"km from the photographs.*UTM zone 18S"):
+        prepare(
+            SfmRequest(
+                photographs=(flight.folder,), output=tmp_path / "out", options=SfmOptions(gcp=tmp_path / "zone.txt")
+            )
+        )
+    check_near(read_control(tmp_path / "zone.txt", collection, ()), np.zeros((0, 3)), ORIGIN, tmp_path / "zone.txt")
+
+
+def test_names_may_be_of_folders_without_endings_in_other_letters_and_with_blanks(flight, tmp_path):
+    photographs = collect([flight.folder]).photographs
+    collection = Collection(
+        (flight.folder,),
+        (replace(photographs[0], name="one/DJI_0001.JPG"), replace(photographs[1], name="two/DJI_0001.JPG"),
+         replace(photographs[2], name="the_mill.JPG")),
+        (LeftOut("cut.jpg", "it is cut off"),), 0,
+    )  # fmt: skip
+
+    def read(*photographs: str) -> Control:
+        lines = [line.split() for line in listed(flight).splitlines()[1:]]
+        written = ["\t".join([*line[:5], *photographs[k % 2 : k % 2 + 1], line[6]]) for k, line in enumerate(lines)]
+        (tmp_path / "list.txt").write_text("\n".join(["EPSG:32719", *written]))
+        return read_control(tmp_path / "list.txt", collection, ())
+
+    control = read("Two\\dji_0001.jpg", "The Mill")
+    assert [each.photograph for each in control.points[0].sightings] == ["two/DJI_0001.JPG", "the_mill.JPG"]
+    with pytest.raises(CaptureError, match=r"may be one/DJI_0001\.JPG or two/DJI_0001\.JPG: write the folder"):
+        read("DJI_0001.JPG", "the mill.jpg")
+    with pytest.raises(CaptureError, match="only one photograph shows a, b, c"):
+        read("cut.jpg", "the_mill.jpg")  # what was left out shows nothing
+
+
+# ------------------------------------------------------------------------------------------------- placing
+
+
+def surveyed(made: Path, flight: Flight, tmp_path: Path, file: Path, *held_out: str):
+    output = tmp_path / "capture"
+    if not output.exists():
+        shutil.copytree(made, output, symlinks=True)
+    options = SfmOptions(gcp=file, check_points=held_out)
+    said = console()
+    facts = reconstruct(
+        SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=options, keep_work=True), said
+    )
+    return facts, load_capture(output), said.file.getvalue()
+
+
+def test_control_points_hold_a_model_where_they_were_surveyed(made, flight, points, tmp_path):
+    """GPS is beside the survey by metres, and does not matter; points that were held out come out right."""
+    file = write_list(tmp_path / "gcp_list.txt", flight, points)
+    facts, capture, said = surveyed(made, flight, tmp_path, file, "well", "fence")
+    assert "5 place the model, 2 are held out" in said
+    assert [each.used_as for each in facts.survey] == ["control"] * 4 + ["check"] * 2 + ["control"]
+    assert max(facts.survey_rmse_m("check")) < 0.12  # a pixel shows 0.13 m
+    assert max(facts.survey_rmse_m("control")) < 0.12
+    assert np.mean([each.residual_m for each in facts.photographs if each.residual_m], axis=0) == pytest.approx(
+        SURVEY_OFF, abs=0.3
+    )
+    shift = enu_from_geodetic(np.array([capture.ground.origin_geo]), ORIGIN)[0]
+    for view, truth in zip(capture.views, flight.cameras, strict=True):
+        assert np.linalg.norm(view.camera.position + shift - truth.position - SURVEY_OFF) < 0.6
+    assert "heights as in gcp_list.txt" in facts.altitude_reference
+    rows = dict(facts_rows(facts))
+    assert rows["Control points"].startswith("5, place the model: RMSE 0.")
+    assert rows["Check points"].startswith("2, held out: RMSE 0.")
+    assert [row[0] for row in survey_table(facts)] == list(NAMES)
+    assert read_reconstruction(tmp_path / "capture") == facts
+
+
+def test_check_points_measure_a_model_that_gps_placed(made, flight, points, tmp_path):
+    file = write_list(tmp_path / "gcp_list.txt", flight, points)
+    facts, capture, _ = surveyed(made, flight, tmp_path, file, "all")
+    assert facts.survey_rmse_m("control") is None
+    across, up = np.array(facts.survey_rmse_m("check")[:2]), facts.survey_rmse_m("check")[2]
+    assert across == pytest.approx(np.abs(SURVEY_OFF[:2]), abs=0.3)
+    assert up == pytest.approx(SURVEY_OFF[2], abs=2.5)  # straight down from one height, nothing else tells the depth
+    assert max(facts.residual_rms_m) < 0.3  # it lies where GPS says
+    known = load_capture(made)
+    for view, before in zip(capture.views, known.views, strict=True):
+        assert np.allclose(view.camera.camera_from_world, before.camera.camera_from_world, atol=1e-6)
+
+
+def test_a_point_that_does_not_fit_and_marks_that_are_wrong_are_named(made, flight, points, tmp_path):
+    moved = [dict(seen) for seen in points]
+    moved[2][-1] = moved[2][-1] + [0, 6.0, 0]
+    first = next(k for k in moved[0] if k >= 0)
+    moved[0][first] = np.clip(moved[0][first] + [60, 0], 0, [WIDTH, HEIGHT])
+    facts, _, said = surveyed(made, flight, tmp_path, write_list(tmp_path / "gcp_list.txt", flight, moved))
+    assert "the control point gate does not fit the others" in said
+    assert "the surveyed point north_west is marked" in said
+    assert max(facts.survey_rmse_m("control")) < 0.4
+    off = {each.name: each.residual_m for each in facts.survey}["gate"]
+    assert off == pytest.approx((0, -6, 0), abs=0.6)
+    assert pytest.approx(facts.height_m, abs=4) == ALTITUDE_M

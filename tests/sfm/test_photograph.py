@@ -1,0 +1,383 @@
+"""What photographs say of themselves, which are used, and what is made of their positions."""
+
+from __future__ import annotations
+
+import random
+from contextlib import suppress
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from support.flights import FOCAL, FOCAL_MM, ORIGIN, SENSOR_MM, add_xmp, write_photograph
+from vdgs.captures.geodesy import geodetic_from_enu
+from vdgs.errors import CaptureError, VdgsError
+from vdgs.settings.sfm import SfmOptions, SfmRequest
+from vdgs.sfm import pairs
+from vdgs.sfm.aligning import tilt_against_attitudes
+from vdgs.sfm.attitude import of_aircraft, of_gimbal
+from vdgs.sfm.collection import collect, only_photographs
+from vdgs.sfm.lens import CALIBRATED, Lens, find_lens
+from vdgs.sfm.look import look_at
+from vdgs.sfm.mapping import holds_focal
+from vdgs.sfm.photograph import Photograph, Unusable, read_photograph
+from vdgs.sfm.positions import find_positions
+from vdgs.sfm.preparing import prepare
+from vdgs.sfm.xmp import LONGEST_PACKET, number, read_xmp
+
+NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+
+
+def photograph(folder: Path, number: int, enu: tuple[float, float, float] | None = (0, 0, 40), **more) -> Photograph:
+    folder.mkdir(parents=True, exist_ok=True)
+    pixels = np.roll(NOISE, number, axis=0)
+    write_photograph(folder / f"p{number:02d}.jpg", pixels, number, None if enu is None else np.array(enu), **more)
+    return read_photograph(folder / f"p{number:02d}.jpg", f"p{number:02d}.jpg")
+
+
+def flight(folder: Path, count: int = 6) -> list[Photograph]:
+    return [photograph(folder, k, (10.0 * (k % 3), 12.0 * (k // 3), 40.0 + k % 2)) for k in range(count)]
+
+
+def positions_of(photographs):
+    return find_positions(photographs, None, (1.0, 2.0))
+
+
+# --------------------------------------------------------------------------------------------------- reading
+
+
+def test_a_photograph_says_where_it_was_taken_and_through_what(tmp_path):
+    seen = photograph(tmp_path, 1, (30.0, -20.0, 41.5))
+    truth = geodetic_from_enu(np.array([[30.0, -20.0, 41.5]]), ORIGIN)[0]
+    assert seen.place == pytest.approx(truth[:2], abs=1e-8)  # south and west
+    assert seen.altitude == pytest.approx(truth[2], abs=1e-3)
+    assert (seen.width, seen.height, seen.above_takeoff) == (160, 120, 41.5)
+    assert seen.lens is not None
+    assert seen.lens.focal == pytest.approx(FOCAL_MM / SENSOR_MM)  # though EXIF's sizes are those of the original
+    assert pytest.approx(FOCAL / 400) == seen.lens.focal
+    assert seen.attitude is not None
+    assert seen.attitude.tilt_deg == pytest.approx(0, abs=1e-6)
+
+
+def test_altitudes_below_the_sea_are_below_it(tmp_path):
+    assert photograph(tmp_path, 1, (0, 0, -620.0)).altitude == pytest.approx(-120, abs=1e-3)
+
+
+def test_orientation_swaps_the_sides_and_what_the_drone_says_of_them(tmp_path):
+    turned = photograph(tmp_path, 1, orientation=6)
+    assert (turned.width, turned.height, turned.attitude) == (120, 160, None)
+    upright = photograph(tmp_path / "upright", 1)
+    assert turned.lens == upright.lens  # of the longer side
+
+
+def test_rtk_says_how_accurate_it_is(tmp_path):
+    xmp = 'drone-dji:RtkStdLon="0.012" drone-dji:RtkStdLat="0.015" drone-dji:RtkStdHgt="0.03"'
+    seen = [photograph(tmp_path, k, (9.0 * k, 0, 40), xmp=xmp) for k in range(3)]
+    assert positions_of(seen).deviations[0] == pytest.approx([0.012, 0.015, 0.03])
+    assert positions_of([replace(each, deviations=None) for each in seen]).deviations[0] == pytest.approx([1, 1, 2])
+
+
+def test_exif_says_how_accurate_a_phone_is_where_rtk_does_not(tmp_path):
+    seen = [photograph(tmp_path, k, (9.0 * k, 0, 40), error_m=4.5) for k in range(3)]
+    assert [each.error_m for each in seen] == [4.5] * 3
+    assert positions_of(seen).deviations[0] == pytest.approx([4.5, 4.5, 9])
+    better = [replace(each, deviations=(0.02, 0.02, 0.04)) for each in seen]
+    assert positions_of(better).deviations[0] == pytest.approx([0.02, 0.02, 0.04])
+    table = tmp_path / "gps.csv"
+    table.write_text("name,lat,lon,alt\n" + "".join(f"p{k:02d},10.{k:04d},20,5\n" for k in range(3)))
+    assert find_positions(seen, table, (1.0, 2.0)).deviations[0] == pytest.approx([1, 1, 2])
+    for nothing in (0.0, 99_999.0):
+        assert photograph(tmp_path, 5, (0, 0, 40), error_m=nothing).error_m is None
+
+
+@pytest.mark.parametrize("cut", [0, 10, 200, 3000, -2000])
+def test_what_is_cut_off_is_named_and_nothing_else_is_raised(tmp_path, cut):
+    photograph(tmp_path, 1)
+    file = tmp_path / "p01.jpg"
+    file.write_bytes(file.read_bytes()[:cut])
+    with pytest.raises(Unusable, match="copy it again"):
+        read_photograph(file, file.name)
+
+
+def test_damaged_heads_are_read_or_refused(tmp_path):
+    photograph(tmp_path, 1)
+    whole, draw = (tmp_path / "p01.jpg").read_bytes(), random.Random(1)
+    read = 0
+    for _ in range(150):
+        damaged = bytearray(whole)
+        for _ in range(20):
+            damaged[draw.randrange(800)] = draw.randrange(256)
+        (tmp_path / "damaged.jpg").write_bytes(damaged)
+        with suppress(Unusable):  # no other error comes
+            read_photograph(tmp_path / "damaged.jpg", "damaged.jpg")
+            read += 1
+    assert 0 < read < 150
+
+
+# ------------------------------------------------------------------------------------------------------- xmp
+
+
+@given(st.binary(max_size=400))
+def test_any_bytes_are_xmp_without_surprises(packet):
+    assert isinstance(read_xmp(packet), dict)
+
+
+def test_xmp_is_read_as_attributes_and_as_elements_and_expands_nothing():
+    bomb = b'<!DOCTYPE a [<!ENTITY b "bbbb"><!ENTITY c "&b;&b;">]><a:x y:Alt="&c;" y:Height=\'+39.80\'/>'
+    bomb += b"<z:Roll>-2.5</z:Roll>"
+    values = read_xmp(bomb)
+    assert values["y:Alt"] == "&c;"
+    assert (number(values, "y:Height"), number(values, "z:Roll"), number(values, "y:Alt")) == (39.8, -2.5, None)
+    assert read_xmp(b" " * LONGEST_PACKET + b' y:Height="1"') == {}
+    assert number({"a:b": "nan", "a:c": "inf"}, "a:b", "a:c") is None
+
+
+def test_an_enormous_packet_is_no_trouble(tmp_path):
+    photograph(tmp_path, 1, None)
+    add_xmp(tmp_path / "p01.jpg", b'y:A="1" ' * 8000)
+    assert read_photograph(tmp_path / "p01.jpg", "p01.jpg").place is None
+
+
+# ------------------------------------------------------------------------------------------------------ lens
+
+
+@pytest.mark.parametrize(
+    ("tags", "details", "xmp", "focal"),
+    [
+        pytest.param({0x0110: "FC300S\0\0"}, {0x920A: 3.61, 0xA405: 20}, {}, 0.585, id="a known sensor"),
+        pytest.param({}, {0x920A: 4.3, 0xA20E: 16393.4, 0xA210: 2, 0xA002: 4000}, {}, 0.694, id="EXIF's sensor"),
+        pytest.param({}, {0xA405: 20}, {}, 0.578, id="a 35 mm equivalent, of 4 x 3"),
+        pytest.param(
+            {}, {0xA405: 20, 0xA002: 4000}, {"drone-dji:DewarpData": "2020-01-01;2800.0,2801,1,2,0,0,0,0,0"}, 0.7,
+            id="calibrated by the maker",
+        ),
+        pytest.param({}, {0x920A: float("nan"), 0xA405: 0}, {"drone-dji:DewarpData": "x;"}, None, id="nothing"),
+    ],
+)  # fmt: skip
+def test_the_focal_length_is_the_best_that_is_known(tags, details, xmp, focal):
+    for width, height in ((1600, 900), (900, 1600), (800, 450)):
+        lens = find_lens(tags, details, xmp, width, height)
+        assert (lens and lens.focal) == (focal and pytest.approx(focal, abs=1e-3))
+
+
+def test_attitudes_of_gimbal_and_aircraft_agree_straight_down():
+    level = of_aircraft(30, 0, 0)
+    assert of_gimbal(30, -90, 0).camera_from_enu == pytest.approx(level.camera_from_enu, abs=1e-12)
+    ahead = -level.camera_from_enu[1]
+    assert ahead == pytest.approx([0.5, np.sqrt(0.75), 0], abs=1e-12)  # the top of the picture looks where it flies
+    assert of_aircraft(0, 10, 0).camera_from_enu[2] @ [0, 1, 0] > 0.17  # nose up: the view swings ahead
+    assert of_aircraft(0, 0, 10).camera_from_enu[2] @ [1, 0, 0] < -0.17  # right wing down: it swings to the left
+    assert np.linalg.det(of_gimbal(12, -60, 5).camera_from_enu) == pytest.approx(1)
+
+
+# ------------------------------------------------------------------------------------------------- positions
+
+
+def turn(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
+    return np.asarray(pycolmap.Rotation3d(np.radians(degrees) * np.array(axis)).matrix())
+
+
+@pytest.mark.parametrize(("tilt", "askew", "headings", "said"), [
+    (0.0, 6.0, (0, 90, 180, 270), 0.0),  # a camera that hangs askew makes no tilted model
+    (4.0, 6.0, (0, 90, 180, 270), 4.0),
+    (4.0, 0.0, (10, 190), 4.0),
+    (4.0, 0.0, (30,), 4.0),  # flown in one direction all is taken for a tilt
+])  # fmt: skip
+def test_a_tilted_model_is_told_from_a_camera_that_hangs_askew(tmp_path, tilt, askew, headings, said):
+    """Recorded attitudes do not know how the camera hangs; the model does, and may lie askew itself."""
+    model, photographs = pycolmap.Reconstruction(), []
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=160, height=120, params=[100, 100, 80, 60], camera_id=1)
+    )
+    for k, heading in enumerate(headings * (6 // len(headings) + 1)):
+        photo = replace(photograph(tmp_path, k), attitude=of_gimbal(heading, -90 + k % 3, 0))
+        photographs.append(photo)
+        truth = turn((0, 1, 0), askew) @ photo.attitude.camera_from_enu
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(truth @ turn((1, 0, 0), tilt)), np.zeros(3))
+        model.add_image_with_trivial_frame(pycolmap.Image(name=photo.name, camera_id=1, image_id=k + 1), pose)
+    assert tilt_against_attitudes(model, photographs) == pytest.approx(said, abs=0.25)
+
+
+def test_positions_that_cannot_be_are_left_out_and_named(tmp_path):
+    seen = flight(tmp_path)
+    seen[1] = replace(seen[1], place=(0.0, 0.0))
+    seen[2] = replace(seen[2], place=(ORIGIN[0] + 1, ORIGIN[1]))
+    seen[3] = replace(seen[3], altitude=None)
+    found = positions_of(seen)
+    assert found.index.tolist() == [0, 4, 5]
+    for name, said in (("p01", "0, 0"), ("p02", "far from all others"), ("p03", "no altitude")):
+        assert any(name in note and said in note for note in found.notes), found.notes
+
+
+def test_positions_at_one_place_say_nothing(tmp_path):
+    found = positions_of([photograph(tmp_path, k) for k in range(4)])
+    assert not found.usable
+    assert any("within 2 m" in note for note in found.notes)
+
+
+def test_a_table_of_positions_wins(tmp_path):
+    seen = flight(tmp_path)
+    table = tmp_path / "gps.csv"
+    table.write_text("name,lat,lon,alt\n" + "".join(f"p{k:02d},10.{k:04d},20,5\n" for k in range(4)))
+    found = find_positions(seen, table, (0.5, 0.7))
+    assert (len(found), found.source, found.origin[1]) == (4, "gps.csv", 20)
+    assert found.deviations[0] == pytest.approx([0.5, 0.5, 0.7])
+
+
+def test_a_long_corridor_has_no_outliers(tmp_path):
+    seen = [photograph(tmp_path, k, (500.0 * k, 3.0 * k, 40.0)) for k in range(20)]
+    assert len(positions_of(seen)) == 20
+
+
+# ---------------------------------------------------------------------------------------------- collections
+
+
+def test_what_is_not_used_is_named_with_its_reason(tmp_path):
+    flight(tmp_path)
+    (tmp_path / "notes.txt").write_text("a flight")
+    (tmp_path / "copy.jpg").write_bytes((tmp_path / "p03.jpg").read_bytes())
+    (tmp_path / "p04.png").write_bytes((tmp_path / "p05.jpg").read_bytes() + b"\0")
+    (tmp_path / "cut.jpg").write_bytes((tmp_path / "p02.jpg").read_bytes()[:4000])
+    found = collect([tmp_path])
+    reasons = {each.name: each.why for each in found.left_out}
+    assert "cut off" in reasons["cut.jpg"]
+    assert "copy of copy.jpg" in reasons["p03.jpg"]
+    assert "another ending" in reasons["p04.png"]
+    assert (len(found.photographs), found.other_files) == (6, 1)
+
+
+def test_folders_are_told_apart(tmp_path):
+    for name in ("a/card", "b/card"):
+        flight(tmp_path / name, 2)
+    (tmp_path / "b/card/p01.jpg").write_bytes((tmp_path / "b/card/p01.jpg").read_bytes() + b"\0")
+    (tmp_path / "b/card/p00.jpg").write_bytes((tmp_path / "b/card/p00.jpg").read_bytes() + b"\0")
+    found = collect([tmp_path / "a/card", tmp_path / "b/card"])
+    assert [photo.name for photo in found.photographs] == [f"card_{n}/p0{k}.jpg" for n in (1, 2) for k in (0, 1)]
+
+
+@pytest.mark.parametrize(
+    ("fill", "said"),
+    [
+        (lambda folder: None, "no such folder"),
+        (lambda folder: folder.mkdir(), "holds no photographs"),
+        (lambda folder: photograph(folder, 1), "1 photograph that can be used; a scene needs 3"),
+    ],
+    ids=["missing", "empty", "one"],
+)
+def test_too_few_photographs_are_refused_with_words(tmp_path, fill, said):
+    fill(tmp_path / "card")
+    with pytest.raises(CaptureError, match=said):
+        collect([tmp_path / "card"])
+
+
+def test_outputs_among_photographs_are_refused(tmp_path):
+    flight(tmp_path / "card")
+    for output in ("card", "card/out"):
+        with pytest.raises(VdgsError, match="among the photographs"):
+            prepare(SfmRequest(photographs=(tmp_path / "card",), output=tmp_path / output))
+    assert only_photographs(tmp_path / "card")
+    (tmp_path / "card/sparse").mkdir()
+    assert not only_photographs(tmp_path / "card")  # a capture that lacks something is told so
+
+
+# -------------------------------------------------------------------------------------------- look and plan
+
+
+def test_the_look_says_what_the_flight_is(tmp_path):
+    seen = flight(tmp_path, 9)
+    found = look_at(collect([tmp_path]), positions_of(seen))
+    assert found.height_m == pytest.approx(40, abs=1)
+    assert found.gsd_m == pytest.approx(found.height_m / (0.85 * 160))
+    assert found.forward_overlap == pytest.approx(1 - 10 / (found.height_m / 0.85 * 0.75), abs=0.02)
+    assert found.spread_m == pytest.approx((20, 24), abs=0.1)
+    assert found.oblique == 0
+    assert found.days == ["2026:06:01"]
+
+
+def test_other_days_and_small_files_are_remarked(tmp_path):
+    seen = flight(tmp_path)
+    kept = collect([tmp_path])
+    other = replace(seen[0], taken="2026:08:01 10:00:00", bytes=100)
+    found = look_at(replace(kept, photographs=(other, *kept.photographs[1:])), positions_of(seen))
+    assert any("taken on 2 days" in each for each in found.warnings)
+    assert any("p00.jpg" in each and "smaller files" in each for each in found.warnings)
+
+
+def test_the_focal_length_is_held_where_the_flight_cannot_tell_it(tmp_path):
+    seen = flight(tmp_path)
+    oblique = [replace(photo, attitude=of_gimbal(0, -50, 0)) for photo in seen]
+    heights = [replace(photo, above_takeoff=30.0 + 20 * k) for k, photo in enumerate(seen)]
+    unknown = [replace(photo, lens=None) for photo in seen]
+    where = positions_of(seen)
+    held = [holds_focal(each, where, SfmOptions())[0] for each in (seen, oblique, heights, unknown)]
+    assert held == [True, False, False, False]
+    assert holds_focal(oblique, where, SfmOptions(focal="hold"))[0]
+
+
+def circle(radius: float) -> np.ndarray:
+    turn = np.linspace(0, 2 * np.pi, 30, endpoint=False)
+    return radius * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+
+
+def strips(count: int, each: int) -> np.ndarray:
+    return np.array([(12.0 * k, 25.0 * strip, 60.0) for strip in range(count) for k in range(each)])
+
+
+@pytest.mark.parametrize(
+    ("places", "wrong_m", "held"),
+    [
+        pytest.param(strips(5, 8), 1.0, True, id="a survey"),
+        pytest.param(strips(2, 20), 0.5, True, id="there and back"),
+        pytest.param(strips(3, 3), 0.5, True, id="nine photographs"),
+        pytest.param(strips(1, 20), 0.5, False, id="a line"),
+        pytest.param(circle(30.0), 0.5, False, id="around a house"),
+        pytest.param(circle(30.0) * [1, 0.3, 1], 0.5, False, id="around a long house"),
+        pytest.param(circle(1.5), 2.0, False, id="around a statue"),
+        pytest.param(strips(5, 8)[:, [0, 2, 1]], 1.0, False, id="a facade"),
+        pytest.param(strips(5, 8) * [1, 1, 0] + np.outer(np.arange(40) % 4, [0, 0, 15]), 1.0, False, id="heights"),
+        pytest.param(None, 0.0, False, id="no positions"),
+    ],
+)
+def test_without_attitudes_the_focal_length_is_held_where_positions_are_those_of_a_survey(
+    tmp_path, places, wrong_m, held
+):
+    """Older drones and cameras on wings record nothing but positions; phones and hands record no more."""
+    silent = replace(photograph(tmp_path, 0), attitude=None, above_takeoff=None)
+    silent = replace(silent, place=None) if places is None else silent
+    photographs = [silent] * (10 if places is None else len(places))
+    where = positions_of(photographs)
+    if places is not None:
+        enu = places + np.random.default_rng(3).normal(0, wrong_m, places.shape)
+        where = replace(where, index=np.arange(len(enu)), enu=enu, deviations=np.tile([1.0, 1, 2], (len(enu), 1)))
+    assert holds_focal(photographs, where, SfmOptions())[0] is held
+    calibrated = [replace(photo, lens=Lens(0.7, CALIBRATED)) for photo in photographs]
+    assert holds_focal(calibrated, where, SfmOptions())[0]
+
+
+# ----------------------------------------------------------------------------------------------------- pairs
+
+
+@given(st.integers(2, 40), st.integers(1, 8), st.integers(0, 4))
+def test_pairs_are_sorted_and_none_is_of_one_photograph(count, following, doublings):
+    order = list(np.random.default_rng(count).permutation(count))
+    chosen = pairs.in_order(order, following, doublings) | pairs.near(np.random.default_rng(0).random((count, 3)), 4)
+    assert all(0 <= i < j < count for i, j in chosen)
+    assert {tuple(sorted(pair)) for pair in pairwise(order)} <= chosen
+
+
+def test_near_ones_are_matched_and_those_without_a_place_are_not():
+    places = np.array([[0, 0, 9], [1, 0, 5], [2, 0, 9], [90, 0, 9], [np.nan, 0, 0]])
+    assert pairs.near(places, 1) == {(0, 1), (1, 2), (2, 3)}
+
+
+def test_photographs_that_look_alike_find_each_other():
+    rng = np.random.default_rng(0)
+    kinds = rng.integers(0, 255, (2, 30, 128))
+    looks = [(kinds[k % 2] + rng.normal(0, 3, (30, 128))).clip(0, 255).astype(np.uint8) for k in range(30)]
+    chosen = pairs.alike(looks, [0, 1])
+    assert sum((i + j) % 2 == 0 for i, j in chosen) > 0.95 * len(chosen)

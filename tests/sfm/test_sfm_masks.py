@@ -1,0 +1,215 @@
+"""Masks of photographs alone: found beside them, kept out of features, and written with the capture."""
+
+from __future__ import annotations
+
+import io
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageOps
+from rich.console import Console
+
+pytest.importorskip("embreex")
+import pycolmap
+
+from support.flights import Flight, copy_folder, write_photograph
+from vdgs.captures.images import load_picture
+from vdgs.captures.loading import load_capture
+from vdgs.captures.photographs import decode_mask
+from vdgs.errors import CaptureError, VdgsError
+from vdgs.settings.capture import CaptureOptions
+from vdgs.settings.presets import PRESETS
+from vdgs.settings.requests import RunRequest
+from vdgs.settings.sfm import SfmOptions, SfmRequest
+from vdgs.sfm import features, mapping, reconstruct
+from vdgs.sfm.collection import collect
+from vdgs.sfm.masking import kept_of, write_upright_masks
+from vdgs.sfm.preparing import prepare, tell
+from vdgs.sfm.request import sfm_request
+from vdgs.sfm.work import Work, quiet_colmap
+
+pytestmark = pytest.mark.xdist_group("sfm")
+
+NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+
+
+def console() -> Console:
+    return Console(file=io.StringIO(), width=500)
+
+
+def photographs(folder: Path, *names: str, orientation: int = 1) -> None:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        turned = np.roll(NOISE, len(list(folder.rglob("*"))), axis=0)
+        write_photograph(folder / name, turned, 0, None, orientation)
+
+
+def write_mask(file: Path, keep: np.ndarray) -> Path:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(keep.astype(np.uint8) * 255).save(file)
+    return file
+
+
+def left_half(height: int = 120, width: int = 160) -> np.ndarray:
+    """What keeps the left half and, to tell up from down, an upper corner of the right one."""
+    keep = np.zeros((height, width), bool)
+    keep[:, : width // 2] = True
+    keep[: height // 4, 3 * width // 4 :] = True
+    return keep
+
+
+# ------------------------------------------------------------------------------------------------- finding
+
+
+@pytest.mark.parametrize(
+    ("asked", "names", "masks"),
+    [
+        pytest.param(".", "{}.jpg", "masks/{}.png", id="beside them"),
+        pytest.param(".", "images/{}.jpg", "masks/{}.jpg.png", id="images and masks"),
+        pytest.param("images", "images/{}.jpg", "masks/{}.jpg", id="images alone are named"),
+        pytest.param(".", "100 MEDIA/é{}.jpg", "100 MEDIA/masks/e\u0301{}.png", id="in folders of a card"),
+        pytest.param(".", "DCIM/100/{}.jpg", "Masks/DCIM/100/{}.png", id="in a tree of their own"),
+    ],
+)
+def test_masks_beside_photographs_are_masks(tmp_path, asked, names, masks):
+    photographs(tmp_path, *(names.format(k) for k in range(4)))
+    for k in range(3):
+        write_mask(tmp_path / masks.format(k), left_half())
+    found = collect([tmp_path / asked])
+    assert len(found.photographs) == 4
+    assert (found.left_out, found.other_files) == ((), 0)
+    assert [photo.mask and photo.mask.name for photo in found.photographs] == [
+        *(Path(masks.format(k)).name for k in range(3)), None,
+    ]  # fmt: skip
+    assert any("3 of 4 photographs have a mask" in note for note in found.notes)
+    said = console()
+    tell(prepare(SfmRequest(photographs=(tmp_path / asked,), output=tmp_path.parent / "new")), said)
+    assert "3 of 4 photographs have one" in said.file.getvalue()
+
+
+def test_masks_of_nothing_and_of_other_shapes_are_named(tmp_path):
+    photographs(tmp_path, *(f"{k}.jpg" for k in range(3)))
+    mask = write_mask(tmp_path / "masks/0_legs.png", left_half())
+    with pytest.raises(CaptureError, match=r"masks: holds 1 masks, none of them .*\(0\.png; 0_legs\.png is there\)"):
+        collect([tmp_path])
+    write_mask(tmp_path / "masks/0.png", left_half())
+    assert any("1 masks belong to no photograph" in note and mask.name in note for note in collect([tmp_path]).notes)
+    wrong = write_mask(tmp_path / "masks/1.png", left_half(160, 120))
+    with pytest.raises(CaptureError, match=r"1\.png: is 120x160, but its photograph 1\.jpg is 160x120"):
+        collect([tmp_path])
+    wrong.unlink()
+    alone = tmp_path / "alone"
+    photographs(alone, *(f"masks/{k}.jpg" for k in range(3)))
+    assert len(collect([alone]).photographs) == 3  # of masks, at the carnival
+
+
+def test_other_folders_of_masks_are_asked_of_captures_only(tmp_path):
+    options = CaptureOptions(masks="legs")
+    training = PRESETS["laptop"].training
+    with pytest.raises(VdgsError, match="--masks legs: names a folder of a capture"):
+        sfm_request(
+            RunRequest(capture=tmp_path, output=tmp_path / "run", preset="laptop", options=options, training=training)
+        )
+
+
+# --------------------------------------------------------------------------------------------------- using
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_masks_turn_with_their_photographs(tmp_path, orientation):
+    photographs(tmp_path, "0.jpg", "1.jpg", "2.jpg", orientation=orientation)
+    write_mask(tmp_path / "masks/0.png", left_half())
+    with Image.open(tmp_path / "0.jpg") as stored:
+        exif = stored.getexif()
+    Image.fromarray(left_half().astype(np.uint8)).save(tmp_path / "turned.png", exif=exif)
+    with Image.open(tmp_path / "turned.png") as image:
+        truth = np.array(ImageOps.exif_transpose(image)) > 0
+    (tmp_path / "turned.png").unlink()
+    found = collect([tmp_path]).photographs
+    assert np.array_equal(kept_of(found[0]), truth)
+    assert kept_of(found[1]) is None
+    if orientation >= 5:  # as programs write it that turn photographs themselves
+        write_mask(tmp_path / "masks/0.png", truth)
+        assert np.array_equal(kept_of(found[0]), truth)
+
+
+def test_transparency_is_a_mask_and_both_count(tmp_path):
+    for k in range(3):
+        alpha = np.where(left_half() | (k == 2), 255, 0).astype(np.uint8)
+        Image.fromarray(np.dstack([np.roll(NOISE, k, axis=0), alpha])).save(tmp_path / f"{k}.png")
+    upper = np.zeros((120, 160), bool)
+    upper[:60] = True
+    write_mask(tmp_path / "masks/1.png", upper)
+    first, second, third = collect([tmp_path]).photographs
+    assert np.array_equal(kept_of(first), left_half())
+    assert np.array_equal(kept_of(second), left_half() & upper)
+    assert kept_of(third) is None
+    said = console()
+    tell(prepare(SfmRequest(photographs=(tmp_path,), output=tmp_path.parent / "new")), said)
+    assert "1 of 3 photographs have one; 3 have an alpha channel" in said.file.getvalue()
+
+
+@pytest.fixture
+def masked(nine, tmp_path) -> Flight:
+    """The nine, two of them with masks."""
+    (tmp_path / "card").mkdir()
+    for name in nine.names:
+        os.link(nine.folder / name, tmp_path / "card" / name)
+    for name in nine.names[:2]:
+        write_mask(tmp_path / f"card/masks/{name}.png", left_half(300, 400))
+    return Flight(tmp_path / "card", nine.cameras)
+
+
+def test_features_lie_where_masks_are_white(masked, tmp_path):
+    quiet_colmap()
+    collection = collect([masked.folder])
+    seen = (collection.photographs[0], collection.photographs[5])
+    black = write_mask(tmp_path / "black.png", np.zeros((300, 400), bool))
+    seen = (*seen, replace(collection.photographs[1], mask=black))
+    work, kinds = Work(tmp_path / "work"), features.kinds_of(seen)
+    features.open_database(work, kinds)
+    features.stand_upright(work, seen)
+    write_upright_masks(work, seen, 1)
+    counts = features.find_features(work, kinds, 300, 500, 1, console())
+    database = pycolmap.Database.open(work.database)
+    found = {image.name: image.image_id for image in database.read_all_images()}
+    x, y = np.asarray(database.read_keypoints(found[seen[0].name]))[:, :2].T
+    database.close()
+    assert left_half(300, 400)[y.astype(int), x.astype(int)].all()
+    assert 0 < counts[seen[0].name] < counts[seen[1].name]
+    assert counts[seen[2].name] == 0
+    with pytest.raises(CaptureError, match="shows only 0 features where its mask is white"):
+        features.without_features(seen, counts)
+
+
+def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_again(nine_begun, masked, tmp_path):
+    output, keys = tmp_path / "capture", []
+    request = SfmRequest(photographs=(masked.folder,), output=output, threads=1, options=SfmOptions(max_size=200))
+    first = masked.folder / f"masks/{masked.names[0]}.png"
+    for change in (lambda: None, lambda: write_mask(first, ~left_half(300, 400)), first.unlink):
+        change()
+        keys.append(reconstruct._keys(prepare(request)))
+    for step in ("features", "matches", "model", "capture"):
+        assert len({each[step] for each in keys}) == 3
+
+    copy_folder(nine_begun["writing"], output)
+    write_mask(first, left_half(300, 400))
+    prepared, work = prepare(request), Work(output / "work")
+    write_upright_masks(work, prepared.collection.photographs, 1)
+    model = mapping.read_models(work)[0]
+    write_mask(output / "masks/old.png", left_half())  # of other masks
+    reconstruct._write(prepared, work, model, "key", 1, console())
+    reconstruct.writing.write_model(output, model, reconstruct._lenses(model, 200))
+    capture = load_capture(output)
+    names = {view.name: view.mask_path and view.mask_path.name for view in capture.views}
+    assert names == {name: f"{name}.png" if k < 2 else None for k, name in enumerate(masked.names)}
+    assert len(list((output / "masks").iterdir())) == 2
+    picture, size = load_picture(capture.views[0]), capture.views[0].camera.whole_size
+    assert tuple(picture.mask.shape) == size[::-1]
+    truth = decode_mask(first, *size)
+    assert (picture.mask.numpy().astype(bool) == truth).mean() > 0.97
+    quarter = load_capture(output, CaptureOptions(images="images_4")).views[0]
+    assert load_picture(quarter).mask.float().mean() == pytest.approx(truth.mean(), abs=0.05)

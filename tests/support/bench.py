@@ -1,0 +1,48 @@
+"""A bench of one tiny capture, in this process."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rich.console import Console
+
+from experiments.bench.bench import BenchSettings, run_bench
+from experiments.bench.plan import Choices
+from experiments.bench.results import Result
+from experiments.bench.worker import Job, work
+from support.captures import tiny_scene, write_colmap
+from support.commands import threads_as_before
+from vdgs.executors.executor import Listener, Outcome, Task
+
+
+@dataclass(frozen=True)
+class InThisProcess:
+    """An executor without processes: starting them would take most of the time."""
+
+    at_once: int
+
+    def run(self, tasks: Sequence[Task], _listener: Listener) -> list[Outcome]:
+        with threads_as_before():
+            for task in tasks:
+                work(replace(Job.read(Path(task.command[-1])), threads=1))
+        return [Outcome(name=task.name, state="done") for task in tasks]
+
+
+def write_data(folder: Path) -> None:
+    """What --data may name: the tiny scene as copr."""
+    write_colmap(folder / "copr", tiny_scene())
+    (folder / "copr" / "images").rename(folder / "copr" / "images_4")  # what the bench reads of it
+
+
+def benched(
+    data: Path, output: Path, *methods: str, total: int = 40, redo: bool = False, renders: tuple[str, ...] = ()
+) -> dict[str, Result]:
+    """Table I of that scene with these methods, one seed."""
+    choices = Choices(
+        seeds=1, scenes=("copr",), methods=methods, iterations_total=total, max_anchors=300, renders=renders
+    )
+    asked = BenchSettings("table1", output, choices, data, redo=redo)
+    return {each.method: each for each in run_bench(asked, Console(file=io.StringIO()))}

@@ -1,0 +1,60 @@
+"""A plane of anchors, cut into two blocks, and the stage that trains one of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import shapely
+import torch
+
+from support.checkerboard import Photographs
+from vdgs.model.anchors import Anchors
+from vdgs.model.decoder import Decoder
+from vdgs.model.start import initial_anchors
+from vdgs.partition.blocks import Block, Blocks
+from vdgs.partition.regions import drawn_by, holds, ramp, split_anchors
+from vdgs.settings.method import AnchorConfig, BlockConfig, CompensationConfig, GrowthConfig, TrainConfig
+from vdgs.training import Stage, Surroundings, TrainingState, start_state
+
+CONFIG = TrainConfig(
+    iterations=40,
+    anchors=AnchorConfig(offsets=4),
+    growth=GrowthConfig(
+        interval=10, statistics_from=0, start=10, until=1.0, threshold=1e-6, coarsest_cell=4.0, gate=0.05
+    ),
+    compensation=CompensationConfig(t_low=0.5),
+)
+#: West, where blocks are cut at x = 0, and east.
+BLOCKS = Blocks(
+    (
+        Block(shapely.box(-4, -4, 0, 4), shapely.box(-5, -5, 1, 5)),
+        Block(shapely.box(0, -4, 4, 4), shapely.box(-1, -5, 5, 5)),
+    )
+)
+
+
+def coarse() -> tuple[Anchors, Decoder]:
+    x, y = np.meshgrid(np.arange(-3.9, 4, 0.4), np.arange(-3.1, 3.2, 0.4))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    anchors, _ = initial_anchors(points, np.zeros((x.size, 3), np.uint8), [], AnchorConfig(offsets=4, voxel=0.4))
+    generator = torch.Generator().manual_seed(0)
+    anchors = replace(
+        anchors,
+        features=torch.randn(len(anchors), 32, generator=generator) * 0.3,
+        offsets=torch.randn(len(anchors), 4, 3, generator=generator) * 0.3,
+    )
+    return anchors, Decoder.initial(4, False, 0, 8, generator)
+
+
+def block_stage(config: BlockConfig, index: int = 0, training: TrainConfig = CONFIG) -> tuple[Stage, TrainingState]:
+    anchors, decoder = coarse()
+    photographs = Photographs()
+    own, around = split_anchors(anchors, BLOCKS, index, config)
+    surroundings = anchors.select(around & drawn_by(anchors, photographs.cameras))
+    stage = Stage(
+        config=training, images=photographs, image_count=8, voxel=0.4, camera_height=5.0, frozen_decoder=True,
+        surroundings=Surroundings(surroundings, decoder), may_hold=holds(BLOCKS, index, config),
+        mobility=ramp(BLOCKS, index, config),
+    )  # fmt: skip
+    return stage, start_state(anchors.select(own), decoder, stage)

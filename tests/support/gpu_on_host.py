@@ -1,0 +1,46 @@
+"""The composed set of operations on the processor: its CUDA kernels run their own text there (cuda_on_host.h), and of
+gsplat only what it compiles is stood in for (fake_gsplat.py)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from support import fake_gsplat
+from support.cuda_on_host import HostDriver, build_on_host
+from vdgs.kernels.composed import rasteriser as choosing
+from vdgs.kernels.cuda import cache, loss
+from vdgs.kernels.cuda.cull import PROGRAM as CULL
+from vdgs.kernels.cuda.decode import PROGRAM as DECODE
+from vdgs.kernels.cuda.rasterise import PROGRAM as RASTERISE
+from vdgs.kernels.cuda.statistics import PROGRAM as STATISTICS
+from vdgs.kernels.reference import adam
+
+PROGRAMS = (loss.PROGRAM, RASTERISE, DECODE, CULL, STATISTICS)
+
+
+def build(folder: Path) -> dict[str, HostDriver]:
+    """Drivers that run the kernels of each source, by its name."""
+    drivers = {}
+    for program in PROGRAMS:
+        own = folder / program.name
+        own.mkdir(parents=True)
+        drivers[program.name] = HostDriver(build_on_host(program.name, own))
+    return drivers
+
+
+def install(
+    drivers: dict[str, HostDriver], code: Path, monkeypatch: pytest.MonkeyPatch, device_type: str, rasteriser: str
+) -> None:
+    """Let tensors of a kind of device be computed on by the composed set, with one of its rasterisers."""
+    monkeypatch.setenv(cache.VARIABLE, str(code))
+    for program in PROGRAMS:
+        driver = drivers[program.name]
+        driver.device_type = device_type
+        for name, value in (("driver", driver), ("_functions", {}), ("_modules", {})):
+            monkeypatch.setattr(program, name, value)
+    fake_gsplat.install(monkeypatch)
+    monkeypatch.setenv(choosing.VARIABLE, rasteriser)
+    choosing.chosen.cache_clear()
+    adam.tables_on.cache_clear()

@@ -1,0 +1,44 @@
+"""Jobs that do what a script says, and how an executor runs them."""
+
+from __future__ import annotations
+
+import io
+import sys
+import textwrap
+from pathlib import Path
+
+from rich.console import Console
+
+from support.commands import PATIENCE_SECONDS
+from vdgs.executors.local import LocalExecutor
+from vdgs.executors.pieces import Piece, run_pieces
+from vdgs.runs.stage_folder import StageFolder
+
+#: What every fake block begins with: it knows its folder, can say how far it is, and lists the SIGTERMs it gets.
+PRELUDE = f"""
+import json, os, pathlib, signal, sys, time
+folder = pathlib.Path(sys.argv[1])
+def tell(state, **facts):
+    (folder / "status.json").write_text(json.dumps({{"state": state, **facts}}))
+def stop(*_):
+    with (folder / "terms").open("a") as terms:
+        terms.write("TERM ")
+signal.signal(signal.SIGTERM, stop)
+def wait_for(condition):
+    end = time.monotonic() + {PATIENCE_SECONDS}
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.02)
+"""
+
+
+def job(root: Path, index: int, script: str) -> Piece:
+    folder = StageFolder(root / f"{index:02d}")
+    who = f"block = {index}\n"
+    return Piece(index, folder, [sys.executable, "-S", "-c", PRELUDE + who + textwrap.dedent(script), str(folder.path)])
+
+
+def run(jobs, *, at_once=2, retries=2, terminal=False):
+    """Outcomes, and what was printed."""
+    console = Console(file=io.StringIO(), width=120, height=40, force_terminal=terminal, color_system=None)
+    outcomes = run_pieces(jobs, LocalExecutor(at_once, retries, poll_seconds=0.02), console)
+    return outcomes, console.file.getvalue()

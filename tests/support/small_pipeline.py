@@ -1,0 +1,75 @@
+"""The whole pipeline in this process, as short as lets its results say something."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from support.captures import tiny_scene, write_colmap
+from vdgs import cli
+
+#: As few and as small as lets anchors grow, blocks train and PSNR say something.
+SETTINGS = (
+    "--preset", "laptop", "--iterations", "40", "--anchors.offsets", "2", "--anchors.voxel", "0.8",
+    "--rates.features", "0.03", "0.03", "--growth.start", "10", "--growth.statistics-from", "0",
+    "--growth.gate", "0.05", "--growth.interval", "10", "--growth.max-anchors", "200",
+)  # fmt: skip
+
+
+CUT = ("--blocks", "2", "--assignment.min-cameras", "3")
+
+
+BLOCK = (
+    "--block.iterations", "16", "--block.growth.start", "8", "--block.growth.statistics-from", "0",
+    "--block.growth.interval", "8", "--block.growth.gate", "0.05",
+)  # fmt: skip
+
+
+def vdgs(*arguments: object) -> None:
+    """A verb in this process; its exit code must be 0."""
+    with pytest.raises(SystemExit) as ended:
+        cli.main([str(each) for each in arguments])
+    assert not ended.value.code
+
+
+def train_coarse(capture: Path, run: Path, *device: str) -> None:
+    vdgs("coarse", capture, "--output", run, "--up", "z", *SETTINGS, *device)
+
+
+def after_the_coarse_stage(run: Path, *device: str) -> None:
+    vdgs("visibility", run)
+    vdgs("partition", run, *CUT)
+    for block in (0, 1):
+        vdgs("train", run, "--block", block, *BLOCK, *device)
+    vdgs("merge", run)
+    vdgs("eval", run, "--model", "coarse", *device)
+    vdgs("eval", run, "--model", "merged", *device)
+
+
+@dataclass(frozen=True)
+class NativeRun:
+    """A capture, a run of it by the native operations, and what that run was after its coarse stage."""
+
+    capture: Path
+    whole: Path
+    coarse: Path
+
+
+def native_run(folder: Path) -> NativeRun:
+    found = NativeRun(folder / "capture", folder / "native", folder / "coarse")
+    write_colmap(found.capture, tiny_scene(columns=3, rows=2, width=32, height=24, points=80))
+    train_coarse(found.capture, found.whole)
+    shutil.copytree(found.whole, found.coarse)
+    after_the_coarse_stage(found.whole)
+    return found
+
+
+def psnr(run: Path) -> tuple[float, float]:
+    """Of the coarse and of the merged model."""
+    folders = (run / "coarse" / "evaluation", run / "evaluation")
+    coarse, merged = (json.loads((folder / "metrics.json").read_text())["psnr"] for folder in folders)
+    return coarse, merged

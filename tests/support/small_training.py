@@ -1,0 +1,51 @@
+"""A short training of a checkerboard."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from support.checkerboard import Photographs
+from vdgs.model.decoder import Decoder
+from vdgs.model.start import initial_anchors
+from vdgs.settings.method import AnchorConfig, GrowthConfig, TrainConfig
+from vdgs.training import Stage, start_state, to_saved, train
+
+BLACK = (0.0, 0.0, 0.0)
+
+
+CONFIG = TrainConfig(
+    iterations=60,
+    resolutions=((0.0, 2), (0.5, 1)),
+    anchors=AnchorConfig(offsets=4, appearance=3),
+    growth=GrowthConfig(interval=10, statistics_from=5, start=20, until=0.9, threshold=1e-6, gate=0.05),
+)
+
+
+def stage(config: TrainConfig = CONFIG) -> Stage:
+    return Stage(config=config, images=Photographs(), image_count=8, voxel=0.4, camera_height=5.0)
+
+
+def start(config: TrainConfig = CONFIG):
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-4, 4, (300, 2)), np.zeros((300, 1))], axis=1)
+    anchors, _ = initial_anchors(
+        points, np.full((300, 3), 128, np.uint8), Photographs().cameras, replace(config.anchors, voxel=0.4)
+    )
+    generator = torch.Generator().manual_seed(config.seed)
+    decoder = Decoder.initial(config.anchors.offsets, False, config.anchors.appearance, 8, generator)
+    return start_state(anchors, decoder, stage(config))
+
+
+def run(state, stage_, until: int | None = None):
+    train(
+        state, stage_,
+        stop=lambda: until is not None and state.iteration >= until, after_step=lambda *_: None,
+    )  # fmt: skip
+    return state
+
+
+def bits(state) -> dict[str, bytes]:
+    return {name: tensor.numpy().tobytes() for name, tensor in to_saved(state).tensors.items()}

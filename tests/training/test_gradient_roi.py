@@ -1,0 +1,129 @@
+"""A block's step draws no more of a view than its splats reach, and moves them as if it had drawn all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+
+from support.block_training import block_stage, coarse
+from support.checkerboard import Photographs
+from support.rasterize_scenes import make_scene, splats_of
+from vdgs.kernels import choose
+from vdgs.kernels.types import Splats
+from vdgs.settings.method import BlockConfig
+from vdgs.training import Stage, Surroundings, TrainingState, loop, start_state, train_step
+from vdgs.training.crops import Crop
+from vdgs.training.reach import box_reached
+
+SCENES = {
+    "ordinary": make_scene(40, 61, 47),
+    "huge": make_scene(3, 64, 64, size=200.0, opacity=-2.0),
+    "edge-on": make_scene(20, 50, 70, size=4.0, thinness=4.0, spread=1.5),
+    "off-screen": make_scene(5, 20, 20, margin=4.0),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_box_holds_every_pixel_that_a_splat_changes(name):
+    scene = SCENES[name]
+    splats, background = splats_of([each.detach() for each in scene.tensors])
+    for i in range(len(splats.depths)):
+        one = Splats(*(getattr(splats, field)[i : i + 1] for field in ("means_px", "conics", "depths", "colours")),
+                     splats.opacities[i : i + 1])  # fmt: skip
+        alpha = choose(torch.device("cpu")).rasterise(one, background, scene.width, scene.height).alpha
+        box = box_reached(one, scene.width, scene.height)
+        if box is None:
+            assert not alpha.any()
+            continue
+        left, top, right, bottom = box
+        assert 0 <= left < right <= scene.width
+        assert 0 <= top < bottom <= scene.height
+        alpha[top:bottom, left:right] = 0
+        assert not alpha.any()
+
+
+def test_splats_that_are_not_drawn_open_no_box():
+    splats, _ = splats_of([each.detach().clone() for each in SCENES["ordinary"].tensors])
+    faint = replace(splats, opacities=torch.full_like(splats.opacities, 1e-3))
+    assert box_reached(faint, 61, 47) is None
+    lost = replace(splats, means_px=torch.full_like(splats.means_px, torch.nan))
+    assert box_reached(lost, 61, 47) is None
+    assert box_reached(Splats(*(getattr(splats, name)[:0] for name in vars(splats))), 61, 47) is None
+
+
+@dataclass
+class Stepped:
+    """A block after its first step, how large the picture was that it drew, and how many splats around it took part."""
+
+    state: TrainingState
+    pixels: int
+    around: int
+
+
+class Masked(Photographs):
+    """Photographs of which a corner does not count."""
+
+    def get(self, index: int, downscale: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+        image, _ = super().get(index, downscale)
+        mask = torch.ones(image.shape[:2], dtype=torch.uint8)
+        mask[:14, :17] = 0
+        return image, mask
+
+
+def step(monkeypatch: pytest.MonkeyPatch, stage: Stage, own: bool, narrowing: bool) -> Stepped:
+    """The westernmost anchors, small, are the block; the others strew their Gaussians far over it and beyond."""
+    anchors, decoder = coarse()
+    west = anchors.positions[:, 0] < -2.6
+    small = anchors.select(west)
+    small = replace(small, log_scales=torch.full_like(small.log_scales, -2.0))
+    others = anchors.select(~west)
+    others = replace(others, offsets=8 * others.offsets)
+    stage = replace(stage, frozen_decoder=not own, surroundings=Surroundings(others, decoder.copy()))
+    state, drawn = start_state(small, decoder, stage), []
+    with monkeypatch.context() as patch:
+        if not narrowing:
+            patch.setattr(loop, "narrow", lambda stage, splats, camera, box: box)
+        draw = loop.draw_view
+        patch.setattr(loop, "draw_view", lambda *given: drawn.append(given) or draw(*given))
+        train_step(state, stage)
+    ((_, camera, _, around),) = drawn
+    return Stepped(state, camera.width * camera.height, len(around.depths))
+
+
+def stages() -> dict[str, Stage]:
+    stage, _ = block_stage(BlockConfig())
+    return {
+        "whole": stage,
+        "part": replace(stage, crops=(Crop(0.1, 0.1, 0.95, 0.9),) * stage.image_count),
+        "masked": replace(stage, images=Masked()),
+    }
+
+
+@pytest.mark.parametrize("name", stages())
+@pytest.mark.parametrize("own", [False, True], ids=["shared decoder", "own decoder"])
+def test_a_step_moves_a_block_as_if_it_had_drawn_all(monkeypatch, name, own):
+    found, expected = (step(monkeypatch, stages()[name], own, narrowing) for narrowing in (True, False))
+    assert found.pixels < 0.9 * expected.pixels
+    assert 10 < found.around < expected.around
+    ours, theirs = found.state, expected.state
+    # Adam's first moments are a tenth of the gradients.
+    for one, other in (
+        *((ours.optimiser.anchors.first[name], each) for name, each in theirs.optimiser.anchors.first.items()),
+        *((ours.optimiser.decoder.first[name], each) for name, each in theirs.optimiser.decoder.first.items()),
+        (ours.statistics.gradient, theirs.statistics.gradient),
+    ):  # fmt: skip
+        assert torch.allclose(one, other, rtol=1e-3, atol=1e-5 * float(other.abs().max()))
+    assert float(theirs.statistics.gradient.max()) > 0
+    for name in ("drawn", "opacity", "seen"):
+        assert torch.equal(getattr(ours.statistics, name), getattr(theirs.statistics, name))
+
+
+def test_a_block_with_nothing_around_it_draws_all(monkeypatch):
+    stage, state = block_stage(BlockConfig())
+    nothing = stage.surroundings.anchors.select(torch.zeros(0, dtype=torch.int64))
+    camera, drawn, draw = stage.images.camera(0), [], loop.draw_view
+    monkeypatch.setattr(loop, "draw_view", lambda *given: drawn.append(given[1]) or draw(*given))
+    train_step(state, replace(stage, surroundings=Surroundings(nothing, state.decoder)))
+    assert [(each.width, each.height) for each in drawn] == [(camera.width, camera.height)]

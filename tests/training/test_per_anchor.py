@@ -1,0 +1,65 @@
+"""What is kept per anchor: everything comes, goes and changes places together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from support.block_training import CONFIG, block_stage
+from vdgs.settings.method import BlockConfig, CompensationConfig
+from vdgs.training import TrainingState, to_saved
+from vdgs.training.averaging import Average
+from vdgs.training.per_anchor import remap, remap_rows
+
+
+@pytest.mark.parametrize("pruned", [0, 3])
+@pytest.mark.parametrize("added", [0, 4])
+def test_rows_of_old_and_new_are_kept(pruned, added):
+    generator = torch.Generator().manual_seed(pruned + added)
+    before = {"a": torch.randn(10, 2, 3, generator=generator), "b": torch.randn(10, generator=generator)}
+    more = {name: torch.randn(added, *t.shape[1:], generator=generator) for name, t in before.items()}
+    kept = torch.ones(10 + added, dtype=torch.bool)
+    kept[torch.randperm(10 + added, generator=generator)[:pruned]] = False
+    order = torch.randperm(10 + added, generator=generator)
+    for rows in (kept, order):
+        tensors = dict(before)
+        remap_rows(tensors, more, rows)
+        for name, tensor in tensors.items():
+            assert torch.equal(tensor, torch.cat([before[name], more[name]])[rows])
+
+
+def full_state() -> TrainingState:
+    """A state of a block that keeps everything there is, every row of everything different."""
+    training = replace(CONFIG, compensation=CompensationConfig(enabled=True))
+    _, state = block_stage(BlockConfig(), training=training)
+    state.average = Average.of(state.anchors, state.decoder)
+    for group in state.groups().values():
+        for place, tensor in enumerate(group.values()):
+            tensor.copy_(torch.arange(tensor.numel()).reshape(tensor.shape) + 0.5 * place)
+    return state
+
+
+def test_nothing_that_has_a_row_for_each_anchor_is_left_out():
+    """Found by its shape among all that is saved, so that what is added later is not forgotten here."""
+    state = full_state()
+    n, known = len(state.anchors), {f"{name}.{key}" for name, group in state.groups().items() for key in group}
+    assert n > 50  # more than any dimension of the decoder
+    found = {name for name, tensor in to_saved(state).tensors.items() if tensor.ndim and tensor.shape[0] == n}
+    assert found == known
+
+
+def test_all_that_is_kept_moves_with_its_anchor():
+    state = full_state()
+    n = len(state.anchors)
+    before = {name: {key: t.clone() for key, t in group.items()} for name, group in state.groups().items()}
+    added = state.anchors.select(torch.tensor([3, 1]))
+    order = torch.randperm(n + 2, generator=torch.Generator().manual_seed(0))[:-5]
+    remap(state, {"anchors": added.tensors()}, 2, order)
+    for name, group in state.groups().items():
+        for key, tensor in group.items():
+            old = before[name][key]
+            new = added.tensors()[key] if name == "anchors" else old.new_zeros(2, *old.shape[1:])
+            assert torch.equal(tensor, torch.cat([old, new])[order]), (name, key)
+    assert len(state.anchors) == n - 3

@@ -1,0 +1,175 @@
+"""Solid ground: where pictures show it, how it becomes opaque, and how large Gaussians may be."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from support.block_training import block_stage
+from support.checkerboard import Photographs
+from vdgs.cameras import NEAR, Camera
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.frustum import project
+from vdgs.model.ground import BELOW_HORIZON_DEG, below_horizon
+from vdgs.model.render import decode_view, render
+from vdgs.model.sizes import REACH, SPAN, SPREAD, largest_log_scales
+from vdgs.settings.method import BlockConfig, GrowthConfig, LossConfig
+from vdgs.training import Stage, train
+from vdgs.training.background import background_at
+
+FOCAL, WIDTH, HEIGHT = 100.0, 200, 160
+
+
+def camera_at(x: float = 0.0, height: float = 20.0, tilt: float = 0.0) -> Camera:
+    """Above (x, 0), looking straight down, or by `tilt` radians towards +y."""
+    down = np.diag([1.0, -1.0, -1.0])
+    turn = np.array([[1, 0, 0], [0, math.cos(tilt), math.sin(tilt)], [0, -math.sin(tilt), math.cos(tilt)]])
+    pose = np.eye(4)
+    pose[:3, :3] = turn @ down
+    pose[:3, 3] = -pose[:3, :3] @ np.array([x, 0.0, height])
+    return Camera(camera_from_world=pose, fx=FOCAL, fy=FOCAL, cx=WIDTH / 2, cy=HEIGHT / 2, width=WIDTH, height=HEIGHT)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 1000), tilt=st.floats(-1.5, 1.5))
+def test_points_fall_where_the_camera_says(seed, tilt):
+    points, camera = np.random.default_rng(seed).uniform(-30, 30, (200, 3)), camera_at(tilt=tilt)
+    seen = project(torch.from_numpy(points), camera)
+    assert np.array_equal(seen.inside.numpy(), camera.sees(points))
+    pixels, depth = camera.project(points)
+    inside = seen.inside.numpy()
+    assert np.allclose(np.stack([seen.column, seen.row], axis=1)[inside], pixels[inside])
+    assert np.allclose(seen.depth, depth)
+    assert np.allclose(seen.distance, np.linalg.norm(points - camera.position, axis=1))
+    assert depth[inside].min(initial=1.0) > NEAR
+
+
+@settings(max_examples=20)
+@given(tilt=st.floats(-1.5, 1.5))
+def test_pixels_well_below_the_horizon_show_no_sky(tilt):
+    camera = camera_at(tilt=tilt)
+    below = below_horizon(camera, HEIGHT, WIDTH)
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+    rays = np.stack([x / FOCAL, y / FOCAL, np.ones_like(x)], axis=-1)
+    up = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ camera.camera_from_world[:3, :3][:, 2]
+    down = np.degrees(np.arcsin(-up))
+    assert below[down > BELOW_HORIZON_DEG + 0.01].all()
+    assert not below[down < BELOW_HORIZON_DEG - 0.01].any()
+
+
+# ------------------------------------------------------------------------------------------ backgrounds
+
+
+class Grey(Photographs):
+    """Of a place that has the colour of the background."""
+
+    def get(self, index: int, downscale: int = 1) -> tuple[torch.Tensor, None]:
+        return torch.full_like(super().get(index, downscale)[0], 128), None
+
+
+def light_through(loss: LossConfig) -> float:
+    """The median of 1 - alpha, of a model that was trained before the colour of grey."""
+    stage, state = block_stage(BlockConfig())
+    config = replace(stage.config, iterations=300, loss=loss, growth=GrowthConfig(levels=0, start=10_000))
+    photographs, grey = Grey(), (128 / 255,) * 3
+    stage = replace(stage, config=config, background=grey, surroundings=None, images=photographs)
+    train(state, stage, stop=lambda: False, after_step=lambda *_: None)
+    model = state.model(stage.voxel, grey)
+    return float((1.0 - render(model, photographs.camera(0)).alpha.clamp(0, 1)).quantile(0.5))
+
+
+def test_ground_becomes_opaque_although_the_background_has_its_colour():
+    """Without backgrounds of random colour light shines through, with them nearly none does."""
+    board = light_through(LossConfig())
+    assert board < 0.02
+    assert light_through(LossConfig(background_noise=0.0)) > 3 * board
+
+
+def test_backgrounds_are_of_all_colours_the_same_for_a_seed_and_no_others_without_noise():
+    stage, _ = block_stage(BlockConfig())
+
+    def colours(share: float) -> torch.Tensor:
+        loss = LossConfig(background_noise=share)
+        changed = replace(stage, config=replace(stage.config, loss=loss), background=(0.2, 0.5, 0.8))
+        return torch.stack([background_at(changed, iteration) for iteration in range(500)])
+
+    own = torch.tensor([0.2, 0.5, 0.8])
+    every = colours(1.0)
+    assert torch.equal(every, colours(1.0))
+    assert float(every.min()) >= 0
+    assert float(every.max()) <= 1
+    assert (every.amin(0) < 0.03).all()
+    assert (every.amax(0) > 0.97).all()
+    torch.testing.assert_close(colours(0.25), own + 0.25 * (every - own))
+    assert (colours(0.0) == own).all()
+
+
+# ------------------------------------------------------------------------------------------------ the law of sizes
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 1000))
+def test_no_camera_that_holds_a_place_is_veiled_from_there(seed):
+    """A Gaussian as large as allowed, drawn at full opacity, spans no more than its share of any picture."""
+    rng = np.random.default_rng(seed)
+    points = torch.from_numpy(rng.uniform(-15, 15, (300, 3)) * [1, 1, 0.3])
+    cameras = [camera_at(x, height, tilt) for x, height, tilt in rng.uniform([-10, 8, -0.5], [10, 30, 0.5], (5, 3))]
+    diameter = 2 * REACH * largest_log_scales(points, cameras).exp().numpy()
+    held = np.zeros(len(points), bool)
+    longest = np.zeros(len(points))
+    for camera in cameras:
+        inside = camera.sees(points.numpy())
+        depth = camera.project(points.numpy())[1]
+        longest[inside] = np.maximum(longest, diameter * FOCAL / depth)[inside]
+        held |= inside
+    assert held.sum() > 10
+    assert longest[held].max() <= SPAN * WIDTH * (1 + 1e-6)
+    assert longest[held].min() > SPAN * WIDTH * 0.999  # no smaller than it must be
+
+
+def test_what_no_camera_holds_is_bounded_by_the_nearest_and_nothing_without_cameras():
+    beside = torch.tensor([[500.0, 0.0, 20.0]])
+    bound = largest_log_scales(beside, [camera_at(), camera_at(100.0)]).exp()
+    assert float(bound) == pytest.approx(400.0 * WIDTH / FOCAL * SPAN / (2 * REACH), rel=1e-5)
+    assert largest_log_scales(beside, []).tolist() == [math.inf]
+
+
+def test_an_anchor_in_the_centre_of_a_camera_has_a_size_that_can_be_trained():
+    assert largest_log_scales(torch.tensor([[0.0, 0.0, 20.0]]), [camera_at()]).isfinite().all()
+
+
+def test_training_leaves_no_gaussian_larger_than_its_bound_nor_far_from_its_anchor():
+    """Scales begin too large, of Gaussians and of the unit of their offsets; anchors that grow are bounded too."""
+    stage, state = block_stage(BlockConfig())
+    growth = GrowthConfig(interval=10, statistics_from=0, start=10, until=0.8, threshold=1e-6, gate=0.05)
+    config = replace(stage.config, iterations=47, average=0.1, growth=growth)
+    cameras = Photographs().cameras
+    stage = replace(stage, config=config, largest=lambda places: largest_log_scales(places, cameras) - 3.0)
+    state.largest = stage.largest_at(state.anchors.positions)
+    state.anchors.log_scales.add_(4.0)
+    before = len(state.anchors)
+    train(state, stage, stop=lambda: False, after_step=lambda *_: None)
+    anchors, decoder = state.result()
+    assert len(anchors) != before
+    bound = largest_log_scales(anchors.positions, cameras) - 3.0
+    for scales, most in ((anchors.log_scales[:, :3], bound + math.log(SPREAD)), (anchors.log_scales[:, 3:], bound)):
+        assert (scales <= most[:, None] + 1e-5).all()
+        assert (scales > most[:, None] - 0.5).any()
+    model = AnchorModel(anchors=anchors, decoder=decoder, voxel=stage.voxel, background=(0.0, 0.0, 0.0))
+    for camera in cameras:
+        rows, splats = decode_view(model, camera)
+        of = rows[splats.source.long() // anchors.offsets.shape[1]]
+        largest = (3 * bound[of]).exp()
+        assert (splats.volumes <= largest * 1.001).all()
+
+
+def test_an_unbounded_stage_changes_no_scale():
+    stage, state = block_stage(BlockConfig())
+    assert isinstance(stage, Stage)
+    assert torch.equal(state.largest, torch.full((len(state.anchors),), math.inf))

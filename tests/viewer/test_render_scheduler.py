@@ -1,0 +1,256 @@
+"""Whose turn it is in a viewer, and how much is drawn in it: visitors, moving and at rest, in a time that tests set."""
+
+from __future__ import annotations
+
+from concurrent.futures import CancelledError
+
+import numpy as np
+import pytest
+
+from support.captures import camera_at
+from vdgs.cameras import Camera
+from vdgs.viewer.layers import Shown
+from vdgs.viewer.studio import FEWEST_PX, REST, ROUND, TURN_ANCHORS, Frame, Studio, shrunk
+
+
+class Clock:
+    """Time that passes only where a test says so."""
+
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Slow:
+    """A painter that takes so long for each pixel."""
+
+    def __init__(self, clock: Clock, per_px: float = 0.0) -> None:
+        self.clock, self.per_px, self.settled, self.drawn = clock, per_px, 0, 0
+
+    def key(self, shown: Shown) -> object:
+        return id(self)
+
+    def in_view(self, shown: Shown, camera: Camera) -> int:
+        return 0
+
+    def settle(self, shown: Shown, whole: Camera) -> None:
+        self.settled += 1
+
+    def paint(self, shown: Shown, camera: Camera, whole: Camera, most: int | None = None) -> np.ndarray:
+        self.clock.now += self.per_px * camera.width * camera.height
+        return np.zeros((camera.height, camera.width, 3), np.uint8)
+
+
+@pytest.fixture
+def studio():
+    clock = Clock()
+    return Studio(clock), clock
+
+
+def sit(studio: Studio, painter: Slow) -> tuple[object, list[Frame], list[Exception]]:
+    frames, errors = list[Frame](), list[Exception]()
+    return studio.seat(painter, frames.append, errors.append), frames, errors
+
+
+def test_small_while_moving_and_full_at_rest(studio):
+    studio, clock = studio
+    seat, frames, _ = sit(studio, Slow(clock, 1e-6))
+    for x in range(5):
+        studio.ask(seat, camera_at(x, 0, width=1280), Shown())
+        assert studio.step() == 0
+        wait = studio.step()
+        assert wait is not None
+        assert 0 < wait <= REST  # nothing to do until it rests
+    assert [frame.full for frame in frames] == [False] * 5
+    assert all(frame.picture.shape[1] <= 640 for frame in frames)
+    clock.now += REST
+    while studio.step() == 0:
+        pass
+    assert [frame.full for frame in frames] == [False] * 5 + [True]
+    assert frames[-1].picture.shape == (960, 1280, 3)
+    assert frames[-1].camera.position[0] == pytest.approx(4.0)
+    assert studio.step() is None
+
+
+def test_a_camera_that_moves_on_leaves_nothing_to_be_finished(studio):
+    studio, clock = studio
+    seat, frames, _ = sit(studio, Slow(clock, 1e-6))
+    for x in range(2):  # the second picture is drawn in turns: the first one told how long they take
+        studio.ask(seat, camera_at(x, 0, width=1280), Shown())
+        studio.step()
+        clock.now += REST
+        studio.step()
+    count = len(frames)
+    assert seat.work is not None
+    studio.ask(seat, camera_at(9, 0, width=1280), Shown())
+    studio.step()
+    assert not frames[-1].full
+    assert frames[-1].camera.position[0] == pytest.approx(9.0)
+    clock.now += REST
+    while studio.step() == 0:
+        pass
+    assert [frame.full for frame in frames[count:]] == [False, True]
+    assert all(frame.camera.position[0] == pytest.approx(9.0) for frame in frames[count:])
+
+
+def test_quick_pictures_are_as_large_as_time_allows(studio):
+    studio, clock = studio
+    for per_px, least, most in ((1e-3, FEWEST_PX * 0.9, FEWEST_PX), (1e-9, 640 * 480 * 0.98, 640 * 480)):
+        seat, frames, _ = sit(studio, Slow(clock, per_px))
+        for x in range(20):
+            studio.ask(seat, camera_at(x, 0, width=1600), Shown())
+            studio.step()
+        height, width = frames[-1].picture.shape[:2]
+        assert least <= width * height <= most
+        studio.leave(seat)
+
+
+class Decoding(Slow):
+    """A painter of 100 000 anchors in view that takes so long for each one that it draws."""
+
+    def __init__(self, clock: Clock, per_anchor: float) -> None:
+        super().__init__(clock)
+        self.per_anchor, self.times = per_anchor, [1, 5, 15, 45]
+
+    def paint(self, shown: Shown, camera: Camera, whole: Camera, most: int | None = None) -> np.ndarray:
+        counts = [100_000 // times for times in self.times]
+        self.drawn = counts[0] if most is None else next((c for c in counts if c <= most), counts[-1])
+        self.clock.now += self.per_anchor * self.drawn
+        return super().paint(shown, camera, whole, most)
+
+
+@pytest.mark.parametrize(("moving", "drawn"), [(1, 20_000), (2, 20_000), (8, 6_666)])
+def test_a_round_of_all_who_move_stays_short(studio, moving, drawn):
+    studio, clock = studio
+    painters = [Decoding(clock, 2e-6) for _ in range(moving)]
+    seats = [sit(studio, painter)[0] for painter in painters]
+    for x in range(8):
+        began = clock.now
+        for seat in seats:
+            studio.ask(seat, camera_at(x, 0, width=1280), Shown())
+        for _ in seats:
+            assert studio.step() == 0
+        taken = clock.now - began
+    assert [painter.drawn for painter in painters] == [drawn] * moving
+    assert taken <= ROUND * 1.05
+
+
+def test_who_is_alone_on_a_fast_machine_sees_the_model_itself_while_moving(studio):
+    studio, clock = studio
+    painter = Decoding(clock, 1e-7)
+    seat, _, _ = sit(studio, painter)
+    for x in range(3):
+        studio.ask(seat, camera_at(x, 0, width=1280), Shown())
+        studio.step()
+    assert painter.drawn == 100_000
+
+
+def test_two_who_rest_at_the_same_place_share_a_picture(studio):
+    studio, clock = studio
+
+    class Alike(Slow):
+        def key(self, shown: Shown) -> object:
+            return "one scene"
+
+    one, other, elsewhere = (sit(studio, Alike(clock, 1e-7)) for _ in range(3))
+    for (seat, _, _), x in ((one, 0), (other, 0), (elsewhere, 1)):
+        studio.ask(seat, camera_at(x, 0, width=640), Shown())
+    for _ in range(3):
+        studio.step()
+    clock.now += REST
+    while studio.step() == 0:
+        pass
+    full = [frames[-1] for _, frames, _ in (one, other, elsewhere)]
+    assert all(frame.full for frame in full)
+    assert full[0].picture is full[1].picture
+    assert full[0].picture is not full[2].picture
+
+
+def test_a_full_picture_of_much_is_drawn_in_parts(studio):
+    studio, clock = studio
+    painter = Slow(clock)
+    painter.in_view = lambda shown, camera: 5 * TURN_ANCHORS  # type: ignore[method-assign]
+    seat, frames, _ = sit(studio, painter)
+    studio.ask(seat, camera_at(0, 0, width=1280), Shown())
+    studio.step()
+    clock.now += REST
+    steps = 0
+    while studio.step() == 0:
+        steps += 1
+    assert steps == 5
+    assert frames[-1].picture.shape == (960, 1280, 3)
+
+
+def test_visitors_take_turns_and_moving_ones_go_first(studio):
+    studio, clock = studio
+    order: list[int] = []
+    seats = []
+    for number in range(3):
+        seat = studio.seat(Slow(clock, 1e-7), lambda frame, n=number: order.append(n), pytest.fail)
+        seats.append(seat)
+    for _ in range(4):
+        for seat in seats:
+            studio.ask(seat, camera_at(0, 0, width=1280), Shown())
+        for _ in seats:
+            studio.step()
+    assert sorted(order[:3]) == [0, 1, 2]
+    assert all(order.count(number) == 4 for number in range(3))
+    clock.now += REST
+    studio.ask(seats[1], camera_at(1, 0, width=1280), Shown())  # the others rest and wait for full pictures
+    studio.step()
+    assert order[-1] == 1
+
+
+def test_who_left_is_drawn_for_no_more(studio):
+    studio, clock = studio
+    seat, frames, _ = sit(studio, Slow(clock))
+    studio.ask(seat, camera_at(0, 0), Shown())
+    studio.leave(seat)
+    assert studio.step() is None
+    assert not frames
+
+
+def test_one_visitors_trouble_is_theirs_alone(studio):
+    studio, clock = studio
+
+    class Broken(Slow):
+        def paint(self, shown, camera, whole, most=None):
+            raise RuntimeError("no picture")
+
+    broken, _, errors = sit(studio, Broken(clock))
+    other, frames, _ = sit(studio, Slow(clock))
+    for seat in (broken, other):
+        studio.ask(seat, camera_at(0, 0, width=640), Shown())
+    assert (studio.step(), studio.step()) == (0, 0)
+    assert [str(error) for error in errors] == ["no picture"]
+    assert len(frames) == 1
+    assert studio.errand(lambda: 3).done() is False
+    future = studio.errand(lambda: 1 // 0)
+    studio.step()
+    studio.step()
+    with pytest.raises(ZeroDivisionError):
+        future.result()
+
+
+def test_nobody_waits_for_errands_of_a_studio_that_closes(studio):
+    studio, _ = studio
+    before = studio.errand(lambda: 3)
+    studio.close()
+    after = studio.errand(lambda: 4)
+    for future in (before, after):
+        with pytest.raises(CancelledError):
+            future.result(timeout=0)
+
+
+def test_a_small_canvas_is_drawn_once(studio):
+    studio, clock = studio
+    seat, frames, _ = sit(studio, Slow(clock))
+    camera = camera_at(0, 0, width=160)
+    assert shrunk(camera, 1e6) is camera
+    studio.ask(seat, camera, Shown())
+    studio.step()
+    clock.now += REST
+    while studio.step() == 0:
+        pass
+    assert [frame.picture.shape for frame in frames] == [(120, 160, 3)] * len(frames)

@@ -1,0 +1,375 @@
+"""The server of `vdgs view`: who may come in, what they get, what happens when they vanish."""
+
+from __future__ import annotations
+
+import gc
+import json
+import math
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[viewer]')")
+
+import viser
+
+from support.commands import vdgs, wait_until
+from support.viewer import Guest, expected, quiet, trained
+from vdgs.cameras import Camera
+from vdgs.errors import RunError, VdgsError
+from vdgs.films.path_files import load_path
+from vdgs.films.paths import look_at
+from vdgs.runs.folder import RunFolder
+from vdgs.runs.opening import open_run
+from vdgs.viewer import navigation
+from vdgs.viewer.following import newest, open_or_last_saved, standing_lines
+from vdgs.viewer.layers import Painter
+from vdgs.viewer.path_panel import PathPanel
+from vdgs.viewer.place_panel import PlacePanel
+from vdgs.viewer.serving import free_port, serve
+from vdgs.viewer.studio import KEPT, Seat
+from vdgs.viewer.visitor import Visitor
+
+pytestmark = pytest.mark.xdist_group("viewer")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A run of a textured plane whose coarse stage is done."""
+    return trained(tmp_path_factory.mktemp("view"))
+
+
+@pytest.fixture(scope="module")
+def viewer(run):
+    with serve(open_run(run), "127.0.0.1", None, Console(file=sys.stderr)) as opened:
+        yield opened
+
+
+@pytest.fixture
+def guest(viewer):
+    guest = Guest(viewer.door.address())
+    yield guest
+    guest.close()
+
+
+def above(x: float = 0.0, y: float = 0.0, width: int = 320, height: int = 240) -> Camera:
+    focal = 0.5 * height / math.tan(math.radians(25))
+    pose = look_at(np.array([x, y - 2.0, 9.0]), np.array([x, y, 0.0]))
+    return Camera(camera_from_world=pose, fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height)
+
+
+@quiet
+def test_a_visitor_sees_the_true_model(viewer, guest):
+    for camera in (above(), above(1.0, 0.5), above(0.0, 0.0, 480, 300)):
+        guest.stand(camera)
+        guest.assert_sees(expected(viewer, camera))
+
+
+@quiet
+def test_every_layer_can_be_chosen(guest):
+    camera = above()
+    guest.stand(camera)
+    seen = [guest.full_picture(camera)]
+    for name in ("Depth", "V: cameras that see it", "Alpha: how opaque", "Blocks", "Error against nearest photograph"):
+        guest.choose("Layer", name)
+        while True:
+            picture = guest.full_picture(camera)
+            if np.abs(picture.astype(int) - seen[-1]).mean() > 1:
+                break
+        assert all(np.abs(picture.astype(int) - other).mean() > 1 for other in seen)
+        seen.append(picture)
+
+
+@quiet
+def test_a_click_tells_the_place(viewer, guest):
+    camera = above(width=640, height=480)
+    guest.stand(camera)
+    guest.full_picture(camera)
+    place = np.array([0.8, -0.6, 0.0])
+    x, y = camera.project(place[None])[0][0]
+    guest.click(x / 640, y / 480)
+    for _ in guest.messages():
+        if "ground frame" in guest.text():
+            break
+    words = next(line for line in guest.text().splitlines() if "ground frame" in line)
+    found = [float(part.split()[1]) for part in words.split(",")[:2]]
+    assert found == pytest.approx(place[:2], abs=0.15)  # of a scene of 60 iterations
+    assert "training cameras have it in their picture" in guest.text()
+
+
+@quiet
+def test_a_double_click_turns_about_the_place(viewer, guest):
+    camera = above(width=640, height=480)
+    guest.stand(camera)
+    guest.full_picture(camera)
+    (visitor,) = viewer.visitors.values()
+    visitor.place.clock = lambda: 0.0  # all at the same time
+    x, y = camera.project(np.array([[0.8, -0.6, 0.0]]))[0][0]
+    guest.click(x / 640, y / 480)
+    guest.click(x / 640 + 0.1, y / 480)  # elsewhere
+    wait_until(lambda: visitor.place._place is not None)
+    assert visitor.camera.position == pytest.approx(camera.position)
+    guest.click(x / 640, y / 480)
+    guest.click(x / 640, y / 480)
+    wait_until(lambda: np.linalg.norm(visitor.stand.look_at[:2] - [0.8, -0.6]) < 0.15)
+    assert visitor.camera.position == pytest.approx(camera.position, abs=1e-6)
+
+    def in_the_middle() -> bool:
+        seen, _ = visitor.camera.project(visitor.stand.look_at[None])
+        return bool(np.abs(seen[0] - (320.0, 240.0)).max() < 0.5)
+
+    wait_until(in_the_middle)  # the browser says where it looks once it has been led there
+
+
+@quiet
+def test_a_path_is_set_and_saved(viewer, guest, tmp_path):
+    frames = [above(), above(1.0, 0.0)]
+    for count, camera in enumerate(frames, start=1):
+        guest.stand(camera)
+        guest.full_picture(camera)
+        guest.choose("Key frame", "Add")
+        visitor = list(viewer.visitors.values())[-1]
+        wait_until(lambda visitor=visitor, count=count: len(visitor.path.keyframes) == count)
+    guest.choose("Path", "Save")
+    parts = b""
+    for message in guest.messages():
+        if message["type"] == "FileTransferPart":
+            parts += bytes(message["content"])
+            break
+    file = tmp_path / "path.json"
+    file.write_bytes(parts)
+    read = load_path(file, above())
+    assert np.allclose(read.cameras[0].camera_from_world, frames[0].camera_from_world, atol=1e-9)
+    assert np.allclose(read.cameras[-1].camera_from_world, frames[1].camera_from_world, atol=1e-9)
+
+
+@quiet
+def test_visitors_that_vanish_are_forgotten(viewer):
+    wait_until(lambda: not viewer.visitors)
+    guests = [Guest(viewer.door.address()) for _ in range(4)]
+    for number, guest in enumerate(guests):
+        guest.stand(above(0.1 * number))
+    wait_until(lambda: len(viewer.visitors) == 4)
+    for guest in guests[:3]:
+        guest.stand(above(0.5))
+        guest.vanish()
+    camera = above(0.3, 0.2)
+    guests[3].stand(camera)
+    guests[3].assert_sees(expected(viewer, camera))
+    guests[3].close()
+    wait_until(lambda: not viewer.visitors)
+    assert not viewer.studio._seats
+
+
+@quiet
+def test_many_visits_leave_nothing_behind(viewer):
+    """Counted in objects: what a process weighs depends on its allocator, and on what else was at work."""
+    kinds = (Visitor, Painter, Seat, PlacePanel, PathPanel, viser.ClientHandle)
+
+    def there() -> dict[type, int]:
+        gc.collect()
+        return {kind: sum(isinstance(each, kind) for each in gc.get_objects()) for kind in kinds}
+
+    wait_until(lambda: not viewer.visitors)
+    for number in range(6):
+        guest = Guest(viewer.door.address())
+        guest.stand(above(0.1 * number))
+        guest.full_picture(above(0.1 * number))
+        guest.choose("Layer", "Depth")
+        (guest.vanish if number % 2 else guest.close)()
+    wait_until(lambda: not viewer.visitors)
+    wait_until(lambda: not any(there().values()))
+    assert len(viewer.studio._full_pictures) <= KEPT
+
+
+@quiet
+def test_a_photograph_lies_over_the_model_until_one_leaves(viewer, guest):
+    guest.stand(above())
+    guest.full_picture(above())
+    wait_until(lambda: len(viewer.visitors) == 1)
+    (visitor,) = viewer.visitors.values()
+    taken = viewer.scene.capture.views[0].camera
+    visitor.look_from(0)
+    assert visitor.shown.photograph == 0
+    guest.stand(above(0.2))  # was on its way when the browser was told to go
+    wait_until(lambda: visitor.camera.position[0] == pytest.approx(0.2))
+    assert visitor.shown.photograph == 0
+    guest.stand(taken)
+    wait_until(lambda: np.allclose(visitor.camera.position, taken.position))
+    guest.assert_sees(visitor.painter.paint(visitor.shown, visitor.camera, visitor.camera))
+    guest.stand(above(0.3))
+    wait_until(lambda: visitor.shown.photograph is None)
+
+
+# ------------------------------------------------------------------------------------- the door
+
+
+def ask(address: str, path: str = "/", **headers: str) -> tuple[int, bytes, str]:
+    try:
+        with urlopen(Request(address.split("?")[0].rstrip("/") + path, headers=headers)) as answer:
+            return answer.status, answer.read(), answer.headers.get("Set-Cookie", "")
+    except HTTPError as error:
+        with error:
+            return error.code, error.read(), ""
+
+
+@quiet
+def test_nothing_of_the_machine_is_reached(viewer):
+    address = viewer.door.address()
+    assert ask(address)[0] == 200
+    for path in (
+        "/../../../../etc/passwd",
+        "/%2e%2e/%2e%2e/pyproject.toml",
+        "/..%5c..%5cx",
+        "//etc/passwd",
+        "/assets/",
+    ):
+        status, body, _ = ask(address, path)
+        assert status == 404, path
+        assert b"root:" not in body
+    assert ask(address, Host="evil.example")[0] == 403
+    assert ask(address, Origin="http://evil.example")[0] == 403
+    with pytest.raises(Exception, match="403"):
+        Guest(address, {"Origin": "http://evil.example"})
+    assert viewer.server.request_share_url() is None  # no tunnel to elsewhere
+
+
+@quiet
+def test_others_need_the_token(run):
+    with serve(open_run(run), "0.0.0.0", None, Console(file=sys.stderr)) as viewer:
+        address, token = viewer.door.address(), viewer.door.token
+        assert token is not None
+        assert len(token) >= 32
+        assert ask(address)[0] == 403
+        assert ask(address, "/?token=" + token[:-1])[0] == 403
+        with pytest.raises(Exception, match="403"):
+            Guest(address.split("?")[0])
+        status, _, cookie = ask(address, "/?token=" + token, Host="somewhere.example")
+        assert status == 200
+        assert "HttpOnly" in cookie
+        assert "SameSite=Strict" in cookie
+        assert ask(address, Cookie=cookie.split(";")[0])[0] == 200
+        guest = Guest(address.split("?")[0], {"Cookie": cookie.split(";")[0]})
+        guest.stand(above())
+        assert guest.full_picture(above()).shape == (240, 320, 3)
+        guest.close()
+
+
+@quiet
+def test_a_canvas_that_is_too_large_is_drawn_smaller(viewer, monkeypatch):
+    monkeypatch.setattr(navigation, "MOST_PX", 320 * 240)
+    guest = Guest(viewer.door.address())
+    guest.stand(above(width=200_000, height=150_000))
+    guest.assert_sees(expected(viewer, above()))
+    guest.close()
+
+
+def test_ports_and_hosts_that_cannot_be_used_are_said_before_any_work(run):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(VdgsError, match=f"--port {port}: cannot be used"):
+            free_port("127.0.0.1", port)
+        done = vdgs("view", run, "--port", port)
+        assert done.returncode == 1
+        assert f"--port {port}" in done.stderr
+    with pytest.raises(VdgsError, match="no address of this machine"):
+        free_port("no.such.host.invalid", None)
+    assert "--port 70000" in vdgs("view", run, "--port", "70000").stderr
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_it_ends_when_asked_to(run, how):
+    command = [sys.executable, "-c", "from vdgs.cli import main; main()", "view", str(run)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        line = next((line for line in process.stdout if "http://127.0.0.1:" in line), "")
+        assert line.startswith("coarse model ("), process.stderr.read()
+        process.stdout.readline()
+        process.send_signal(how)
+        assert process.wait(timeout=60) == 0
+        assert "Traceback" not in process.stderr.read()
+
+
+def test_what_draws_charts_is_not_waited_for():
+    code = "import sys, vdgs.viewer.serving; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_a_folder_without_a_run_is_said(tmp_path):
+    done = vdgs("view", tmp_path)
+    assert done.returncode == 1
+    assert str(tmp_path) in done.stderr
+
+
+# ------------------------------------------------------------------------------------- a run that trains
+
+
+@quiet
+def test_a_run_that_trains_is_shown_as_it_was_saved_last(run, viewer, guest, tmp_path):
+    unfinished = tmp_path / "run"
+    shutil.copytree(run, unfinished)
+    finished = open_run(unfinished)
+    assert open_or_last_saved(unfinished).name == "coarse"
+    before = newest(RunFolder(unfinished))
+    (unfinished / "coarse/model.safetensors").unlink()
+    status = json.loads((unfinished / "coarse/status.json").read_text())
+    (unfinished / "coarse/status.json").write_text(json.dumps({**status, "state": "stopped"}))
+    assert newest(RunFolder(unfinished)) != before
+    last = open_or_last_saved(unfinished)
+    assert last.name == "training"
+    assert "60 iterations" in last.caution
+    assert np.array_equal(last.model.anchors.features, finished.model.anchors.features)
+    assert "**coarse** stopped" in standing_lines(RunFolder(unfinished))
+    with pytest.raises(RunError):
+        open_or_last_saved(unfinished, "merged")
+    for file in (unfinished / "coarse/checkpoints").iterdir():
+        file.unlink()
+    with pytest.raises(RunError, match="no model and no checkpoint yet"):
+        open_or_last_saved(unfinished)
+    # Whoever looks sees the newer model, and how far training is.
+    camera = above()
+    guest.stand(camera)
+    guest.full_picture(camera)
+    viewer.tell(standing_lines(RunFolder(run)))
+    shown = viewer.scene.run
+    viewer.show(last)
+    guest.assert_sees(expected(viewer, camera))
+    viewer.show(shown)
+    for _ in guest.messages():  # words and pictures take turns
+        if "**coarse** done" in guest.text():
+            break
+    assert "**coarse** done" in guest.text()
+
+
+def test_blocks_that_train_are_shown_with_what_they_have(run, tmp_path):
+    cut = tmp_path / "run"
+    shutil.copytree(run, cut)
+    for command in (("visibility", cut), ("partition", cut, "--blocks", "2")):
+        done = vdgs(*command)
+        assert done.returncode == 0, done.stderr
+    assert open_or_last_saved(cut).name == "coarse"
+    done = vdgs("train", cut, "--block", "1", "--block.iterations", "20", "--save-every", "10")
+    assert done.returncode == 0, done.stderr
+    folder = cut / "blocks/01"
+    status = json.loads((folder / "status.json").read_text())
+    for unfinished in (False, True):
+        if unfinished:
+            (folder / "model.safetensors").unlink()
+            (folder / "status.json").write_text(json.dumps({**status, "state": "stopped"}))
+        shown = open_or_last_saved(cut)
+        assert shown.name == "training"
+        assert "1 of 2 blocks" in shown.caution
+        assert len(shown.model.anchors) > 0
+        assert "**block 1**" in standing_lines(RunFolder(cut))

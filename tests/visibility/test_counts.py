@@ -1,0 +1,157 @@
+"""Visibility: V against brute force, shares of a cycle, and the numbers that describe imbalance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from support.captures import look_down
+from vdgs.cameras import NEAR, Camera, CameraModel
+from vdgs.model.anchors import Anchors
+from vdgs.model.visibility import effective_count, imbalance, normalised, share_in_cycle, visibility_of, votes_of
+from vdgs.settings.method import TrainConfig
+from vdgs.training.sampling import shares_for
+
+
+def flight(count: int, model: CameraModel = "pinhole", seed: int = 0) -> list[Camera]:
+    """Tilted views over a square of 20 units; an orthographic camera has 4 px a unit."""
+    generator = np.random.default_rng(seed)
+    focal = 60.0 if model == "pinhole" else 4.0
+    places = generator.uniform(0, 20, (count, 2))
+    poses = [look_down(np.array([*at, 8.0]), generator.uniform(0, 80), generator.uniform(0, 360)) for at in places]
+    return [
+        Camera(camera_from_world=pose, fx=focal, fy=focal, cx=31.5, cy=25.0, width=64, height=48, model=model)
+        for pose in poses
+    ]
+
+
+def cloud(n: int, seed: int = 1) -> np.ndarray:
+    """Points on the ground and far above the cameras, float32 values in float64."""
+    return np.random.default_rng(seed).uniform([-5, -5, -2], [25, 25, 14], (n, 3)).astype(np.float32).astype(np.float64)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "orthographic"])
+def test_v_is_the_number_of_frusta_that_hold_an_anchor(model: CameraModel) -> None:
+    cameras, points = flight(30, model), cloud(3000)
+    # float32 rounding decides about places within 1e-3 px of a border: none of them here.
+    borderless = np.ones(len(points), bool)
+    for camera in cameras:
+        pixels, depth = camera.project(points)
+        for value, border in ((pixels[:, 0], 0), (pixels[:, 0], 64), (pixels[:, 1], 0), (pixels[:, 1], 48)):
+            borderless &= np.abs(value - border) > 1e-3
+        borderless &= np.abs(depth - NEAR) > 1e-4
+    points = points[borderless]
+    expected = sum(camera.sees(points).astype(int) for camera in cameras)
+    views = visibility_of(torch.from_numpy(points).float(), cameras)
+    assert views.dtype == torch.int32
+    assert views.tolist() == expected.tolist()
+    assert len(set(views.tolist())) > 3
+    behind = [torch.from_numpy(camera.position - camera.forward).float()[None] for camera in cameras[:5]]
+    alone = [int(visibility_of(place, [camera])) for place, camera in zip(behind, cameras[:5], strict=True)]
+    assert alone == [0] * 5
+
+
+def test_the_left_and_upper_border_belong_to_the_image_the_right_and_lower_do_not() -> None:
+    camera = Camera(camera_from_world=np.eye(4), fx=32.0, fy=32.0, cx=32.0, cy=16.0, width=64, height=32)
+    places = [[-1, 0, 1], [1, 0, 1], [0, -0.5, 1], [0, 0.5, 1], [0, 0, 1], [0, 0, -1], [0, 0, NEAR / 2]]
+    points = np.array(places, np.float64)
+    assert visibility_of(torch.from_numpy(points).float(), [camera]).tolist() == [1, 0, 1, 0, 1, 0, 0]
+    assert camera.sees(points).tolist() == [True, False, True, False, True, False, False]
+
+
+def test_v_does_not_depend_on_the_order_of_cameras_and_no_camera_sees_nothing() -> None:
+    cameras, points = flight(12), torch.from_numpy(cloud(500)).float()
+    assert torch.equal(visibility_of(points, cameras), visibility_of(points, cameras[::-1]))
+    assert visibility_of(points, []).tolist() == [0] * 500
+
+
+def test_a_view_counts_once_in_a_cycle_at_whatever_resolution() -> None:
+    cameras, points = flight(7), torch.from_numpy(cloud(800)).float()
+    share = share_in_cycle(points, cameras)
+    again = share_in_cycle(points, [*cameras, cameras[0], cameras[3].resized(32, 24), cameras[3].resized(16, 12)])
+    assert torch.equal(share, again)
+    assert torch.equal(share, visibility_of(points, cameras).float() / 7)
+    moved = replace(cameras[0], cx=cameras[0].cx + 4)
+    assert not torch.equal(share, share_in_cycle(points, [*cameras, moved]))
+    with pytest.raises(ValueError, match="without cameras"):
+        share_in_cycle(points, [])
+
+
+def test_normalised_visibility_spans_zero_to_one_and_is_zero_where_all_are_alike() -> None:
+    assert normalised(np.array([3, 7, 5])) == pytest.approx([0, 1, 0.5])
+    assert normalised(np.array([4, 4])).tolist() == [0, 0]
+    assert len(normalised(np.array([], np.int64))) == 0
+
+
+@given(st.lists(st.integers(0, 50), min_size=1, max_size=30))
+def test_gini_is_the_mean_difference_of_two_anchors(views: list[int]) -> None:
+    values = np.array(views, np.float64)
+    mean = values.mean()
+    expected = np.abs(values[:, None] - values[None]).mean() / (2 * mean) if mean else 0.0
+    assert imbalance(np.array(views)).gini == pytest.approx(expected, abs=1e-12)
+
+
+def test_imbalance_in_numbers() -> None:
+    facts = imbalance(np.arange(101))
+    assert facts.mean == 50
+    assert facts.quantiles == {5: 5, 25: 25, 50: 50, 75: 75, 95: 95}
+    assert facts.share_below == {3: 3 / 101, 5: 5 / 101, 10: 10 / 101}
+    with pytest.raises(ValueError, match="no anchors"):
+        imbalance(np.array([], np.int64))
+
+
+def test_every_anchor_divides_its_vote_among_the_cameras_that_hold_it() -> None:
+    cameras, points = flight(20), torch.from_numpy(cloud(500))
+    held = np.array([visibility_of(points, [camera]).numpy() > 0 for camera in cameras])
+    seen = held.sum(0)
+    expected = [sum(1.0 / seen[i] for i in np.flatnonzero(row)) for row in held]
+    shares = votes_of(points, cameras)
+    assert np.allclose(shares, expected)
+    assert np.isclose(sum(shares), (seen > 0).sum())
+
+
+@given(count=st.integers(1, 50), weight=st.floats(1e-3, 1e3))
+def test_photographs_used_alike_are_worth_their_number_and_one_that_outweighs_all_is_worth_one(
+    count: int, weight: float
+) -> None:
+    assert effective_count([weight] * count) == pytest.approx(count)
+    assert effective_count([weight] * count + [0.0] * 7) == pytest.approx(count)
+    assert effective_count([weight] * count + [1e9 * weight]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("sampling", "ratio"), [("even", None), ("shares", 9.0), ("roots", 3.0)])
+def test_how_often_a_photograph_with_nine_times_the_votes_is_used(sampling: str, ratio: float | None) -> None:
+    cameras = [
+        Camera(
+            camera_from_world=look_down(np.array([x, 0.0, 8.0]), 0.0, 0.0),
+            fx=60.0,
+            fy=60.0,
+            cx=32.0,
+            cy=24.0,
+            width=64,
+            height=48,
+        )
+        for x in (0.0, 100.0)
+    ]
+    positions = torch.tensor([[0.0, 0.0, 0.0]] + [[100.0, 0.0, 0.0]] * 9)
+    anchors = Anchors(positions, torch.zeros(10, 32), torch.zeros(10, 1, 3), torch.zeros(10, 6))
+    shares = shares_for(TrainConfig(sampling=sampling), anchors, cameras)
+    assert (None if shares is None else shares[1] / shares[0]) == (ratio and pytest.approx(ratio))
+
+
+def test_a_camera_alone_over_a_place_has_the_votes_of_all_its_anchors() -> None:
+    def above(x: float) -> Camera:
+        return Camera(
+            camera_from_world=look_down(np.array([x, 0.0, 8.0]), 0.0, 0.0), fx=60.0, fy=60.0, cx=32.0, cy=24.0,
+            width=64, height=48,
+        )  # fmt: skip
+
+    crowd, lonely = [above(0.0)] * 9, above(100.0)
+    points = torch.tensor([[0.0, 0.0, 0.0]] * 9 + [[100.0, 0.0, 0.0]] * 9)
+    assert np.allclose(votes_of(points, [*crowd, lonely]), [1.0] * 9 + [9.0])
+    assert votes_of(torch.zeros(0, 3), crowd) == (1.0,) * 9
