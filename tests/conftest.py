@@ -73,9 +73,9 @@ def compiled_code(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def compiled_once(compiled_code: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiled kernels are found again."""
-    from vdgs.kernels.cuda import cache
+    from vdgs.kernels.cuda import compile_cache
 
-    monkeypatch.setenv(cache.VARIABLE, str(compiled_code))
+    monkeypatch.setenv(compile_cache.VARIABLE, str(compiled_code))
 
 
 @pytest.fixture(scope="session")

@@ -39,7 +39,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 #: The folders of the experiments, lowest first, as the rooms of a package of its own.
 EXPERIMENT_LAYERS: tuple[tuple[str, ...], ...] = (("baselines", "microbench"), ("bench",), ("reports",))
 #: The only module of the package that may import the experiments.
-HANDS_OVER = "vdgs.verbs.experiments"
+HANDS_OVER = "vdgs.cli.bench_cmd"
 #: What other rooms may import of a room, beside the room itself.
 DOORS: Mapping[str, tuple[str, ...]] = {
     "kernels": ("types", "constants", "operations", "devices", "moving", "rotations", "spherical_harmonics")
@@ -95,7 +95,7 @@ def _imported(node: ast.Import | ast.ImportFrom, within: str, modules: Iterable[
 
 
 def room_of(module: str) -> str:
-    """`partition` for vdgs.partition.cut; empty for the package itself, which only says its version."""
+    """`partition` for vdgs.partition.partition_scene; empty for the package itself, which only says its version."""
     return module.partition(".")[2].partition(".")[0]
 
 
@@ -223,9 +223,9 @@ def tree(tmp_path):
 SMALL = (("low", "side"), ("kernels",), ("stages",), ("high", "doctor"))
 CLEAN = {
     "__init__.py": "", "low.py": "from vdgs import __version__", "side.py": "import json",
-    "kernels/__init__.py": "from vdgs.kernels import native", "kernels/native.py": "from vdgs.kernels.types import T",
-    "kernels/types.py": "import vdgs.low", "stages/one.py": "from vdgs.kernels import work",
-    "stages/two.py": "from vdgs.kernels.types import T", "high.py": "from vdgs.stages import one",
+    "kernels/__init__.py": "from vdgs.kernels import native", "kernels/native.py": "from vdgs.kernels.kernel_types import T",
+    "kernels/kernel_types.py": "import vdgs.low", "stages/one.py": "from vdgs.kernels import work",
+    "stages/two.py": "from vdgs.kernels.kernel_types import T", "high.py": "from vdgs.pipeline import one",
     "doctor/cards.py": "from vdgs.kernels import native",
 }  # fmt: skip
 
@@ -249,18 +249,18 @@ def test_the_checker_is_content_with_a_clean_tree(tree):
         ),
         pytest.param(
             "stages/one.py", "from .two import go",
-            ["vdgs/stages/one.py:1: imports vdgs.stages.two: files of stages do not import each other"],
+            ["vdgs/stages/one.py:1: imports vdgs.pipeline.two: files of stages do not import each other"],
             id="between stages, relative",
         ),
         pytest.param(
             "high.py", "from vdgs.kernels import native as kernels",
-            ["vdgs/high.py:1: imports vdgs.kernels.native: high may import only kernels, kernels.types, "
+            ["vdgs/high.py:1: imports vdgs.kernels.cpu: high may import only kernels, kernels.types, "
              "kernels.constants, kernels.operations, kernels.devices, kernels.moving, "
              "kernels.rotations, kernels.spherical_harmonics"], id="past the door",
         ),
         pytest.param(
-            "stages/two.py", "from vdgs.kernels.native.module import threads",
-            ["vdgs/stages/two.py:1: imports vdgs.kernels.native.module: stages may import only kernels, kernels.types, "
+            "stages/two.py", "from vdgs.kernels.cpu.extension import threads",
+            ["vdgs/stages/two.py:1: imports vdgs.kernels.cpu.extension: stages may import only kernels, kernels.types, "
              "kernels.constants, kernels.operations, kernels.devices, kernels.moving, "
              "kernels.rotations, kernels.spherical_harmonics"], id="far past the door",
         ),

@@ -12,15 +12,15 @@ import torch
 from jaxtyping import TypeCheckError
 
 from support.package_files import checked_files, files_with_shapes, module_name
-from vdgs.captures.heights import reach
+from vdgs.captures.camera_height import reach
+from vdgs.config.method import CompensationConfig
 from vdgs.evaluation.metrics import squared_error
-from vdgs.kernels import native, reference, rotations
+from vdgs.kernels import cpu, rotations, torch_ref
 from vdgs.kernels.spherical_harmonics import basis
-from vdgs.model.gaps import gap_points
-from vdgs.model.visibility import visibility_of
-from vdgs.partition.plane import principal_plane
-from vdgs.settings.method import CompensationConfig
+from vdgs.model.initialization.gap_filling import gap_points
+from vdgs.partition.principal_axes import principal_plane
 from vdgs.training.compensation import low_visibility
+from vdgs.visibility.visibility_counts import visibility_of
 
 
 def imports_jaxtyping(file: Path) -> bool:
@@ -52,9 +52,9 @@ def test_other_files_are_loaded_as_always():
 
 FLAT = np.zeros((5, 2))
 WRONG = {
-    "kernels.native": lambda: native.count_visibility(torch.zeros(5, 2), []),
-    "kernels.native, two that disagree": lambda: native.group_max(torch.zeros(5, 2), torch.zeros(4).long(), 1),
-    "kernels.reference": lambda: reference.morton_order(torch.zeros(5, 2)),
+    "kernels.native": lambda: cpu.count_visibility(torch.zeros(5, 2), []),
+    "kernels.native, two that disagree": lambda: cpu.group_max(torch.zeros(5, 2), torch.zeros(4).long(), 1),
+    "kernels.reference": lambda: torch_ref.morton_order(torch.zeros(5, 2)),
     "kernels": lambda: rotations.rotation_matrices(torch.zeros(5, 3)),
     "model, torch": lambda: visibility_of(torch.zeros(5, 2), []),
     "model, numpy": lambda: gap_points(FLAT, [], 1.0),

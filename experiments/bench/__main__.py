@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from vdgs.cli import main
+from vdgs.cli.main import main
 
 if __name__ == "__main__":
     main(["bench", *sys.argv[1:]])

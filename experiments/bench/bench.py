@@ -36,18 +36,18 @@ from experiments.bench.verdict import verdict
 from experiments.bench.worker import RECORD, Job
 from experiments.bench.writing import latex, markdown, tidy_csv
 from vdgs.captures.loading import load_capture
-from vdgs.captures.outputs import refuse_among_files, refuse_in_a_capture
+from vdgs.captures.output_guard import refuse_among_files, refuse_in_a_capture
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.serialization import differences, to_dict
+from vdgs.distributed.executor import Outcome, Task
+from vdgs.distributed.lines import Lines
+from vdgs.distributed.local_executor import LocalExecutor
+from vdgs.distributed.progress_table import STYLES
 from vdgs.errors import Stopped, VdgsError
-from vdgs.executors.executor import Outcome, Task
-from vdgs.executors.lines import Lines
-from vdgs.executors.local import LocalExecutor
-from vdgs.executors.table import STYLES
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.keys import counted
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.plain import differences, to_dict
-from vdgs.storage.files import jsonable, read_json, write_json, write_text
+from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.stage_keys import counted
 from vdgs.synth import SynthOptions, generate
+from vdgs.system.atomic_files import jsonable, read_json, write_json, write_text
 
 
 @dataclass(frozen=True)

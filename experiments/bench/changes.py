@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Literal
 
 from experiments.bench.definitions import Budget, Change
-from vdgs.settings.method import CompensationConfig, MergeConfig, MethodConfig, PartitionStrategy
+from vdgs.config.method import CompensationConfig, MergeConfig, MethodConfig, PartitionStrategy
 
 #: So many cameras has each block of the factorial: every camera joins its best block, and each block is topped up to
 #: these. With as few as one block's share (160) the cameras of the least seen places join none: the dense ones show

@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.ranges import MANY, Range
-from vdgs.settings.requests import BINS
-from vdgs.verbs.shared import open_console, parse
+from vdgs.cli.common import open_console, parse
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.commands import BINS
+from vdgs.config.ranges import MANY, Range
 
 TableName = Literal[
     "table1", "table2", "table3", "table3-each", "table4", "factorial", "coarse-compensation", "more-anchors",

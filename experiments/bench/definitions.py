@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from vdgs.settings.method import MethodConfig
-from vdgs.settings.presets import PRESETS, PresetName
+from vdgs.config.method import MethodConfig
+from vdgs.config.presets import PRESETS, PresetName
 
 #: Stages of the run of a method, by the names that `worker.STAGES` knows.
 COARSE_ONLY = ("coarse", "evaluate")

@@ -12,9 +12,9 @@ from experiments.baselines.gs3d.run import gaussians_folder, run_gaussians
 from experiments.baselines.gs3d.schedule import scheduled
 from experiments.baselines.gs3d.training import GaussiansConfig
 from vdgs.captures.capture import Capture
-from vdgs.runs.folder import RunFolder
-from vdgs.settings.method import MethodConfig
-from vdgs.settings.plain import to_dict
+from vdgs.config.method import MethodConfig
+from vdgs.config.serialization import to_dict
+from vdgs.runs.run_folder import RunFolder
 
 
 def gaussians_config(method: MethodConfig) -> GaussiansConfig:

@@ -15,7 +15,7 @@ from experiments.bench.measure import group_names
 from experiments.bench.plan import Plan
 from experiments.bench.results import Result
 from experiments.bench.statistics import Summary, summarise
-from vdgs.figures.style import ACCENT, DPI, FAINT, INK, plain, titles
+from vdgs.plots.style import ACCENT, DPI, FAINT, INK, plain, titles
 
 #: Colours and markers of the other methods, told apart without colour too.
 COLOURS = ("#1f6f8b", "#8ab17d", "#e0a030", "#7b5ea7", "#22262b", "#2a9d8f", "#b5838d", "#6c757d")

@@ -11,12 +11,12 @@ from typing import Any
 from experiments.bench.definitions import Budget, Scene
 from experiments.bench.scenes import LAPTOP_BUDGET, SCENES
 from vdgs.captures.capture import Capture
-from vdgs.captures.facts import fingerprint
+from vdgs.captures.capture_metadata import fingerprint
 from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.method import MethodConfig, with_iterations
+from vdgs.config.presets import PRESETS
 from vdgs.errors import VdgsError
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.method import MethodConfig, with_iterations
-from vdgs.settings.presets import PRESETS
 
 #: A block is topped up to this share of the training photographs, within these limits (choice): of a few dozen, a
 #: hundred would be all.

@@ -15,7 +15,7 @@ from typing import Any
 from experiments.bench.plan import Plan
 from experiments.bench.results import Result
 from vdgs.errors import VdgsError
-from vdgs.storage.files import read_json
+from vdgs.system.atomic_files import read_json
 
 
 def read_known(files: Iterable[Path]) -> dict[str, Result]:

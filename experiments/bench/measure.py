@@ -17,14 +17,14 @@ from jaxtyping import UInt8
 
 from experiments.bench.seen import Seen
 from experiments.bench.worker import RECORD
-from vdgs.captures.images import ImageCache
+from vdgs.captures.image_cache import ImageCache
 from vdgs.errors import VdgsError
 from vdgs.evaluation import metrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
-from vdgs.evaluation.colour import correct_colours
-from vdgs.evaluation.of_run import EVALUATION_IMAGES_BYTES
-from vdgs.evaluation.saving import file_stems
-from vdgs.storage.files import jsonable, read_json, write_json
+from vdgs.evaluation.color_correction import correct_colours
+from vdgs.evaluation.evaluate_run import EVALUATION_IMAGES_BYTES
+from vdgs.evaluation.image_io import file_stems
+from vdgs.system.atomic_files import jsonable, read_json, write_json
 
 #: In a run folder: its figures by visibility, and the V and the key of the run that they hold for.
 GROUPS_FILE = "by_visibility.json"

@@ -44,7 +44,7 @@ from experiments.bench.changes import (
     without_blocking_as_long,
 )
 from experiments.bench.definitions import COARSE_ONLY, EXPLICIT, Change, Method
-from vdgs.settings.method import CompensationConfig
+from vdgs.config.method import CompensationConfig
 
 LAMBDA_VIS = (0.0, 0.5, 1.0, 1.3)
 T_LOW = (0.05, 0.15, 0.20, 0.30)

@@ -7,7 +7,7 @@ from datetime import date
 from pathlib import Path
 
 from vdgs import __version__
-from vdgs.executors.fitness import instructions
+from vdgs.distributed.node_check import instructions
 from vdgs.runs.config_file import commit
 
 _PROCESSORS = Path("/proc/cpuinfo")

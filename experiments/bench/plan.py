@@ -15,12 +15,12 @@ from experiments.bench.folders import scenes_of
 from experiments.bench.methods import METHODS
 from experiments.bench.renders import folder_of, foreign_method, identity
 from experiments.bench.tables import TABLES
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.method import MethodConfig
+from vdgs.config.serialization import to_dict
+from vdgs.config.validation_rules import validate
 from vdgs.errors import VdgsError
-from vdgs.runs.keys import counted
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.checks import validate
-from vdgs.settings.method import MethodConfig
-from vdgs.settings.plain import to_dict
+from vdgs.runs.stage_keys import counted
 
 
 @dataclass(frozen=True)

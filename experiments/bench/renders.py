@@ -24,12 +24,12 @@ from torch import Tensor
 from experiments.bench.definitions import RENDERS, Method
 from vdgs.captures.capture import Capture, View
 from vdgs.errors import VdgsError
-from vdgs.evaluation.evaluate import evaluate
+from vdgs.evaluation.evaluate_model import evaluate
+from vdgs.evaluation.evaluate_run import cached_photographs
+from vdgs.evaluation.image_io import file_stems
 from vdgs.evaluation.lpips import load_lpips
-from vdgs.evaluation.measured_model import MeasuredModel
-from vdgs.evaluation.of_run import cached_photographs
-from vdgs.evaluation.saving import file_stems
-from vdgs.storage.tensors import size_and_checksum
+from vdgs.evaluation.renderable_model import MeasuredModel
+from vdgs.system.tensors import size_and_checksum
 
 #: What a row may be called: it also names a folder, and stands in tables of three languages and in a figure.
 NAMES = re.compile(r"[A-Za-z0-9][A-Za-z0-9 .+_()-]*")

@@ -12,11 +12,11 @@ from experiments.bench.definitions import EXPLICIT
 from experiments.bench.measure import FRUSTA_FILE, GROUPS_FILE, evaluated
 from experiments.bench.plan import Plan, PlannedRun
 from experiments.bench.worker import RECORD
+from vdgs.distributed.executor import Outcome
 from vdgs.errors import VdgsError
-from vdgs.executors.executor import Outcome
-from vdgs.runs.folder import RunFolder
+from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.status import Status
-from vdgs.storage.files import read_json
+from vdgs.system.atomic_files import read_json
 
 #: What evaluations report, raw and after colour correction.
 QUALITY = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01", "psnr_cc", "ssim_cc", "lpips_vgg_cc", "lpips_vgg_01_cc")

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from experiments.bench.definitions import Budget, Scene
-from vdgs.settings.method import MethodConfig
+from vdgs.config.method import MethodConfig
 
 #: What the paper gives every scene: 100 000 iterations, then 50 000 for each of eight blocks.
 PAPER_BUDGET = Budget(100_000, 8, 50_000)

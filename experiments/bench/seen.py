@@ -12,15 +12,15 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, View
-from vdgs.captures.facts import fingerprint
+from vdgs.captures.capture_metadata import fingerprint
+from vdgs.captures.ground_truth import Truth, has_truth, load_truth
 from vdgs.captures.loading import load_capture
-from vdgs.evaluation.of_run import visibility_map
-from vdgs.model.visibility import visibility_of
-from vdgs.runs.opening import open_run
-from vdgs.settings.capture import CaptureOptions
-from vdgs.synth.truth import Truth, has_truth, load_truth
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.evaluation.evaluate_run import visibility_map
+from vdgs.geometry.camera import Camera
+from vdgs.runs.open_run import open_run
+from vdgs.visibility.visibility_counts import visibility_of
 
 #: `truth`: training cameras that truly see the surface. `frusta`: whose frustum holds it, hidden or not, as the paper
 #: counts. `model`: whose frustum holds the place that a model draws.

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.method import MethodConfig
+from vdgs.config.serialization import from_dict
 from vdgs.errors import Stopped, VdgsError
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.method import MethodConfig
-from vdgs.settings.plain import from_dict
-from vdgs.storage.files import read_json, write_json
+from vdgs.system.atomic_files import read_json, write_json
 
 if TYPE_CHECKING:
     from vdgs.runs.run_context import RunContext
@@ -67,8 +67,8 @@ class _Working:
 
 
 def _coarse(at: _Working) -> None:
-    from vdgs.settings.watching import WatchOptions
-    from vdgs.stages.coarse import train_coarse
+    from vdgs.config.checkpointing import WatchOptions
+    from vdgs.pipeline.train_coarse import train_coarse
 
     if at.job.coarse_from is not None:
         take_coarse(at.job.coarse_from, at.job.output)
@@ -76,28 +76,28 @@ def _coarse(at: _Working) -> None:
 
 
 def _partition(at: _Working) -> None:
-    from vdgs.stages.partition import partition_run
-    from vdgs.stages.visibility import measure_visibility
+    from vdgs.pipeline.count_visibility import measure_visibility
+    from vdgs.pipeline.partition_stage import partition_run
 
     measure_visibility(at.context, at.console)
     partition_run(at.context, at.console)
 
 
 def _blocks(at: _Working) -> None:
-    from vdgs.settings.watching import WatchOptions
-    from vdgs.stages.train import train_blocks
+    from vdgs.config.checkpointing import WatchOptions
+    from vdgs.pipeline.train_blocks import train_blocks
 
     train_blocks(at.context, WatchOptions(), at.job.block_jobs, at.console)
 
 
 def _merge(at: _Working) -> None:
-    from vdgs.stages.merge import merge_run
+    from vdgs.pipeline.merge_blocks import merge_run
 
     merge_run(at.context, False, at.console)
 
 
 def _evaluate(at: _Working) -> None:
-    from vdgs.stages.evaluate import Measuring, evaluate_stage
+    from vdgs.pipeline.evaluate_stage import Measuring, evaluate_stage
 
     evaluate_stage(
         at.context,
@@ -133,7 +133,7 @@ def take_coarse(source: Path, target: Path) -> None:
     Raises VdgsError if the other run has none. The keys of both are the same because the settings are; were they not,
     the coarse stage would be trained again.
     """
-    from vdgs.runs.stereo import FILE
+    from vdgs.pipeline.dense_points import FILE
 
     if (target / "coarse" / "model.safetensors").exists():
         return
@@ -179,9 +179,9 @@ def work(job: Job) -> None:
 def _opened(job: Job) -> Iterator[RunContext]:
     """The run, driven, with its capture. Where renders are measured the folder is no run: nothing is trained there."""
     from vdgs.captures.loading import load_capture
-    from vdgs.runs.beginning import driven_run
-    from vdgs.runs.folder import RunFolder
+    from vdgs.runs.create_or_resume import driven_run
     from vdgs.runs.run_context import RunContext
+    from vdgs.runs.run_folder import RunFolder
 
     options: CaptureOptions = from_dict(CaptureOptions, job.options, "capture")
     if job.renders is not None:
@@ -209,8 +209,8 @@ def main(arguments: list[str]) -> int:
     from vdgs.kernels import configure_threads
 
     configure_threads()  # before anything imports torch
-    from vdgs.executors.parent import stop_when_parent_dies
-    from vdgs.watching.interrupts import stop_requests
+    from vdgs.distributed.parent import stop_when_parent_dies
+    from vdgs.system.stop_signals import stop_requests
 
     stop_when_parent_dies()
     try:

@@ -13,10 +13,10 @@ import torch
 
 from experiments.microbench.machine import describe
 from experiments.microbench.stopwatch import medians_ms
-from vdgs.kernels.native import adam as native
-from vdgs.kernels.native import module
-from vdgs.kernels.reference import adam as reference
-from vdgs.kernels.types import AdamState
+from vdgs.kernels.cpu import adam as native
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.kernel_types import AdamState
+from vdgs.kernels.torch_ref import adam as reference
 
 #: The trained arrays of an anchor.
 WIDTHS = {"log_scales": 6, "offsets": 30, "features": 32}
@@ -47,10 +47,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--anchors", type=int, default=100_000)
     parser.add_argument("--visible", type=int, default=20_000)
-    parser.add_argument("--threads", type=int, default=module.threads())
+    parser.add_argument("--threads", type=int, default=extension.threads())
     parser.add_argument("--rounds", type=int, default=15)
     arguments = parser.parse_args()
-    module.set_threads(arguments.threads)
+    extension.set_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
     print(f"{arguments.visible} of {arguments.anchors} rows, median ms of {arguments.rounds}")

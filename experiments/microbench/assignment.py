@@ -27,15 +27,15 @@ import torch
 
 from experiments.microbench.machine import describe
 from experiments.microbench.stopwatch import medians_ms
-from vdgs.cameras import Camera
-from vdgs.kernels import native as kernels
-from vdgs.kernels.native.module import set_threads, threads
+from vdgs.config.method import AssignmentConfig
+from vdgs.geometry.camera import Camera
+from vdgs.kernels import cpu as kernels
+from vdgs.kernels.cpu.extension import set_threads, threads
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.partition.assignment.scores import score_matrix
+from vdgs.partition.assignment.score_matrix import score_matrix
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.settings.method import AssignmentConfig
 
 MODES = get_args(get_type_hints(AssignmentConfig)["mode"])
 SIZE, ALTITUDE = (1200, 800), 20.0
@@ -103,7 +103,7 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     print(describe())
     if arguments.run:
-        from vdgs.runs.opening import open_run
+        from vdgs.runs.open_run import open_run
 
         run = open_run(arguments.run)
         model, cameras = run.model, [view.camera for view in run.capture.train_views]

@@ -13,9 +13,9 @@ import torch
 
 from experiments.microbench.machine import describe
 from experiments.microbench.stopwatch import medians_ms
-from vdgs.kernels.native import cells as native
-from vdgs.kernels.native import module
-from vdgs.kernels.reference import cells as reference
+from vdgs.kernels.cpu import cells as native
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.torch_ref import cells as reference
 
 CELL_M = 4.0
 FEATURES = 32
@@ -42,10 +42,10 @@ def main() -> None:
     """Print one line for each operation."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=int, default=1_000_000)
-    parser.add_argument("--threads", type=int, default=module.threads())
+    parser.add_argument("--threads", type=int, default=extension.threads())
     parser.add_argument("--rounds", type=int, default=7)
     arguments = parser.parse_args()
-    module.set_threads(arguments.threads)
+    extension.set_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
     print(f"{arguments.points} points, median ms of {arguments.rounds}")

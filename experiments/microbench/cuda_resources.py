@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from vdgs.kernels.cuda.launching import OPTIONS, read_header, read_source
+from vdgs.kernels.cuda.launch import OPTIONS, read_header, read_source
 from vdgs.kernels.cuda.nvrtc import Nvrtc, Target, nvrtc
 
 

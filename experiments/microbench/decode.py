@@ -17,13 +17,13 @@ from unittest import mock
 import numpy as np
 import torch
 
-from vdgs.cameras import Camera
-from vdgs.kernels.native import module
-from vdgs.kernels.native.cull import cull as native_cull
-from vdgs.kernels.native.decode import decode as native_decode
-from vdgs.kernels.reference.cull import cull as twin_cull
-from vdgs.kernels.reference.decode import decode as twin_decode
-from vdgs.kernels.types import AnchorSplats, DecoderWeights
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.cpu.cull import cull as native_cull
+from vdgs.kernels.cpu.decode import decode as native_decode
+from vdgs.kernels.kernel_types import AnchorSplats, DecoderWeights
+from vdgs.kernels.torch_ref.cull import cull as twin_cull
+from vdgs.kernels.torch_ref.decode import decode as twin_decode
 
 
 def overhead_camera() -> Camera:
@@ -91,9 +91,9 @@ def report_decode(v: int, k: int, repeats: int, isas: list[str]) -> None:
 
 def use(isa: str, threads: int) -> None:
     """Run the kernels of one instruction set on so many threads."""
-    chosen = module.load(isa)
+    chosen = extension.load(isa)
     chosen.set_threads(threads)
-    mock.patch.object(module, "native", return_value=chosen).start()
+    mock.patch.object(extension, "native", return_value=chosen).start()
 
 
 def report_cull(n: int, isas: list[str]) -> None:
@@ -123,7 +123,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--anchors", type=int, nargs="*", default=[20_000, 100_000])
     parser.add_argument("--offsets", type=int, default=10)
-    parser.add_argument("--isa", nargs="*", default=list(module.supported()))
+    parser.add_argument("--isa", nargs="*", default=list(extension.supported()))
     parser.add_argument("--cull", type=int, default=1_000_000)
     parser.add_argument("--repeats", type=int, default=15)
     options = parser.parse_args()

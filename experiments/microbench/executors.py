@@ -18,8 +18,8 @@ import time
 from pathlib import Path
 
 from experiments.microbench.machine import describe
-from vdgs.executors.on_ray import connected
-from vdgs.runs.folder import RunFolder
+from vdgs.distributed.ray_executor import connected
+from vdgs.runs.run_folder import RunFolder
 
 ENGINES = ("local", "ray")
 
@@ -32,7 +32,7 @@ def copy(run: Path, to: Path) -> Path:
 
 def train(run: Path, engine: str, jobs: int) -> float:
     """Seconds that the blocks of a run take, from the command to its end."""
-    command = [sys.executable, "-m", "vdgs.cli", "train", str(run), "--jobs", str(jobs), "--executor", engine]
+    command = [sys.executable, "-m", "vdgs.cli.main", "train", str(run), "--jobs", str(jobs), "--executor", engine]
     began = time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     return time.perf_counter() - began

@@ -27,18 +27,18 @@ import torch
 from PIL import Image
 from rich.console import Console
 
-from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
-from vdgs.export import exporting
+from vdgs.config.commands import ExportRequest
+from vdgs.export import export_run
+from vdgs.geometry.camera import Camera
 from vdgs.kernels import choose, set_threads, threads
-from vdgs.kernels.types import FEATURE_SIZE
+from vdgs.kernels.kernel_types import FEATURE_SIZE
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import TrainedRun
+from vdgs.runs.open_run import TrainedRun
+from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.status import Status
-from vdgs.settings.requests import ExportRequest
 
 OFFSETS, ANCHORS_PER_VIEW, SEEN_BY, SPACING = 10, 1600, 10, 1.0
 WIDTH, HEIGHT = 400, 300
@@ -112,11 +112,11 @@ def one(anchors: int, folder: Path, names: list[str], measure: bool) -> None:
         folder=RunFolder(folder / "run"), model=model, model_path=file, name="coarse", status=Status(), key="key",
         caution="", capture=capture,
     )  # fmt: skip
-    exporting.open_run = lambda *_: run
+    export_run.open_run = lambda *_: run
     set_threads(threads())
     began, before = time.monotonic(), time.process_time()
     asked = ExportRequest(run=folder / "run", to=tuple(folder / name for name in names), measure=measure, device="cpu")
-    record = exporting.export_run(asked, Console(quiet=True))
+    record = export_run.export_run(asked, Console(quiet=True))
     print(json.dumps({
         "anchors": anchors, "gaussians": record["gaussians"], "views": len(cameras),
         "seconds": time.monotonic() - began, "processor": time.process_time() - before,

@@ -30,11 +30,11 @@ import torch
 from experiments.microbench import gpu_parity, step
 from experiments.microbench.cuda_resources import resources_of
 from experiments.microbench.machine import describe
-from vdgs.cli import main as vdgs
-from vdgs.kernels.composed import rasteriser
+from vdgs.cli.main import main as vdgs
 from vdgs.kernels.cuda.driver import CudaUnavailable, cuda_driver
 from vdgs.kernels.cuda.nvrtc import Target, nvrtc
-from vdgs.kernels.gsplat.rasterise import GsplatUnavailable
+from vdgs.kernels.gpu import rasterizer
+from vdgs.kernels.gsplat.rasterize import GsplatUnavailable
 
 #: Sources and the headers that they include.
 SOURCES = {
@@ -183,7 +183,7 @@ def command(*arguments: str) -> None:
 
 def time_steps(machine: Machine, sizes: Sizes) -> None:
     for name in rasterisers():
-        os.environ[rasteriser.VARIABLE] = name
+        os.environ[rasterizer.VARIABLE] = name
         for visible, width, height in sizes.steps:
             state, camera, target = step.prepare(visible, width, height, device=machine.device)
             times: dict[str, list[float]] = {phase: [] for phase in step.PHASES}
@@ -195,13 +195,13 @@ def time_steps(machine: Machine, sizes: Sizes) -> None:
                 f"{name:7} {width}x{height}, {seen} visible anchors, {splats} splats: {sum(medians.values()):.2f} ms "
                 f"({parts})", flush=True,
             )  # fmt: skip
-    os.environ.pop(rasteriser.VARIABLE, None)
+    os.environ.pop(rasterizer.VARIABLE, None)
 
 
 def rasterisers() -> list[str]:
     """Those that can be used."""
     try:
-        rasteriser.chosen("gsplat")
+        rasterizer.chosen("gsplat")
     except GsplatUnavailable as error:
         print(f"without gsplat: {error}")
         return ["cuda"]

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from experiments.microbench.step import scene
 from vdgs.kernels import cuda, gsplat
-from vdgs.kernels.gsplat.rasterise import GsplatUnavailable
+from vdgs.kernels.gsplat.rasterize import GsplatUnavailable
+from vdgs.kernels.kernel_types import AdamState, AnchorSplats, DecoderWeights, SplatGradients, Splats, Statistics
 from vdgs.kernels.operations import Operations
-from vdgs.kernels.reference.ellipsoids import logarithms
-from vdgs.kernels.types import AdamState, AnchorSplats, DecoderWeights, SplatGradients, Splats, Statistics
+from vdgs.kernels.torch_ref.ellipsoids import logarithms
 from vdgs.model.decoder import Decoder
 
 #: Largest difference of a value, of a gradient and share of whole numbers that differ.
@@ -294,12 +294,12 @@ CASES: dict[str, Callable[[Operations, Place], Results]] = {
 
 def differences(device: torch.device, anchors: int, width: int, height: int) -> Iterator[Difference]:
     """All results of all operations; those of the rasterisers by each of them."""
-    from vdgs.kernels import composed, native
+    from vdgs.kernels import cpu, gpu
 
     here, there = Place(torch.device("cpu"), anchors, width, height), Place(device, anchors, width, height)
     for name, case in CASES.items():
-        expected = case(native, here)
-        sets: dict[str, Any] = {"cuda": cuda, "gsplat": gsplat} if name.startswith("rasterise") else {"": composed}
+        expected = case(cpu, here)
+        sets: dict[str, Any] = {"cuda": cuda, "gsplat": gsplat} if name.startswith("rasterise") else {"": gpu}
         for by, kernels in sets.items():
             with suppress(GsplatUnavailable):
                 yield from compared(name, by, case(kernels, there), expected)

@@ -13,9 +13,9 @@ import torch
 
 from experiments.microbench.machine import describe
 from experiments.microbench.stopwatch import medians_ms
-from vdgs.kernels.native import loss as native
-from vdgs.kernels.native import module
-from vdgs.kernels.reference import loss as reference
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.cpu import loss as native
+from vdgs.kernels.torch_ref import loss as reference
 
 SIZES = [(400, 300), (800, 600), (1600, 1200)]
 
@@ -36,10 +36,10 @@ def step(implementation: ModuleType, width: int, height: int, masked: bool) -> C
 def main() -> None:
     """Print one line for each size."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--threads", type=int, default=module.threads())
+    parser.add_argument("--threads", type=int, default=extension.threads())
     parser.add_argument("--rounds", type=int, default=5)
     arguments = parser.parse_args()
-    module.set_threads(arguments.threads)
+    extension.set_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
     print(f"loss + gradient, median ms of {arguments.rounds}")

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from vdgs.kernels.cores import cores
-from vdgs.kernels.native.module import isa, supported
+from vdgs.kernels.cpu.extension import isa, supported
+from vdgs.kernels.thread_count import cores
 
 
 def describe() -> str:

@@ -16,7 +16,7 @@ import shapely
 import torch
 from PIL import Image
 
-from vdgs.cameras import Camera
+from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder

@@ -20,11 +20,11 @@ import torch
 
 from experiments.microbench.machine import describe
 from experiments.microbench.visibility import flight
-from vdgs.kernels.native import module
-from vdgs.model.visibility import visibility_of
+from vdgs.config.method import PartitionConfig
+from vdgs.kernels.cpu import extension
 from vdgs.partition.blocks import Blocks
-from vdgs.partition.cut import cut_scene
-from vdgs.settings.method import PartitionConfig
+from vdgs.partition.partition_scene import cut_scene
+from vdgs.visibility.visibility_counts import visibility_of
 
 EXTENT_M = 2000.0
 #: Places whose owner is compared with brute force.
@@ -65,9 +65,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--anchors", type=int, default=1_000_000)
     parser.add_argument("--cameras", type=int, default=1_000)
-    parser.add_argument("--threads", type=int, default=module.threads())
+    parser.add_argument("--threads", type=int, default=extension.threads())
     arguments = parser.parse_args()
-    module.set_threads(arguments.threads)
+    extension.set_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
     print(f"{arguments.anchors} anchors, {arguments.cameras} cameras")

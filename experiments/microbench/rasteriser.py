@@ -31,9 +31,9 @@ import numpy as np
 import torch
 
 from experiments.microbench.machine import describe
-from vdgs.kernels.native.module import load, supported
-from vdgs.kernels.native.rasterise import rasterise
-from vdgs.kernels.types import Splats
+from vdgs.kernels.cpu.extension import load, supported
+from vdgs.kernels.cpu.rasterize import rasterise
+from vdgs.kernels.kernel_types import Splats
 
 COUNTS = (20_000, 200_000, 1_000_000)
 SIZES = ((400, 300), (800, 600), (1600, 1200))
@@ -146,8 +146,8 @@ class Prototype:
 
 def scenes_of_run(run: Path, views: int) -> list[tuple[str, Scene]]:
     """What the first test views of a trained run draw."""
-    from vdgs.model.render import decode_rows, visible_rows
-    from vdgs.runs.opening import open_run
+    from vdgs.model.renderer import decode_rows, visible_rows
+    from vdgs.runs.open_run import open_run
 
     opened, scenes = open_run(run), []
     for view in opened.capture.test_views[:views]:

@@ -38,9 +38,9 @@ import torch
 
 from experiments.microbench import made_up
 from experiments.microbench.machine import describe
-from vdgs.memory.process import forget_peak, peak_memory_bytes
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.partition.blocks import Blocks
+from vdgs.system.memory.process_memory import forget_peak, peak_memory_bytes
 
 #: Blocks of a cut, of an assignment and of a merge; cameras that an assignment scores.
 BLOCKS, SCORED = 16, 30
@@ -76,7 +76,7 @@ class Measured:
 
 
 def _visibility(case: Case, folder: Path) -> Work:
-    from vdgs.model.visibility import visibility_of
+    from vdgs.visibility.visibility_counts import visibility_of
 
     extent = made_up.extent_of(case.photographs)
     positions, cameras = torch.from_numpy(made_up.places(case.anchors, extent)), made_up.flight(case.photographs)
@@ -85,15 +85,15 @@ def _visibility(case: Case, folder: Path) -> Work:
 
 def _seen_places(case: Case) -> tuple[np.ndarray, np.ndarray]:
     """Anchors and how many photographs hold each."""
-    from vdgs.model.visibility import visibility_of
+    from vdgs.visibility.visibility_counts import visibility_of
 
     positions = made_up.places(case.anchors, made_up.extent_of(case.photographs))
     return positions, visibility_of(torch.from_numpy(positions), made_up.flight(case.photographs)).numpy()
 
 
 def _cut(case: Case, folder: Path) -> Work:
-    from vdgs.partition.cut import cut_scene
-    from vdgs.settings.method import PartitionConfig
+    from vdgs.config.method import PartitionConfig
+    from vdgs.partition.partition_scene import cut_scene
 
     positions, views = _seen_places(case)
     return lambda: cut_scene(positions, views, PartitionConfig(blocks=BLOCKS), seed=0)
@@ -108,8 +108,8 @@ def _owners(case: Case, folder: Path) -> Work:
 
 def _cut_site(case: Case) -> tuple[Blocks, np.ndarray, np.ndarray]:
     """Blocks as the method cuts them, of some of the anchors; where all anchors are, and their V."""
-    from vdgs.partition.cut import cut_scene
-    from vdgs.settings.method import PartitionConfig
+    from vdgs.config.method import PartitionConfig
+    from vdgs.partition.partition_scene import cut_scene
 
     positions, views = _seen_places(case)
     some = slice(None, None, max(1, case.anchors // 200_000))
@@ -117,8 +117,8 @@ def _cut_site(case: Case) -> tuple[Blocks, np.ndarray, np.ndarray]:
 
 
 def _rows(case: Case, folder: Path) -> Work:
-    from vdgs.partition.assignment.assign import Assignment
-    from vdgs.partition.assignment.tables import assignment_rows
+    from vdgs.partition.assignment.assign_cameras import Assignment
+    from vdgs.partition.assignment.assignment_tables import assignment_rows
 
     blocks, positions, views = _cut_site(case)
     why = np.ones((case.photographs, len(blocks)), np.int8)
@@ -126,17 +126,17 @@ def _rows(case: Case, folder: Path) -> Work:
 
 
 def _figures(case: Case, folder: Path) -> Work:
-    from vdgs.partition.figures import maps
+    from vdgs.plots.partition import block_maps
 
     blocks, positions, views = _cut_site(case)
     cameras, used = made_up.flight(case.photographs), np.ones((case.photographs, len(blocks)), bool)
 
     def draw() -> None:
         names = ("x (m)", "y (m)")
-        maps.draw_visibility_map(folder / "map.png", positions, views, cameras, names)
-        maps.draw_blocks(folder / "blocks.png", positions, views, cameras, used, [("cut", blocks)], names)
-        maps.draw_block_facts(folder / "facts.png", positions, views, blocks, used, "m", blocks)
-        maps.draw_scores(folder / "scores.png", np.random.default_rng(0).random(used.shape), used)
+        block_maps.draw_visibility_map(folder / "map.png", positions, views, cameras, names)
+        block_maps.draw_blocks(folder / "blocks.png", positions, views, cameras, used, [("cut", blocks)], names)
+        block_maps.draw_block_facts(folder / "facts.png", positions, views, blocks, used, "m", blocks)
+        block_maps.draw_scores(folder / "scores.png", np.random.default_rng(0).random(used.shape), used)
 
     return draw
 
@@ -147,8 +147,8 @@ def _site_model(case: Case) -> AnchorModel:
 
 
 def _assignment(case: Case, folder: Path) -> Work:
-    from vdgs.partition.assignment.scores import score_matrix
-    from vdgs.settings.method import AssignmentConfig
+    from vdgs.config.method import AssignmentConfig
+    from vdgs.partition.assignment.score_matrix import score_matrix
 
     model, blocks = _site_model(case), made_up.slices(made_up.extent_of(case.photographs), BLOCKS)
     cameras = made_up.flight(case.photographs)[:: max(1, case.photographs // SCORED)][:SCORED]
@@ -156,7 +156,7 @@ def _assignment(case: Case, folder: Path) -> Work:
 
 
 def _start(case: Case, folder: Path) -> Work:
-    from vdgs.model.sizes import largest_log_scales
+    from vdgs.model.scale_bounds import largest_log_scales
 
     positions = torch.from_numpy(made_up.places(case.anchors, made_up.extent_of(case.photographs)))
     cameras = made_up.flight(case.photographs)
@@ -174,9 +174,9 @@ def _load(case: Case, folder: Path) -> Work:
 
 
 def _merge(case: Case, folder: Path) -> Work:
+    from vdgs.config.method import MergeConfig
     from vdgs.partition.blocks import places_of
     from vdgs.partition.merging import merge
-    from vdgs.settings.method import MergeConfig
 
     blocks, cameras = made_up.slices(made_up.extent_of(case.photographs), BLOCKS), made_up.flight(case.photographs)
     files = [folder / f"block_{index}.safetensors" for index in range(len(blocks))]
@@ -218,9 +218,9 @@ def _open(case: Case, folder: Path) -> Work:
 
 
 def _facts(case: Case, folder: Path) -> Work:
-    from vdgs.captures.facts import capture_facts
+    from vdgs.captures.capture_metadata import capture_facts
     from vdgs.captures.loading import load_capture
-    from vdgs.inspection.soundness import refuse_unsound
+    from vdgs.captures.validation import refuse_unsound
 
     capture = load_capture(_capture(case, folder))
     return lambda: (capture_facts(capture), refuse_unsound(capture))
@@ -228,10 +228,10 @@ def _facts(case: Case, folder: Path) -> Work:
 
 def _command(case: Case, folder: Path, *words: str) -> Work:
     """A verb of the command line and its arguments, in this process."""
-    from vdgs import verbs
+    from vdgs import cli
 
     path = _capture(case, folder)
-    verb = getattr(verbs, words[0])
+    verb = getattr(cli, words[0])
     return lambda: verb([word.format(capture=path, folder=folder) for word in words[1:]])
 
 
@@ -351,16 +351,16 @@ def _exponent(before: Measured | None, each: Measured) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    verbs = parser.add_subparsers(dest="verb", required=True)
-    measuring = verbs.add_parser("measure", help="measure what is not in RESULTS yet")
+    cli = parser.add_subparsers(dest="verb", required=True)
+    measuring = cli.add_parser("measure", help="measure what is not in RESULTS yet")
     measuring.add_argument("results", type=Path)
     measuring.add_argument("--stages", nargs="+", choices=STAGES, default=list(STAGES))
     measuring.add_argument("--anchors", nargs="+", type=int, default=list(ANCHORS))
     measuring.add_argument("--photographs", nargs="+", type=int, default=list(PHOTOGRAPHS))
     measuring.add_argument("--flight", type=int, default=300, help="photographs over the anchors")
-    showing = verbs.add_parser("table", help="print RESULTS as a table")
+    showing = cli.add_parser("table", help="print RESULTS as a table")
     showing.add_argument("results", type=Path)
-    one = verbs.add_parser("one", help="measure one case here and print it")
+    one = cli.add_parser("one", help="measure one case here and print it")
     one.add_argument("stage", choices=STAGES)
     one.add_argument("anchors", type=int)
     one.add_argument("photographs", type=int)

@@ -30,18 +30,18 @@ import numpy as np
 import torch
 
 from experiments.microbench.machine import describe
-from vdgs.cameras import Camera
+from vdgs.config.method import TrainConfig
+from vdgs.geometry.camera import Camera
 from vdgs.kernels import choose, set_threads
-from vdgs.kernels.types import OrderedSplats
-from vdgs.memory.process import forget_peak, peak_memory_bytes
+from vdgs.kernels.kernel_types import OrderedSplats
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.render import decode_rows_to_train, visible_rows
-from vdgs.settings.method import TrainConfig
-from vdgs.storage.checkpoints import save_state
+from vdgs.model.renderer import decode_rows_to_train, visible_rows
+from vdgs.system.checkpoints import save_state
+from vdgs.system.memory.process_memory import forget_peak, peak_memory_bytes
 from vdgs.training import Stage, Surroundings, start_state, to_saved
-from vdgs.training.optimiser import rates_at
-from vdgs.training.step import draw_view, move_anchors
+from vdgs.training.optimizer import rates_at
+from vdgs.training.training_step import draw_view, move_anchors
 
 PHASES = ("cull", "decode", "around", "rasterise", "loss", "solid", "backward", "move", "statistics")
 

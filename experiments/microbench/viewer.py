@@ -29,13 +29,13 @@ import psutil
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
 from support.viewer import Guest
-from vdgs.cameras import Camera
 from vdgs.captures.overview import FOV_DEG
-from vdgs.films.paths import look_at
-from vdgs.runs.opening import open_run
+from vdgs.geometry.camera import Camera
+from vdgs.rendering.camera_paths import look_at
+from vdgs.runs.open_run import open_run
 from vdgs.viewer.navigation import whole_scene
 
-SERVER = "import sys\nfrom vdgs.cli import main\nmain(sys.argv[1:])"
+SERVER = "import sys\nfrom vdgs.cli.main import main\nmain(sys.argv[1:])"
 #: How often a visitor's mouse moves, a second.
 MOVES = 30.0
 

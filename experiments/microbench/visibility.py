@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from experiments.microbench.machine import describe
-from vdgs.cameras import Camera
-from vdgs.kernels.native import module
-from vdgs.kernels.native import visibility as native
-from vdgs.kernels.reference import visibility as reference
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.cpu import visibility as native
+from vdgs.kernels.torch_ref import visibility as reference
 
 BRUTE_FORCE_CAMERAS = 10
 #: Name, side of the square in metres, tilt of the cameras in degrees.
@@ -53,9 +53,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--points", type=int, default=1_000_000)
     parser.add_argument("--cameras", type=int, default=1_000)
-    parser.add_argument("--threads", type=int, default=module.threads())
+    parser.add_argument("--threads", type=int, default=extension.threads())
     arguments = parser.parse_args()
-    module.set_threads(arguments.threads)
+    extension.set_threads(arguments.threads)
     torch.set_num_threads(arguments.threads)
     print(describe())
     print(f"{arguments.points} points x {arguments.cameras} cameras")

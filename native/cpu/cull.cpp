@@ -1,4 +1,4 @@
-// Which anchors a camera may see; the bound is explained in src/vdgs/kernels/reference/cull.py.
+// Which anchors a camera may see; the bound is explained in src/vdgs/kernels/torch_ref/cull.py.
 #include <vector>
 
 #include "bindings.h"

@@ -1,5 +1,5 @@
 // The mean of ellipsoids: that of the logarithms of their covariances, by the weight of each. Eight Gaussians are lanes.
-// What is computed, and why, is said in vdgs.kernels.reference.ellipsoids.
+// What is computed, and why, is said in vdgs.kernels.torch_ref.ellipsoids.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

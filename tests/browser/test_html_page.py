@@ -13,12 +13,12 @@ pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[v
 from support.commands import wait_until
 from support.gaussians import psnr
 from support.viewer import needs_browser, open_page
-from vdgs.cameras import Camera
 from vdgs.export.formats import registry
-from vdgs.export.formats.scene import Page, Scene
-from vdgs.films.paths import look_at
+from vdgs.export.formats.export_scene import Page, Scene
+from vdgs.geometry.camera import Camera
 from vdgs.kernels.spherical_harmonics import dc_of_colours
 from vdgs.model.gaussians import Gaussians, draw_gaussians
+from vdgs.rendering.camera_paths import look_at
 
 pytestmark = [pytest.mark.browser, needs_browser, pytest.mark.xdist_group("viewer")]
 

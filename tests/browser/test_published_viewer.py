@@ -24,7 +24,7 @@ from support.commands import wait_until
 from support.gaussians import overhead, picture, psnr, random_gaussians
 from support.viewer import needs_browser, open_page
 from vdgs.export.formats import registry
-from vdgs.export.formats.scene import Scene
+from vdgs.export.formats.export_scene import Scene
 
 pytestmark = [pytest.mark.browser, needs_browser]
 

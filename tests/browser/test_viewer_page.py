@@ -16,10 +16,10 @@ pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[v
 
 from support.commands import wait_until
 from support.viewer import expected, needs_browser, open_page, quiet, trained
-from vdgs.cameras import Camera
-from vdgs.runs.opening import open_run
-from vdgs.viewer.serving import serve
-from vdgs.viewer.visitor import NAMES, Visitor
+from vdgs.geometry.camera import Camera
+from vdgs.runs.open_run import open_run
+from vdgs.viewer.client_session import NAMES, Visitor
+from vdgs.viewer.server import serve
 
 pytestmark = [pytest.mark.browser, needs_browser, pytest.mark.xdist_group("viewer")]
 

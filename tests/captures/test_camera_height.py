@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.captures import TinyScene, data_folder, look_down, moved, tiny_scene
-from vdgs.cameras import Camera
+from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture, GroundFrame, View
-from vdgs.captures.heights import camera_height
 from vdgs.captures.loading import load_capture
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.method import TrainConfig
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.method import TrainConfig
+from vdgs.geometry.camera import Camera
 from vdgs.training import Stage
-from vdgs.training.loop import _volume_weight
+from vdgs.training.training_loop import _volume_weight
 
 
 def capture_of(scene: TinyScene) -> Capture:

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 from support.captures import TinyScene, data_folder, tiny_scene, write_colmap
 from vdgs.captures.formats.colmap import read_colmap
-from vdgs.captures.formats.source import CAMERA_MODELS
+from vdgs.captures.formats.source_capture import CAMERA_MODELS
 from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.settings.capture import CaptureOptions
 
 FUZZ = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

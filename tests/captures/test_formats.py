@@ -17,11 +17,11 @@ from support.captures import TinyScene, moved, tiny_scene, to_source, write_colm
 from support.dataset_layouts import DRB, OPENGL, halves, matrixcity_frames, write_matrixcity, write_mega_nerf
 from vdgs.captures.capture import Capture
 from vdgs.captures.formats.json_poses import intrinsics_of
-from vdgs.captures.formats.ply import read_point_cloud
-from vdgs.captures.formats.source import Intrinsics
+from vdgs.captures.formats.ply_reader import read_point_cloud
+from vdgs.captures.formats.source_capture import Intrinsics
 from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.settings.capture import CaptureOptions
 
 FUZZ = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

@@ -11,13 +11,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from support.captures import data_folder, moved, tiny_scene, to_source, write_colmap
-from vdgs.captures.alignment import fit_similarity, fit_similarity_robust, geometric_median
-from vdgs.captures.formats.source import Intrinsics, SourceCapture, SourceView
-from vdgs.captures.geodesy import ecef_from_geodetic, enu_from_geodetic, geodetic_from_ecef, geodetic_from_enu
-from vdgs.captures.ground import CAMERA_HEIGHT, find_ground_frame, rotation_to_z, transform_pose
+from vdgs.captures.formats.source_capture import Intrinsics, SourceCapture, SourceView
+from vdgs.captures.ground_estimation import CAMERA_HEIGHT, find_ground_frame, rotation_to_z, transform_pose
 from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.settings.capture import CaptureOptions
+from vdgs.geometry.geodesy import ecef_from_geodetic, enu_from_geodetic, geodetic_from_ecef, geodetic_from_enu
+from vdgs.geometry.similarity import fit_similarity, fit_similarity_robust, geometric_median
 
 ORIGIN = (46.8426, -91.994, 159.4)
 

@@ -11,11 +11,11 @@ import pytest
 import torch
 from PIL import Image
 
-from vdgs.cameras import Camera
 from vdgs.captures.capture import View
-from vdgs.captures.images import ImageCache, load_picture
-from vdgs.captures.photographs import decode_mask, decode_photograph, read_header
+from vdgs.captures.image_cache import ImageCache, load_picture
+from vdgs.captures.image_files import decode_mask, decode_photograph, read_header
 from vdgs.errors import CaptureError
+from vdgs.geometry.camera import Camera
 
 WIDTH, HEIGHT = 60, 41
 BYTES = WIDTH * HEIGHT * 3
@@ -95,7 +95,7 @@ def test_prefetched_pictures_are_ready_and_decoded_once(views, monkeypatch):
         decoded.append(threading.current_thread().name)
         return load_picture(view)
 
-    monkeypatch.setattr("vdgs.captures.images.load_picture", counting)
+    monkeypatch.setattr("vdgs.captures.image_cache.load_picture", counting)
     with ImageCache(views, 10**6) as cache:
         cache.prefetch([4, 5, 6, 4])
         for index in (4, 5, 6):

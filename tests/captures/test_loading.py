@@ -16,15 +16,15 @@ from PIL import Image
 
 from support.captures import TinyScene, data_folder, render_plane, tiny_scene, write_colmap, write_images
 from vdgs.captures import undistortion
-from vdgs.captures.checks import check_images
-from vdgs.captures.formats.source import Intrinsics, SourceView
-from vdgs.captures.images import load_picture
+from vdgs.captures.formats.source_capture import Intrinsics, SourceView
+from vdgs.captures.image_cache import load_picture
+from vdgs.captures.image_checks import check_images
+from vdgs.captures.image_files import decode_photograph
+from vdgs.captures.image_matching import fit_to_image, scaled
 from vdgs.captures.loading import load_capture
-from vdgs.captures.matching import fit_to_image, scaled
-from vdgs.captures.photographs import decode_photograph
 from vdgs.captures.undistortion import ImageFile, pinhole_for, sampling_map
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.settings.capture import CaptureOptions
 
 UP = CaptureOptions(up="z")
 
@@ -45,7 +45,7 @@ def folder(tmp_path, scene):
 
 
 def test_options_import_nothing_heavy():
-    code = "import sys, vdgs.settings.capture; print(*{'torch', 'numpy', 'cv2', 'pycolmap'} & set(sys.modules))"
+    code = "import sys, vdgs.config.capture_options; print(*{'torch', 'numpy', 'cv2', 'pycolmap'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
 

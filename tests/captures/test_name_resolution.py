@@ -16,11 +16,11 @@ from support.captures import tiny_scene, write_colmap
 from support.flights import write_photograph
 from vdgs.captures.georeference import match_gps, read_gps
 from vdgs.captures.loading import load_capture
-from vdgs.captures.names import Lookup, Names, listable, without_suffix
+from vdgs.captures.name_resolution import Lookup, Names, listable, without_suffix
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.settings.capture import CaptureOptions
-from vdgs.sfm.collection import collect
-from vdgs.sfm.positions import find_positions
+from vdgs.sfm.gps_priors import find_positions
+from vdgs.sfm.image_list import collect
 
 #: Two photographs of one name, as cards have them.
 CARD = ["100MEDIA/DJI_0001.JPG", "100MEDIA/DJI_0002.JPG", "101MEDIA/DJI_0001.JPG"]

@@ -14,15 +14,15 @@ from experiments.bench.plan import Choices
 from support.captures import tiny_scene, write_colmap
 from support.dataset_layouts import write_mega_nerf
 from vdgs.captures.loading import load_capture
-from vdgs.captures.outputs import refuse_among_inputs, refuse_in_a_capture
+from vdgs.captures.output_guard import refuse_among_inputs, refuse_in_a_capture
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.commands import MapRequest
+from vdgs.config.presets import PRESETS
 from vdgs.errors import VdgsError
-from vdgs.inspection.inspect import inspect_capture
-from vdgs.maps.mapping import map_run
-from vdgs.runs.beginning import begin_run
+from vdgs.rendering.ortho.render_ortho import map_run
+from vdgs.report.capture_report import inspect_capture
+from vdgs.runs.create_or_resume import begin_run
 from vdgs.runs.run_context import RunContext
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.presets import PRESETS
-from vdgs.settings.requests import MapRequest
 from vdgs.synth import SynthOptions, generate
 
 
@@ -146,6 +146,6 @@ def test_a_folder_that_cannot_be_read_is_no_capture(tmp_path: Path, monkeypatch:
     def refuse(path: Path) -> None:
         raise PermissionError(13, os.strerror(13), str(path))
 
-    monkeypatch.setattr("vdgs.captures.outputs.find_models", refuse)
+    monkeypatch.setattr("vdgs.captures.output_guard.find_models", refuse)
     refuse_in_a_capture(tmp_path / "images" / "run")
     assert not list(tmp_path.iterdir())

@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 
 from support.captures import TinyScene, render_plane, tiny_scene, write_colmap
 from support.commands import vdgs
-from vdgs.captures.brightness import LEAST_LIGHT, PointColours, point_colours
 from vdgs.captures.capture import View
 from vdgs.captures.formats.colmap_records import SIGHTINGS, some_of
-from vdgs.captures.images import ImageCache, Picture
+from vdgs.captures.image_cache import ImageCache, Picture
+from vdgs.captures.photometric_gains import LEAST_LIGHT, PointColours, point_colours
 from vdgs.captures.sightings import Sightings
+from vdgs.config.presets import PRESETS
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.settings.presets import PRESETS
 
 SCENE = tiny_scene(columns=5, rows=4)
 CAMERAS = list(SCENE.cameras.values())

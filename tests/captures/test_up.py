@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vdgs.captures.up import estimate_up
+from vdgs.captures.up_axis import estimate_up
 
 #: Of each way to take photographs: camera centres [n, 3], rotations [n, 3, 3] and points [m, 3], z up.
 Scene = tuple[np.ndarray, np.ndarray, np.ndarray]

@@ -14,14 +14,14 @@ from rich.console import Console
 
 from support.captures import TinyScene, look_down, moved, tiny_scene, write_colmap, write_images, write_ply
 from support.commands import vdgs
-from vdgs.captures.checks import check_images
 from vdgs.captures.formats.colmap_records import SIGHTINGS
+from vdgs.captures.image_checks import check_images
 from vdgs.captures.loading import load_capture
 from vdgs.captures.precision import rounding_of
+from vdgs.captures.validation import judge, refuse_unsound
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.inspection.inspect import inspect_capture, print_report
-from vdgs.inspection.soundness import judge, refuse_unsound
-from vdgs.settings.capture import CaptureOptions
+from vdgs.report.capture_report import inspect_capture, print_report
 
 UTM = np.array([500_000.0, 5_000_000.0, 300.0])
 

@@ -12,9 +12,9 @@ from rich.console import Console
 
 from support.clusters import copy_run
 from support.commands import PATIENCE_SECONDS, entry_point, vdgs
-from vdgs import verbs
-from vdgs.cli import HELP, VERBS, main
-from vdgs.verbs.shared import as_typed, open_console
+from vdgs import cli
+from vdgs.cli.common import as_typed, open_console
+from vdgs.cli.main import HELP, VERBS, main
 
 HEAVY = ("torch", "numpy", "matplotlib", "pycolmap", "cv2", "scipy")
 
@@ -22,7 +22,7 @@ HEAVY = ("torch", "numpy", "matplotlib", "pycolmap", "cv2", "scipy")
 @pytest.mark.parametrize("arguments", [["--help"], ["coarse", "--help"], ["eval", "--help"]])
 def test_help_imports_nothing_heavy(arguments):
     code = (
-        "import sys\nfrom vdgs.cli import main\n"
+        "import sys\nfrom vdgs.cli.main import main\n"
         f"try:\n    main({arguments!r})\nexcept SystemExit as exit:\n    assert not exit.code, exit.code\n"
         f"heavy = [name for name in {HEAVY!r} if name in sys.modules]\nassert not heavy, heavy\n"
     )
@@ -34,7 +34,7 @@ def test_help_imports_nothing_heavy(arguments):
 def test_every_verb_is_in_the_help_and_has_an_action():
     for verb in VERBS:
         assert f"  {verb} " in HELP
-        assert callable(getattr(verbs, verb))
+        assert callable(getattr(cli, verb))
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -71,9 +71,9 @@ def test_the_bench_is_named_where_there_is_only_the_package(monkeypatch, capsys)
 
 
 def test_the_bench_is_found_from_any_folder(tmp_path):
-    environment = os.environ | {"PYTHONPATH": str(Path(verbs.__file__).parents[2])}
+    environment = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[2])}
     done = subprocess.run(
-        [sys.executable, "-m", "vdgs.cli", "bench", "--help"], cwd=tmp_path, env=environment,
+        [sys.executable, "-m", "vdgs.cli.main", "bench", "--help"], cwd=tmp_path, env=environment,
         capture_output=True, text=True, timeout=PATIENCE_SECONDS,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -105,7 +105,7 @@ def test_quiet_leaves_what_a_person_must_know(capsys):
 
 
 @pytest.mark.parametrize(
-    ("verb", "does"), [("report", "vdgs.report.write_report"), ("map", "vdgs.maps.mapping.map_run")]
+    ("verb", "does"), [("report", "vdgs.report.write_report"), ("map", "vdgs.rendering.ortho.render_ortho.map_run")]
 )
 def test_verbs_that_show_a_result_can_be_quiet(verb, does, monkeypatch, capsys):
     def done(*given: object) -> Path:
@@ -115,9 +115,9 @@ def test_verbs_that_show_a_result_can_be_quiet(verb, does, monkeypatch, capsys):
         return Path("result")
 
     monkeypatch.setattr(does, done)
-    getattr(verbs, verb)(["run"])
+    getattr(cli, verb)(["run"])
     assert capsys.readouterr().out.startswith({"report": "report: result", "map": "how it goes"}[verb])
-    getattr(verbs, verb)(["run", "--quiet"])
+    getattr(cli, verb)(["run", "--quiet"])
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err in ("", "note what a person must know\n")

@@ -8,11 +8,11 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+from vdgs.cli.main.doctor import doctor_report as doctor_report
+from vdgs.cli.main.doctor import system_checks as doctor
 
-from vdgs.doctor import checks as doctor
-from vdgs.doctor import report as doctor_report
-from vdgs.doctor.check import Check
-from vdgs.doctor.report import healthy, print_report, report
+from vdgs.cli.doctor.check import Check
+from vdgs.cli.doctor.doctor_report import healthy, print_report, report
 
 pytestmark = pytest.mark.xdist_group("doctor")
 
@@ -118,6 +118,6 @@ def test_a_missing_dependency_has_its_command(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_it_imports_nothing_heavy_before_it_looks():
-    code = "import sys, vdgs.doctor.report; print(sorted({'torch', 'numpy', 'cv2', 'rich'} & set(sys.modules)))"
+    code = "import sys, vdgs.cli.doctor.doctor_report; print(sorted({'torch', 'numpy', 'cv2', 'rich'} & set(sys.modules)))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"

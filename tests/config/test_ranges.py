@@ -11,23 +11,23 @@ from typing import Any
 import pytest
 
 from experiments.bench.cli import BenchArguments
-from vdgs.cli import main
+from vdgs.cli.capture_cmds import InspectArguments, SynthArguments
+from vdgs.cli.export_cmd import ExportArguments
+from vdgs.cli.main import main
+from vdgs.cli.ortho_cmd import MapArguments
+from vdgs.cli.result_cmds import EvalArguments, RenderArguments
+from vdgs.cli.run_cmd import CoarseArguments, RunArguments
+from vdgs.cli.sfm_cmd import SfmArguments
+from vdgs.cli.stage_cmds import MergeArguments, PartitionArguments, TrainArguments
+from vdgs.cli.view_cmd import ViewArguments
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.method import MethodConfig, PartitionConfig
+from vdgs.config.presets import PRESETS
+from vdgs.config.ranges import Number, Range, numbers, problems, refuse
+from vdgs.config.serialization import from_dict, to_dict
+from vdgs.config.validation_rules import validate
 from vdgs.errors import VdgsError
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.checks import validate
-from vdgs.settings.method import MethodConfig, PartitionConfig
-from vdgs.settings.plain import from_dict, to_dict
-from vdgs.settings.presets import PRESETS
-from vdgs.settings.ranges import Number, Range, numbers, problems, refuse
 from vdgs.synth.options import SynthOptions
-from vdgs.verbs.captures import InspectArguments, SynthArguments
-from vdgs.verbs.exporting import ExportArguments
-from vdgs.verbs.mapping import MapArguments
-from vdgs.verbs.photographs import SfmArguments
-from vdgs.verbs.results import EvalArguments, RenderArguments
-from vdgs.verbs.stages import MergeArguments, PartitionArguments, TrainArguments
-from vdgs.verbs.starting import CoarseArguments, RunArguments
-from vdgs.verbs.viewing import ViewArguments
 
 HERE = Path("here")
 ARGUMENTS: tuple[Any, ...] = (

@@ -12,12 +12,12 @@ import pytest
 
 from support.commands import PATIENCE_SECONDS, wait_until
 from support.shard_scripts import job, run
-from vdgs.executors import local
-from vdgs.executors.executor import Listener, Outcome, Task
-from vdgs.executors.lines import Lines
-from vdgs.executors.local import LocalExecutor
-from vdgs.executors.parent import PARENT, stop_when_parent_dies
-from vdgs.executors.pieces import Piece
+from vdgs.distributed import local_executor
+from vdgs.distributed.executor import Listener, Outcome, Task
+from vdgs.distributed.lines import Lines
+from vdgs.distributed.local_executor import LocalExecutor
+from vdgs.distributed.parent import PARENT, stop_when_parent_dies
+from vdgs.distributed.shard_runner import Piece
 from vdgs.runs.stage_folder import StageFolder
 
 FINE = 'tell("done", iteration=10, iterations=10, psnr_training=25.5, anchors=1234)'
@@ -122,7 +122,7 @@ def test_a_job_that_someone_else_stopped_is_not_started_again(tmp_path):
 
 def test_memory_that_ran_out_lowers_the_number_at_once(tmp_path, monkeypatch):
     kills = iter([5, 6, 6, 6])
-    monkeypatch.setattr(local, "out_of_memory_kills", lambda: next(kills))
+    monkeypatch.setattr(local_executor, "out_of_memory_kills", lambda: next(kills))
     script = """
         if not (folder / "state").exists() and block == 0:
             (folder / "state").touch()
@@ -236,8 +236,8 @@ DRIVER = """
 import json, sys
 from pathlib import Path
 from rich.console import Console
-from vdgs.executors.pieces import Piece, run_pieces
-from vdgs.executors.local import LocalExecutor
+from vdgs.distributed.shard_runner import Piece, run_pieces
+from vdgs.distributed.local_executor import LocalExecutor
 from vdgs.runs.stage_folder import StageFolder
 
 class Counted(LocalExecutor):
@@ -313,9 +313,9 @@ def test_a_second_interrupt_kills(tmp_path):
 def test_a_job_ends_with_a_driver_that_was_killed(tmp_path):
     watched = (
         "import sys; sys.path.insert(0, sys.argv[2])\n"
-        "from vdgs.executors.parent import stop_when_parent_dies\nstop_when_parent_dies(0.05)\n" + LONG
+        "from vdgs.distributed.parent import stop_when_parent_dies\nstop_when_parent_dies(0.05)\n" + LONG
     )
-    source = str(Path(local.__file__).parents[2])
+    source = str(Path(local_executor.__file__).parents[2])
     jobs = [job(tmp_path, i, watched) for i in range(2)]
     for made in jobs:
         made.command.append(source)

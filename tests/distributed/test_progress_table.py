@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from vdgs.executors.output import explanation
-from vdgs.executors.pieces import default_jobs
-from vdgs.executors.progress import Figures, PieceProgress, read_figures, seconds_left_overall
-from vdgs.executors.table import progress_line, progress_table
+from vdgs.distributed.output import explanation
+from vdgs.distributed.progress_table import progress_line, progress_table
+from vdgs.distributed.shard_progress import Figures, PieceProgress, read_figures, seconds_left_overall
+from vdgs.distributed.shard_runner import default_jobs
 
 
 @given(st.dictionaries(st.sampled_from(["iteration", "iterations", "psnr_training", "anchors", "seconds_left",

@@ -9,22 +9,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.captures import tiny_scene, write_colmap
-from vdgs.cameras import Camera
+from vdgs.cli.main import run_cmd
+from vdgs.config.executor_options import ExecutorOptions, SlurmOptions
+from vdgs.config.presets import PRESETS
+from vdgs.distributed import node_check
+from vdgs.distributed.backend_selection import Machine, choose
+from vdgs.distributed.engine import Begun, End
+from vdgs.distributed.executor import Listener, Needs, Task
+from vdgs.distributed.lines import Lines
+from vdgs.distributed.node_check import Question, examine
+from vdgs.distributed.resource_allocation import Work, by_queue, exceeds, on_cluster, on_this_machine
+from vdgs.distributed.scheduler import Policy, run_crew
 from vdgs.errors import VdgsError
-from vdgs.executors import fitness
-from vdgs.executors.choosing import Machine, choose
-from vdgs.executors.crew import Policy, run_crew
-from vdgs.executors.engine import Begun, End
-from vdgs.executors.executor import Listener, Needs, Task
-from vdgs.executors.fitness import Question, examine
-from vdgs.executors.lines import Lines
-from vdgs.executors.placement import Work, by_queue, exceeds, on_cluster, on_this_machine
-from vdgs.memory.estimate import decoded_bytes, estimate, need_of_block
+from vdgs.geometry.camera import Camera
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
-from vdgs.settings.executors import ExecutorOptions, SlurmOptions
-from vdgs.settings.presets import PRESETS
-from vdgs.verbs import starting
+from vdgs.system.memory.memory_estimate import decoded_bytes, estimate, need_of_block
 
 GB = 10**9
 SAVED = End(130, out_of_time=True)
@@ -251,7 +251,7 @@ def test_where_blocks_could_not_be_trained_no_coarse_model_is_trained_before_tha
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     write_colmap(tmp_path / "capture", tiny_scene())
     with pytest.raises(VdgsError, match=said):
-        starting.run([str(tmp_path / "capture"), "--output", str(tmp_path / "run"), *options])
+        run_cmd.run([str(tmp_path / "capture"), "--output", str(tmp_path / "run"), *options])
     assert not (tmp_path / "run").exists()
 
 
@@ -283,13 +283,13 @@ def test_what_a_machine_does_not_see_is_named(question, monkeypatch):
         assert "has 6 bytes there and 7 here" in said(files=[[str(question.files[0]), 7]])
         assert "it has vdgs" in said(version="9.9")
         assert "not the same code" in said(code="other")
-        monkeypatch.setattr(fitness, "is_locked", lambda _: False)
+        monkeypatch.setattr(node_check, "is_locked", lambda _: False)
         assert "reach no other node" in said()
 
         def refuse(_: Path) -> bool:
             raise OSError(38, "Function not implemented")
 
-        monkeypatch.setattr(fitness, "is_locked", refuse)
+        monkeypatch.setattr(node_check, "is_locked", refuse)
         assert "do not work there (Function not implemented)" in said()
 
 

@@ -16,9 +16,9 @@ from rich.console import Console
 
 from support.captures import render_plane
 from support.hand_made_models import camera_above, opaque_plane, quadrant_of, quadrants
-from vdgs.cameras import Camera
 from vdgs.captures.capture import View
 from vdgs.errors import RunError
+from vdgs.evaluation.block_seams import SEAM_VIEWS, BlockInputs, block_table, evaluate_blocks
 from vdgs.evaluation.by_block import (
     NOTHING,
     BlockMetrics,
@@ -29,9 +29,9 @@ from vdgs.evaluation.by_block import (
     label_map,
 )
 from vdgs.evaluation.reference_views import ReferenceViews
-from vdgs.evaluation.seams import SEAM_VIEWS, BlockInputs, block_table, evaluate_blocks
-from vdgs.kernels.types import Raster
-from vdgs.model.render import render
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import Raster
+from vdgs.model.renderer import render
 
 CAMERAS = [
     camera_above(0.3, -0.2),

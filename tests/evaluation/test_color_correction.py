@@ -7,7 +7,7 @@ import pytest
 
 from support.photographs import photograph, psnr
 from vdgs.evaluation import metrics
-from vdgs.evaluation.colour import correct_colours, correct_colours_affinely
+from vdgs.evaluation.color_correction import correct_colours, correct_colours_affinely
 
 
 def directly_corrected(image: np.ndarray, reference: np.ndarray) -> np.ndarray:

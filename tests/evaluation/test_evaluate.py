@@ -18,12 +18,12 @@ from rich.console import Console
 
 from support.photographs import as_render, load_mask, noisy, photograph, psnr, real_photographs, ssim, view
 from vdgs.errors import CaptureError, RunError, TrainingDiverged
-from vdgs.evaluation import metrics, pictures, saving
-from vdgs.evaluation.evaluate import evaluate
+from vdgs.evaluation import comparison_images, image_io, metrics
+from vdgs.evaluation.evaluate_model import evaluate
 from vdgs.evaluation.lpips import Lpips, LpipsScores
-from vdgs.evaluation.measured_model import EvaluationSettings, MeasuredModel, ModelFacts
 from vdgs.evaluation.reference_views import ReferenceViews
-from vdgs.storage.files import jsonable, write_json
+from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ModelFacts
+from vdgs.system.atomic_files import jsonable, write_json
 
 pytestmark = pytest.mark.xdist_group("evaluate")
 
@@ -227,7 +227,7 @@ def test_what_cannot_be_evaluated_is_said(city: City, tmp_path: Path):
 
 @given(st.lists(st.text("ab/.\\_: é", min_size=1, max_size=8), min_size=1, max_size=8))
 def test_every_view_has_its_own_plain_file_name(names: list[str]):
-    stems = saving.file_stems(names)
+    stems = image_io.file_stems(names)
     assert len({stem.casefold() for stem in stems}) == len(names)
     for stem in stems:
         assert not set(stem) & set('/\\:*?"<>|')
@@ -236,7 +236,7 @@ def test_every_view_has_its_own_plain_file_name(names: list[str]):
 
 def test_readable_file_names():
     names = ["a/b.jpg", "c/b.jpg", "a/b.png", "A/B.JPG", "DJI_0018.JPG"]
-    assert saving.file_stems(names) == ["a__b", "c__b", "a__b_png", "A__B_JPG", "DJI_0018"]
+    assert image_io.file_stems(names) == ["a__b", "c__b", "a__b_png", "A__B_JPG", "DJI_0018"]
 
 
 def test_json_has_no_nan(tmp_path):
@@ -248,19 +248,19 @@ def test_json_has_no_nan(tmp_path):
 
 
 def test_the_colour_map_grows_with_the_error():
-    ramp = pictures.colourise(np.linspace(0, 0.3, 64)[None], limit=0.2).astype(int)
+    ramp = comparison_images.colourise(np.linspace(0, 0.3, 64)[None], limit=0.2).astype(int)
     brightness = ramp.sum(axis=2)[0]
     assert (np.diff(brightness) >= 0).all()
     assert brightness[0] < 20
     assert (ramp[0, 45:] == ramp[0, -1]).all()
-    assert pictures.colourise(np.array([[np.nan]]), 0.2).tolist() == [[[255, 255, 255]]]
+    assert comparison_images.colourise(np.array([[np.nan]]), 0.2).tolist() == [[[255, 255, 255]]]
 
 
 @pytest.mark.parametrize("size", [(48, 64), (300, 20), (900, 1400)])
 def test_a_comparison_of_any_size(size: tuple[int, int]):
     reference = photograph(np.random.default_rng(1), *size)
-    picture = pictures.comparison(reference, reference, "a name " * 3, "30.00 dB")
-    width, height = pictures.panel_size(size[1], size[0], pictures.PANEL_MIN_PX, pictures.PANEL_MAX_PX)
+    picture = comparison_images.comparison(reference, reference, "a name " * 3, "30.00 dB")
+    width, height = comparison_images.panel_size(size[1], size[0], comparison_images.PANEL_MIN_PX, comparison_images.PANEL_MAX_PX)
     assert picture.width > 3 * width
     assert picture.height > height
 

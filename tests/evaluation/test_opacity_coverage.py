@@ -18,15 +18,15 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from support.photographs import load_mask, photograph, psnr, view
-from vdgs.cameras import Camera
 from vdgs.evaluation import metrics
+from vdgs.evaluation.coverage import seen_map
 from vdgs.evaluation.depth_errors import NAMES, DepthErrors, errors_of_view
-from vdgs.evaluation.evaluate import evaluate
-from vdgs.evaluation.measured_model import MeasuredModel
+from vdgs.evaluation.evaluate_model import evaluate
+from vdgs.evaluation.opacity_coverage import PSNRS_SEEN, Rendered, larger_than_picture
 from vdgs.evaluation.reference_views import ReferenceViews
-from vdgs.evaluation.seen import seen_map
-from vdgs.evaluation.solidity import PSNRS_SEEN, Rendered, larger_than_picture
-from vdgs.kernels.types import Raster, Splats
+from vdgs.evaluation.renderable_model import MeasuredModel
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import Raster, Splats
 
 HEIGHT, WIDTH = 48, 64
 VIEWS = [view("one.jpg", shift=0.0), view("two.jpg", shift=1.0)]

@@ -19,9 +19,9 @@ from experiments.bench.plan import Choices
 from experiments.bench.seen import seen_by_frusta, seen_truly
 from support.commands import begun, is_free, vdgs, wait_until
 from support.forking import start_tasks
-from vdgs.cameras import Camera
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import VdgsError
-from vdgs.settings.capture import CaptureOptions
+from vdgs.geometry.camera import Camera
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("bench")]
 

@@ -20,10 +20,10 @@ from experiments.bench.results import Result
 from experiments.bench.scenes import LAPTOP_BUDGET, SCENES
 from support.bench import InThisProcess
 from support.captures import tiny_scene, write_colmap
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.method import with_iterations
+from vdgs.config.presets import PRESETS
 from vdgs.errors import CaptureError, VdgsError
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.method import with_iterations
-from vdgs.settings.presets import PRESETS
 
 pytestmark = pytest.mark.xdist_group("bench_folders")
 

@@ -13,7 +13,7 @@ from support.commands import do_tasks_here, vdgs
 from support.dataset_layouts import halves, write_matrixcity, write_mega_nerf
 from vdgs.captures.capture import Capture
 from vdgs.captures.loading import load_capture
-from vdgs.runs.folder import RunFolder
+from vdgs.runs.run_folder import RunFolder
 from vdgs.synth import SynthOptions, generate
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("bench_layouts")]

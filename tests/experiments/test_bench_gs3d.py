@@ -19,10 +19,10 @@ from experiments.bench.notes import notes_of
 from experiments.bench.plan import Choices, make_plan
 from experiments.bench.results import Result
 from support.bench import InThisProcess, benched, write_data
+from vdgs.config.method import MethodConfig
 from vdgs.errors import RunError, Stopped
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import open_run
-from vdgs.settings.method import MethodConfig
+from vdgs.runs.open_run import open_run
+from vdgs.runs.run_folder import RunFolder
 
 pytestmark = pytest.mark.xdist_group("bench_explicit")
 

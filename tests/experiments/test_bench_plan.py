@@ -13,11 +13,11 @@ from experiments.bench.quoted import QUOTED
 from experiments.bench.scenes import PUBLISHED, SCENES
 from experiments.bench.tables import TABLES
 from experiments.bench.worker import STAGES
+from vdgs.config.method import block_training
+from vdgs.config.presets import PRESETS
+from vdgs.config.serialization import differences, to_dict
+from vdgs.config.validation_rules import validate
 from vdgs.errors import VdgsError
-from vdgs.settings.checks import validate
-from vdgs.settings.method import block_training
-from vdgs.settings.plain import differences, to_dict
-from vdgs.settings.presets import PRESETS
 
 
 def total_iterations(method: Method, scene: Scene) -> int:

@@ -15,7 +15,7 @@ from experiments.bench.results import NEUTRAL, SOLIDITY
 from experiments.bench.verdict import verdict
 from support.bench import InThisProcess, benched, write_data
 from vdgs.errors import VdgsError
-from vdgs.evaluation import saving
+from vdgs.evaluation import image_io
 
 pytestmark = pytest.mark.xdist_group("bench_renders")
 
@@ -105,7 +105,7 @@ def test_what_was_broken_off_is_measured_again(data, output, theirs, monkeypatch
     pictures = [file.read_bytes() for file in files]
     for file in files:
         cv2.imwrite(str(file), 255 - cv2.imread(str(file)))
-    write, written = saving.write_png, []
+    write, written = image_io.write_png, []
 
     def interrupted(path, picture):
         if path.parent.name == "renders" and written:
@@ -114,7 +114,7 @@ def test_what_was_broken_off_is_measured_again(data, output, theirs, monkeypatch
         write(path, picture)
 
     with monkeypatch.context() as patched:
-        patched.setattr(saving, "write_png", interrupted)
+        patched.setattr(image_io, "write_png", interrupted)
         with pytest.raises(KeyboardInterrupt):
             benched(data, output, "baseline", **asked)
     for file, picture in zip(files, pictures, strict=True):

@@ -11,7 +11,7 @@ from support.cuda_on_host import host_compiler, needs_nvrtc
 from support.fake_device import CARD, pretended_card
 from support.fake_gsplat import needs_gsplat
 from support.gpu_on_host import build, install
-from vdgs.kernels import devices
+from vdgs.kernels import device_selection
 from vdgs.kernels.operations import OPERATIONS
 
 pytest.importorskip("embreex", reason="synth: pip install 'vdgs[synth]'")
@@ -29,7 +29,7 @@ def drivers(tmp_path_factory):
 
 def test_all_of_it_runs_and_agrees(drivers, compiled_code, tmp_path, monkeypatch, capsys):
     install(drivers, compiled_code, monkeypatch, "cuda", "")
-    monkeypatch.setattr(devices, "_no_card", lambda index: "")
+    monkeypatch.setattr(device_selection, "_no_card", lambda index: "")
     monkeypatch.setattr(gpu, "TOWN_DB", 3.0)  # after eight iterations, less says nothing
     write_colmap(tmp_path / "capture", tiny_scene(columns=3, rows=2, width=32, height=24, points=80))
     machine = gpu.Machine(CARD, lambda: None, lambda: None, lambda: 0, (8, 6))

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from experiments.baselines.gs3d.density import DensityConfig, control_density, reset_logits, split
 from experiments.baselines.gs3d.model import GaussiansModel, initial_gaussians
 from support.checkerboard import Photographs
-from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
+from vdgs.geometry.camera import Camera
 from vdgs.kernels.spherical_harmonics import view_colours
 from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows
 

@@ -20,14 +20,14 @@ from experiments.baselines.gs3d.training import (
     train,
 )
 from support.captures import tiny_scene, write_colmap
-from vdgs.cameras import Camera
 from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.checkpointing import WatchOptions
 from vdgs.errors import RunError, Stopped, VdgsError
-from vdgs.evaluation.measured_model import EvaluationSettings
-from vdgs.runs.folder import RunFolder
+from vdgs.evaluation.renderable_model import EvaluationSettings
+from vdgs.geometry.camera import Camera
+from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.watching import WatchOptions
 
 pytestmark = pytest.mark.xdist_group("gaussians")
 

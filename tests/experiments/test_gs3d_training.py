@@ -31,11 +31,11 @@ from experiments.baselines.gs3d.training import (
     train_step,
 )
 from support.checkerboard import Photographs
+from vdgs.config.checkpointing import WatchOptions
 from vdgs.errors import TrainingDiverged, VdgsError
-from vdgs.kernels import native, set_threads, threads
+from vdgs.kernels import cpu, set_threads, threads
 from vdgs.runs.stage_folder import StageFolder
-from vdgs.settings.watching import WatchOptions
-from vdgs.storage.checkpoints import load_newest, save_state
+from vdgs.system.checkpoints import load_newest, save_state
 
 pytestmark = pytest.mark.xdist_group("gaussian_training")
 
@@ -143,7 +143,7 @@ def test_where_memory_runs_out_before_anything_moves_no_step_is_lost(where, unbr
 
 def test_where_memory_runs_out_within_a_step_nothing_half_moved_is_saved(tmp_path, monkeypatch):
     folder = StageFolder(tmp_path / "gaussians")
-    memory_runs_out(monkeypatch, "adam_rows", 38 * 5, room=native)  # four of the tensors have moved, or three
+    memory_runs_out(monkeypatch, "adam_rows", 38 * 5, room=cpu)  # four of the tensors have moved, or three
     with pytest.raises(VdgsError, match="There is no checkpoint yet"):
         watched(folder)
 

@@ -11,14 +11,14 @@ import pytest
 import torch
 
 from support.gaussians import overhead, picture, psnr, random_gaussians
-from vdgs.captures.geodesy import geodetic_from_ecef
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry, spz
-from vdgs.export.formats.levels import cell_of, thinned
-from vdgs.export.formats.scene import Y_UP, Facts, Scene
-from vdgs.export.formats.tiles import write_tiles
+from vdgs.export.formats.export_scene import Y_UP, Facts, Scene
+from vdgs.export.formats.simplify import cell_of, thinned
+from vdgs.export.formats.tiles_3d import write_tiles
+from vdgs.geometry.geodesy import geodetic_from_ecef
+from vdgs.model.gaussian_transform import covariances, transformed
 from vdgs.model.gaussians import Gaussians, draw_gaussians
-from vdgs.model.similarity import covariances, transformed
 
 pytestmark = pytest.mark.xdist_group("export_tiles")
 

@@ -13,22 +13,22 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.hand_made_models import camera_above, model_at
-from vdgs.cameras import Camera
-from vdgs.export import baking
-from vdgs.export.baking import Survey, bake, survey
-from vdgs.export.between import between, endless, round_count, rounds
-from vdgs.export.formats.scene import Scene
-from vdgs.export.formats.spool import spooled
-from vdgs.export.refining import refine
-from vdgs.export.refit import Baked, refit
-from vdgs.kernels.reference.ellipsoids import logarithms
+from vdgs.export import bake
+from vdgs.export.bake import Survey, bake, survey
+from vdgs.export.color_refinement import Baked, refit
+from vdgs.export.formats.export_scene import Scene
+from vdgs.export.formats.gaussian_store import spooled
+from vdgs.export.gaussian_optimization import refine
+from vdgs.export.novel_cameras import between, endless, round_count, rounds
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import DecoderWeights, HeadWeights
 from vdgs.kernels.spherical_harmonics import function_count
-from vdgs.kernels.types import DecoderWeights, HeadWeights
+from vdgs.kernels.torch_ref.ellipsoids import logarithms
 from vdgs.model.anchor_model import AnchorModel, Part
+from vdgs.model.decode_world import places, spawned
 from vdgs.model.decoder import Decoder
 from vdgs.model.gaussians import Gaussians, draw_gaussians
-from vdgs.model.render import decode_view, render
-from vdgs.model.world import places, spawned
+from vdgs.model.renderer import decode_view, render
 
 VIEWS = [camera_above(0.3, -0.2), camera_above(-2.0, 1.0, tilt_deg=30.0), camera_above(1.5, 2.0, tilt_deg=-25.0)]
 
@@ -122,7 +122,7 @@ def test_parts_do_not_change_what_is_baked(monkeypatch):
     kept = np.flatnonzero(seen.pixels > 0)[::3]
     whole, done = baked(seen, 3, kept), list[int]()
     expected = whole.tensors()
-    monkeypatch.setattr(baking, "ANCHORS_AT_ONCE", 17)
+    monkeypatch.setattr(bake, "ANCHORS_AT_ONCE", 17)
     parts = list(bake(seen, kept, 3, done.append))
     assert len(parts) > 5
     assert done[-1] == len(kept) == len(whole)

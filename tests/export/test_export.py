@@ -14,22 +14,22 @@ from rich.console import Console
 from support.captures import look_down
 from support.gaussians import random_gaussians
 from support.hand_made_models import capture_at, ground, model_at
-from vdgs.cameras import Camera
-from vdgs.captures.geodesy import ecef_from_geodetic, enu_axes
+from vdgs.config.commands import ExportRequest
 from vdgs.errors import VdgsError
-from vdgs.export import exporting, here
-from vdgs.export.baking import survey
-from vdgs.export.exporting import RECORD, export_run
+from vdgs.export import export_run, local_bake
+from vdgs.export.bake import survey
+from vdgs.export.export_run import RECORD, export_run
 from vdgs.export.formats import registry
-from vdgs.export.frame import FAR, frame_of
+from vdgs.export.local_frame import FAR, frame_of
+from vdgs.geometry.camera import Camera
+from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes
 from vdgs.model.anchor_model import AnchorModel, Part
 from vdgs.model.gaussians import draw_gaussians
-from vdgs.model.render import render
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import TrainedRun
+from vdgs.model.renderer import render
+from vdgs.runs.open_run import TrainedRun
+from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.status import Status
-from vdgs.settings.requests import ExportRequest
-from vdgs.storage.files import read_json
+from vdgs.system.atomic_files import read_json
 
 #: Far from the middle of its UTM zone: grid north is 1.1 degrees off.
 PLACE = (46.95, 7.44, 560.0)
@@ -55,7 +55,7 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             folder=RunFolder(tmp_path / "run"), model=shown, model_path=file, name="merged", status=Status(), key="k",
             caution="", capture=capture_at(origin),
         )  # fmt: skip
-        monkeypatch.setattr(exporting, "open_run", lambda *_: opened)
+        monkeypatch.setattr(export_run, "open_run", lambda *_: opened)
         request = ExportRequest(
             run=tmp_path / "run", to=tuple(tmp_path / name for name in names), measure=False, device="cpu", **asked
         )
@@ -105,8 +105,8 @@ def test_files_about_a_place_on_earth_keep_its_origin_apart(export, tmp_path: Pa
     # In the default system, metres east and north of the origin, nothing is turned.
     export("plain.ply", origin=PLACE)
     export("local.ply")
-    plain, here = registry.read(tmp_path / "plain.ply"), registry.read(tmp_path / "local.ply")
-    assert torch.allclose(plain.means, here.means, atol=1e-4)
+    plain, local_bake = registry.read(tmp_path / "plain.ply"), registry.read(tmp_path / "local.ply")
+    assert torch.allclose(plain.means, local_bake.means, atol=1e-4)
 
 
 def on_earth(local: torch.Tensor, geodetic: tuple[float, float, float]) -> np.ndarray:
@@ -159,7 +159,7 @@ def test_a_frame_and_back_is_where_it_was():
     pytest.importorskip("pyproj")
     model = scattered()
     seen = survey(model, [view.camera for view in capture_at(None).train_views])
-    gaussians = next(iter(here.bake(seen, np.flatnonzero(seen.pixels > 0), 3)))
+    gaussians = next(iter(local_bake.bake(seen, np.flatnonzero(seen.pixels > 0), 3)))
     for crs in ("EPSG:32632", "enu", "local"):
         frame = frame_of(ground(PLACE), crs, np.zeros(3))
         back = frame.to_ground(frame.place(gaussians))
@@ -206,7 +206,7 @@ def test_boxes_blocks_and_numbers_choose(export, tmp_path: Path):
 def test_what_cannot_be_written_is_said_before_anything_is_baked(
     export, tmp_path: Path, monkeypatch, names, asked, said
 ):
-    monkeypatch.setattr(here, "bake", lambda *_: pytest.fail("baked"))
+    monkeypatch.setattr(local_bake, "bake", lambda *_: pytest.fail("baked"))
     with pytest.raises(VdgsError, match=said):
         export(*names, **asked)
     assert not list(tmp_path.glob("*.ply"))
@@ -237,7 +237,7 @@ def moved(model: AnchorModel, x: torch.Tensor) -> AnchorModel:
 
 
 def test_a_scene_too_wide_for_a_format_is_refused_before_it_is_baked(export, monkeypatch):
-    monkeypatch.setattr(here, "bake", lambda *_: pytest.fail("baked"))
+    monkeypatch.setattr(local_bake, "bake", lambda *_: pytest.fail("baked"))
     looking_down_at(monkeypatch, -3000.0, 3000.0)
     sides = torch.where(torch.arange(200) % 2 == 0, 3000.0, -3000.0)
     with pytest.raises(VdgsError, match="2048"):
@@ -263,9 +263,9 @@ def test_a_file_goes_without_the_few_that_lie_beyond_its_reach(export, tmp_path,
     k = model.anchors.offsets.shape[1]
     there = slice(7 * k, 8 * k)
     pixels[there] = 0.01
-    monkeypatch.setattr(here, "survey", lambda *_: replace(real, pixels=pixels))
-    monkeypatch.setattr(here, "bake", lambda seen, kept, degree, _: iter([random_gaussians(len(kept), degree)]))
-    monkeypatch.setattr(here, "refit", lambda *_: None)
+    monkeypatch.setattr(local_bake, "survey", lambda *_: replace(real, pixels=pixels))
+    monkeypatch.setattr(local_bake, "bake", lambda seen, kept, degree, _: iter([random_gaussians(len(kept), degree)]))
+    monkeypatch.setattr(local_bake, "refit", lambda *_: None)
     record = export("all.ply", "near.spz", model=model)
     assert [file["gaussians"] for file in record["files"]] == [record["gaussians"], record["gaussians"] - k]
     assert len(registry.read(tmp_path / "near.spz")) == record["gaussians"] - k
@@ -278,7 +278,7 @@ def test_a_disk_that_fills_leaves_nothing(export, tmp_path: Path, monkeypatch):
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(here, "spooled", full)
+    monkeypatch.setattr(local_bake, "spooled", full)
     with pytest.raises(VdgsError, match="No space left"):
         export("a.ply")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -16,8 +16,8 @@ pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[v
 from support.gaussians import overhead, picture, psnr, random_gaussians
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry
-from vdgs.export.formats.scene import Facts, Page, Scene
-from vdgs.model.similarity import covariances
+from vdgs.export.formats.export_scene import Facts, Page, Scene
+from vdgs.model.gaussian_transform import covariances
 
 PLACED = Facts(origin=(690_000.0, 5_334_000.25, 512.0), crs="EPSG:32632", geodetic=(48.13, 11.57, 512.0))
 
@@ -94,5 +94,5 @@ def test_without_viser_it_is_said_before_the_work(tmp_path, monkeypatch):
 
 
 def test_writing_other_formats_does_not_wait_for_viser():
-    code = "import sys, vdgs.export.exporting; sys.exit('viser' in sys.modules)"
+    code = "import sys, vdgs.export.export_run; sys.exit('viser' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

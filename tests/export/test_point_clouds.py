@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from support.gaussians import random_gaussians
-from vdgs.captures.formats.ply import read_point_cloud
+from vdgs.captures.formats.ply_reader import read_point_cloud
 from vdgs.errors import VdgsError
 from vdgs.export.formats import registry
-from vdgs.export.formats.scene import Facts, Scene
+from vdgs.export.formats.export_scene import Facts, Scene
 
 laspy = pytest.importorskip("laspy")
 ORIGIN = (690_000.5, 5_334_000.25, 512.75)

@@ -13,13 +13,13 @@ import torch
 
 from support.gaussians import overhead, picture, psnr, random_gaussians
 from vdgs.errors import VdgsError
-from vdgs.export.formats import registry, scene, spz
-from vdgs.export.formats.gzipping import gzipped
-from vdgs.export.formats.ply import read_ply
-from vdgs.export.formats.scene import Y_DOWN, Y_UP, Facts, Scene, beside
-from vdgs.export.formats.small_turns import with_small_turns
+from vdgs.export.formats import export_scene, registry, spz
+from vdgs.export.formats.export_scene import Y_DOWN, Y_UP, Facts, Scene, beside
+from vdgs.export.formats.gaussian_ply import read_ply
+from vdgs.export.formats.parallel_gzip import gzipped
+from vdgs.export.formats.quaternion_canonical import with_small_turns
+from vdgs.model.gaussian_transform import covariances, transformed
 from vdgs.model.gaussians import Gaussians
-from vdgs.model.similarity import covariances, transformed
 
 PLACED = Facts(origin=(690_000.0, 5_334_000.25, 512.0), crs="EPSG:32632", geodetic=(48.13, 11.57, 512.0))
 #: PSNR of what is read back, drawn, against the scene as it was: at least.
@@ -133,7 +133,7 @@ def test_chunks_and_their_sizes_make_no_difference(tmp_path, monkeypatch):
     names = [f"a{each.ending}" for each in registry.FORMATS if each.ending not in ("tileset.json", ".sog")]
     for name in names:
         registry.write(tmp_path / f"1{name}", Scene.of(whole, PLACED))
-    monkeypatch.setattr(scene, "ROWS", 16)
+    monkeypatch.setattr(export_scene, "ROWS", 16)
     for name in names:
         registry.write(tmp_path / f"2{name}", Scene(chunks=iter(parts), count=100, degree=2, facts=PLACED))
         one, other = (tmp_path / f"{i}{name}" for i in (1, 2))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from vdgs.captures.capture import GroundFrame
-from vdgs.captures.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_enu
 from vdgs.errors import VdgsError
-from vdgs.placing.placement import Placement
+from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_enu
+from vdgs.geometry.map_projection import Placement
 
 pyproj = pytest.importorskip("pyproj")
 

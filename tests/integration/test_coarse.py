@@ -18,9 +18,9 @@ from support.captures import tiny_scene, write_colmap
 from support.commands import begun, entry_point, limit_files, vdgs
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.runs.opening import open_run
-from vdgs.runs.stereo import PIXELS_A_POINT
-from vdgs.storage.tensors import read_tensors
+from vdgs.pipeline.dense_points import PIXELS_A_POINT
+from vdgs.runs.open_run import open_run
+from vdgs.system.tensors import read_tensors
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("coarse")]
 

@@ -15,8 +15,8 @@ from support.fake_device import CARD, pretended_card
 from support.fake_gsplat import needs_gsplat
 from support.gpu_on_host import build, install
 from vdgs import kernels
-from vdgs.settings.method import CompensationConfig, GrowthConfig
-from vdgs.training import Stage, Surroundings, TrainingState, loop, start_state, to_saved, train_step
+from vdgs.config.method import CompensationConfig, GrowthConfig
+from vdgs.training import Stage, Surroundings, TrainingState, start_state, to_saved, train_step, training_loop
 
 pytestmark = [
     pytest.mark.slow,
@@ -58,8 +58,8 @@ def trained_on(device: torch.device, steps: int, **changes: Any) -> TrainingStat
 WAITS = {
     "kernels/cuda/cull.py: cull: _local_scalar_dense": 1,
     "kernels/cuda/decode.py: _decoded: _local_scalar_dense": 1,
-    "training/loop.py: train_step: tolist": 1,
-    "training/loop.py: _move: _local_scalar_dense": 1,
+    "training/training_loop.py: train_step: tolist": 1,
+    "training/training_loop.py: _move: _local_scalar_dense": 1,
 }
 
 
@@ -106,7 +106,7 @@ def test_a_step_waits_for_the_card_only_where_it_must(rasteriser):
         waits.clear()
         train_step(state, stage)
         # gsplat's wait of this kind is in its compiled part.
-        tiles = {"kernels/cuda/rasterise.py: _entries: _local_scalar_dense": 1} if rasteriser == "cuda" else {}
+        tiles = {"kernels/cuda/rasterize.py: _entries: _local_scalar_dense": 1} if rasteriser == "cuda" else {}
         surroundings = {
             "kernels/cuda/cull.py: cull: _local_scalar_dense": 2,
             "kernels/cuda/decode.py: _decoded: _local_scalar_dense": 2,
@@ -115,7 +115,7 @@ def test_a_step_waits_for_the_card_only_where_it_must(rasteriser):
 
 
 def test_growth_a_new_order_and_the_mean_stay_on_the_device(monkeypatch, rasteriser):
-    monkeypatch.setattr(loop, "REORDER_INTERVAL", 5)
+    monkeypatch.setattr(training_loop, "REORDER_INTERVAL", 5)
     with pretended_card():
         state = trained_on(CARD, 8, **BUSY)
         devices = {tensor.device.type for group in state.groups().values() for tensor in group.values()}
@@ -127,7 +127,7 @@ def test_growth_a_new_order_and_the_mean_stay_on_the_device(monkeypatch, rasteri
 
 def test_mixed_devices_are_found(monkeypatch, rasteriser):
     """The check can fail: with a background left in main memory, it does."""
-    monkeypatch.setattr(loop, "background_at", lambda stage, iteration: torch.zeros(3))
+    monkeypatch.setattr(training_loop, "background_at", lambda stage, iteration: torch.zeros(3))
     with (
         pretended_card(),
         pytest.raises((RuntimeError, TypeError), match=r"cuda and of shape|a cuda device, not on cpu|is not on cuda"),
@@ -136,8 +136,8 @@ def test_mixed_devices_are_found(monkeypatch, rasteriser):
 
 
 def test_cards_take_the_composed_set_and_the_processor_its_own(monkeypatch):
-    assert kernels.choose(CARD).__name__ == "vdgs.kernels.composed"
-    assert kernels.choose(CPU).__name__ == "vdgs.kernels.native"
+    assert kernels.choose(CARD).__name__ == "vdgs.kernels.gpu"
+    assert kernels.choose(CPU).__name__ == "vdgs.kernels.cpu"
     for name in ("reference", "composed"):
         monkeypatch.setenv(kernels.VARIABLE, name)
         assert kernels.choose(CPU).__name__ == f"vdgs.kernels.{name}"

@@ -14,7 +14,7 @@ from support.fake_device import pretended_card
 from support.fake_gsplat import needs_gsplat
 from support.gpu_on_host import build, install
 from support.small_pipeline import after_the_coarse_stage, psnr, train_coarse, vdgs
-from vdgs.kernels import devices
+from vdgs.kernels import device_selection
 
 pytestmark = [
     pytest.mark.slow,
@@ -31,7 +31,7 @@ def runs(native_small, tmp_path_factory, compiled_code) -> tuple[Path, Path]:
     card = folder / "card"
     with pytest.MonkeyPatch.context() as patch:
         install(drivers, compiled_code, patch, "cuda", "gsplat")
-        patch.setattr(devices, "_no_card", lambda index: "")
+        patch.setattr(device_selection, "_no_card", lambda index: "")
         with pretended_card():
             train_coarse(native_small.capture, card, "--device", "cuda")
             after_the_coarse_stage(card, "--device", "cuda")

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from support.shard_scripts import job, run
-from vdgs.executors.engine import End
-from vdgs.executors.fitness import Question
-from vdgs.executors.keeper import Keeper, Order
+from vdgs.distributed.engine import End
+from vdgs.distributed.node_check import Question
+from vdgs.distributed.ray_actor import Keeper, Order
 
 pytestmark = pytest.mark.slow
 

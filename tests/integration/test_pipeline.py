@@ -13,15 +13,15 @@ import torch
 
 from support.captures import tiny_scene, write_colmap
 from support.commands import begun, do_tasks_here, entry_point, is_free, vdgs, wait_until
-from vdgs.evaluation.alone import BlocksAlone
+from vdgs.evaluation.isolated_blocks import BlocksAlone
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
-from vdgs.model.visibility import visibility_of
-from vdgs.partition.assignment.saving import load_scores
+from vdgs.partition.assignment.score_file import load_scores
 from vdgs.partition.blocks import load_blocks, places_of
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import open_run
-from vdgs.runs.stereo import PIXELS_A_POINT
+from vdgs.pipeline.dense_points import PIXELS_A_POINT
+from vdgs.runs.open_run import open_run
+from vdgs.runs.run_folder import RunFolder
+from vdgs.visibility.visibility_counts import visibility_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pipeline")]
 
@@ -270,13 +270,13 @@ def test_a_block_that_is_killed_is_started_again(unbroken, copied):
 
 def swallow_ctrl_c() -> None:
     """Let Ctrl-C come between two stages, inside something that swallows it."""
-    from vdgs import pipeline
+    from vdgs.pipeline.run_pipeline import run_pipeline
 
     def measure_visibility(*_: object) -> None:
         with suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
 
-    pipeline.measure_visibility = measure_visibility  # type: ignore[assignment]
+    run_pipeline.measure_visibility = measure_visibility  # type: ignore[assignment]
 
 
 def test_ctrl_c_between_stages_stops_the_run_and_the_same_command_continues(capture, copied):
@@ -294,9 +294,9 @@ def test_ctrl_c_between_stages_stops_the_run_and_the_same_command_continues(capt
 
 def time_few_steps() -> None:
     """Let a plan be made of fewer steps than take seconds."""
-    from vdgs import planning
+    from vdgs.pipeline.run_pipeline import dry_run
 
-    planning.TIMED_SECONDS = 0.0
+    dry_run.TIMED_SECONDS = 0.0
 
 
 def test_a_dry_run_says_what_it_takes_and_writes_nothing(capture, copied, tmp_path):

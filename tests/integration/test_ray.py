@@ -24,7 +24,7 @@ from support.clusters import (
     train_here,
 )  # fmt: skip
 from support.commands import begun, do_tasks_here, python, vdgs, wait_until
-from vdgs import cli
+from vdgs.cli.main import main
 
 pytestmark = [
     pytest.mark.slow,
@@ -59,16 +59,16 @@ def on_ray(run: Path, cluster: Cluster) -> tuple[object, ...]:
 
 def another_code() -> None:
     """Let this process take itself for another version of vdgs."""
-    from vdgs.executors import fitness
+    from vdgs.distributed import node_check
 
-    fitness.code_identity = lambda: "of this machine"  # type: ignore[assignment]
+    node_check.code_identity = lambda: "of this machine"  # type: ignore[assignment]
 
 
 def test_a_run_starts_a_ray_of_its_own_for_each_job():
     """One after the other, in one process, as `vdgs run --executor ray` does without an address."""
     done = python(
         """
-from vdgs.executors.on_ray import connected, nodes
+from vdgs.distributed.ray_executor import connected, nodes
 for _ in range(2):
     with connected(None):
         print(len(nodes()), "node")
@@ -209,7 +209,7 @@ def test_nodes_that_join_late_are_avoided_where_they_cannot_work_or_have_no_memo
 
 def another_vdgs(folder: Path) -> Path:
     """A folder to import a vdgs from that differs by one file."""
-    source = Path(cli.__file__).parent
+    source = Path(main.__file__).parent
     shutil.copytree(source, folder / "vdgs", ignore=shutil.ignore_patterns("*.so", "__pycache__"))
     (folder / "vdgs/of_another_version.py").touch()
     # An installation that leads to its sources by a hook would lead there from that node too.

@@ -10,18 +10,18 @@ from rich.console import Console
 
 from support.clusters import FINE, alive, copy_run, evaluated
 from support.commands import begun, do_tasks_here, vdgs, wait_until
-from vdgs import pipeline
+from vdgs.config.commands import RunRequest
+from vdgs.config.executor_options import ExecutorOptions
 from vdgs.errors import RunError, Stopped
-from vdgs.export import baking, steps
-from vdgs.export.baking import Shown
-from vdgs.export.formats.spool import flat, opened, unflattened
-from vdgs.export.refit import Lacking
-from vdgs.export.saved import load_added, load_lacking, load_shown, save_added, save_lacking, save_shown
-from vdgs.maps.pieces import load_tile, save_tile
-from vdgs.maps.tiles import Tile
+from vdgs.export import bake, bake_plan
+from vdgs.export.bake import Shown
+from vdgs.export.bake_io import load_added, load_lacking, load_shown, save_added, save_lacking, save_shown
+from vdgs.export.color_refinement import Lacking
+from vdgs.export.formats.gaussian_store import flat, opened, unflattened
+from vdgs.pipeline.run_pipeline import run_pipeline
+from vdgs.rendering.ortho.tile_renderer import Tile
+from vdgs.rendering.ortho.tile_shards import load_tile, save_tile
 from vdgs.runs.run_context import RunContext
-from vdgs.settings.executors import ExecutorOptions
-from vdgs.settings.requests import RunRequest
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("shards")]  # one worker, which trains once
 
@@ -83,12 +83,12 @@ def test_a_tile_that_is_damaged_is_named(tmp_path):
 
 
 def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline, "can_map", lambda: True)
+    monkeypatch.setattr(run_pipeline, "can_map", lambda: True)
     wishes = []
-    monkeypatch.setattr(pipeline, "map_run", lambda context, asked, console, wish: wishes.append(wish))
+    monkeypatch.setattr(run_pipeline, "map_run", lambda context, asked, console, wish: wishes.append(wish))
     for executor in ("local", "slurm"):
         asked = RunRequest(capture=tmp_path, output=tmp_path, jobs=3, where=ExecutorOptions(executor=executor))
-        pipeline._map(RunContext.from_path(tmp_path), asked, Console(quiet=True))
+        run_pipeline._map(RunContext.from_path(tmp_path), asked, Console(quiet=True))
     assert [(wish.sends, wish.jobs, wish.where.executor) for wish in wishes] == [
         (False, 0, "local"),
         (True, 3, "slurm"),
@@ -97,14 +97,14 @@ def test_a_run_sends_its_maps_where_its_blocks_go_and_stops_when_asked(tmp_path,
     def stopped(*_):
         raise Stopped("Stopped")
 
-    monkeypatch.setattr(pipeline, "map_run", stopped)
+    monkeypatch.setattr(run_pipeline, "map_run", stopped)
     with pytest.raises(Stopped):
-        pipeline._map(RunContext.from_path(tmp_path), asked, Console(quiet=True))
+        run_pipeline._map(RunContext.from_path(tmp_path), asked, Console(quiet=True))
 
 
 def small_parts() -> None:
     """Let so few anchors be fitted at once, and shards be so small, that a small scene has several for each step."""
-    baking.ANCHORS_AT_ONCE, steps.VIEWS_OF_SHARD, steps.PARTS_OF_SHARD = 64, (8, 100, 8), (2, 50, 8)
+    bake.ANCHORS_AT_ONCE, bake_plan.VIEWS_OF_SHARD, bake_plan.PARTS_OF_SHARD = 64, (8, 100, 8), (2, 50, 8)
 
 
 def small_parts_here() -> None:

@@ -20,28 +20,28 @@ pytest.importorskip("embreex")
 import pycolmap
 
 from support.flights import FOCAL, ORIGIN, Flight, write_photograph
-from vdgs.captures.alignment import Similarity
-from vdgs.captures.geodesy import enu_from_geodetic
-from vdgs.captures.images import load_picture
+from vdgs.captures.image_cache import load_picture
 from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import facts_rows, read_reconstruction
+from vdgs.captures.validation import judge
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.commands import RunRequest
+from vdgs.config.presets import PRESETS
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, RunError, VdgsError
-from vdgs.inspection.soundness import judge
-from vdgs.pipeline import with_capture
-from vdgs.planning import plan_run
+from vdgs.geometry.geodesy import enu_from_geodetic
+from vdgs.geometry.similarity import Similarity
+from vdgs.pipeline.dry_run import plan_run
+from vdgs.pipeline.run_pipeline import with_capture
 from vdgs.report import write_report
-from vdgs.runs.beginning import begin_run
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.presets import PRESETS
-from vdgs.settings.requests import RunRequest
-from vdgs.settings.sfm import SfmOptions, SfmRequest
-from vdgs.sfm import aligning, features, mapping, matching
-from vdgs.sfm.aligning import Placed, Unplaced, move, place
-from vdgs.sfm.collection import collect
-from vdgs.sfm.positions import find_positions
+from vdgs.runs.create_or_resume import begin_run
+from vdgs.sfm import feature_extraction, feature_matching, georegistration, incremental_mapper
+from vdgs.sfm.georegistration import Placed, Unplaced, move, place
+from vdgs.sfm.gps_priors import find_positions
+from vdgs.sfm.image_list import collect
 from vdgs.sfm.reconstruct import reconstruct
-from vdgs.sfm.work import call
-from vdgs.watching.interrupts import stop_requests
+from vdgs.sfm.workspace import call
+from vdgs.system.stop_signals import stop_requests
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sfm")]
 
@@ -121,7 +121,7 @@ def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(mad
     before = files(output)
     reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1, keep_work=True), console())
     assert files(output) == before
-    for room, name in ((features, "find_features"), (matching, "match"), (mapping, "find_models")):
+    for room, name in ((feature_extraction, "find_features"), (feature_matching, "match"), (incremental_mapper, "find_models")):
         monkeypatch.setattr(room, name, lambda *_: pytest.fail("was done already"))
     asked = SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(max_size=200))
     reconstruct(asked, console())
@@ -142,7 +142,7 @@ def test_what_was_interrupted_goes_on(flight, tmp_path, monkeypatch):
                 raise KeyboardInterrupt
             return call(function, *arguments, **named)
 
-        patch.setattr(features, "call", stopped)
+        patch.setattr(feature_extraction, "call", stopped)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(request, console())
     with pytest.raises(CaptureError, match="is not finished"):
@@ -153,7 +153,7 @@ def test_what_was_interrupted_goes_on(flight, tmp_path, monkeypatch):
         extracted.extend(arguments[2])
         return call(function, *arguments, **named)
 
-    monkeypatch.setattr(features, "call", counted)
+    monkeypatch.setattr(feature_extraction, "call", counted)
     facts = reconstruct(request, console())
     assert facts.registered == 9
     assert len(extracted) == 10 - 4  # four were searched before, in two calls
@@ -251,7 +251,7 @@ def test_positions_that_disagree_leave_the_scale_arbitrary_and_say_why(made, fli
     output, said = tmp_path / "capture", console()
     shutil.copytree(made, output, symlinks=True)
     found = Unplaced("the positions disagree by 2 m", "give better ones")
-    monkeypatch.setattr(aligning, "place", lambda *_: found)
+    monkeypatch.setattr(georegistration, "place", lambda *_: found)
     facts = reconstruct(
         SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(max_size=200)), said
     )

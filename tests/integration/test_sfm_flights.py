@@ -18,19 +18,19 @@ pytest.importorskip("embreex")
 import pycolmap
 
 from support.flights import ORIGIN, Flight, copy_folder, fly, grid, write_photograph
-from vdgs.cameras import Camera
-from vdgs.captures.geodesy import enu_from_geodetic
 from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import ReconstructionFacts, read_reconstruction
+from vdgs.config.commands import RunRequest
+from vdgs.config.presets import PRESETS
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
-from vdgs.pipeline import with_capture
-from vdgs.settings.presets import PRESETS
-from vdgs.settings.requests import RunRequest
-from vdgs.settings.sfm import SfmOptions, SfmRequest
-from vdgs.sfm import features, mapping, matching, writing
+from vdgs.geometry.camera import Camera
+from vdgs.geometry.geodesy import enu_from_geodetic
+from vdgs.pipeline.run_pipeline import with_capture
+from vdgs.sfm import capture_writer, feature_extraction, feature_matching, incremental_mapper
 from vdgs.sfm.reconstruct import reconstruct
-from vdgs.sfm.work import Work, call
-from vdgs.watching.interrupts import stop_requests
+from vdgs.sfm.workspace import Work, call
+from vdgs.system.stop_signals import stop_requests
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sfm")]
 
@@ -62,7 +62,7 @@ def whole_capture(output: Path, flight: Flight, facts: ReconstructionFacts) -> N
     shift = enu_from_geodetic(np.array([capture.ground.origin_geo]), ORIGIN)[0]
     for view, truth in zip(capture.views, flight.cameras, strict=True):
         assert np.linalg.norm(view.camera.position + shift - truth.position) < 0.5
-    for folder, _ in writing.SIZES:
+    for folder, _ in capture_writer.SIZES:
         assert sorted(path.name for path in (output / folder).iterdir()) == flight.names
     assert not (output / "work").exists()
 
@@ -176,10 +176,10 @@ class Stopper:
 
 
 STEPS = {
-    "features": (features, "_extract", 3),
-    "matching": (matching, "call", 2),
-    "mapping": (mapping, "keep_snapshots", 5),
-    "writing": (writing, "write_bytes", 8),
+    "features": (feature_extraction, "_extract", 3),
+    "matching": (feature_matching, "call", 2),
+    "mapping": (incremental_mapper, "keep_snapshots", 5),
+    "writing": (capture_writer, "write_bytes", 8),
 }
 
 
@@ -187,8 +187,8 @@ STEPS = {
 def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
     flight, begun, tmp_path, monkeypatch, step
 ):
-    monkeypatch.setattr(matching, "AT_ONCE", 4)
-    monkeypatch.setattr(mapping, "LEAST_BETWEEN", 2)
+    monkeypatch.setattr(feature_matching, "AT_ONCE", 4)
+    monkeypatch.setattr(incremental_mapper, "LEAST_BETWEEN", 2)
     room, name, after = STEPS[step]
     output, stop, function = tmp_path / "capture", Stopper(after), getattr(room, name)
     if step in begun:
@@ -217,7 +217,7 @@ def test_ctrl_c_at_each_step_keeps_what_is_done_and_the_same_command_goes_on(
             mapped.append(named["input_path"])
         return call(called, *arguments, **named)
 
-    for each in (features, matching, mapping):
+    for each in (feature_extraction, feature_matching, incremental_mapper):
         monkeypatch.setattr(each, "call", counted)
     written = {path: path.stat().st_mtime_ns for path in output.glob("images*/*.JPG")}
     facts = reconstruct(request, console())
@@ -240,28 +240,28 @@ def test_only_whole_snapshots_are_gone_on_from_and_the_largest_of_them(tmp_path)
         (work.snapshots / name).mkdir(parents=True)
         (work.snapshots / name / "images.bin").write_bytes(placed.to_bytes(8, "little"))
 
-    mapping.keep_snapshots(work)
-    assert mapping._largest_kept(work) is None
+    incremental_mapper.keep_snapshots(work)
+    assert incremental_mapper._largest_kept(work) is None
     for name, placed, kept in (("1", 7, 7), ("2", 12, 12), ("3", 5, 12), ("4", 110, 110)):
         snapshot(name, placed)
-        mapping.keep_snapshots(work)
+        incremental_mapper.keep_snapshots(work)
         assert [path.name for path in work.kept.iterdir()] == [str(kept)]
         assert not any(work.snapshots.iterdir())
-    mapping.forget_models(work)
+    incremental_mapper.forget_models(work)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_another_focal_length_begins_mapping_anew(flight, begun, tmp_path, monkeypatch):
     output, stop = tmp_path / "capture", Stopper(5)
     copy_folder(begun["mapping"], output)
-    monkeypatch.setattr(mapping, "LEAST_BETWEEN", 2)
-    keep = mapping.keep_snapshots
+    monkeypatch.setattr(incremental_mapper, "LEAST_BETWEEN", 2)
+    keep = incremental_mapper.keep_snapshots
     with monkeypatch.context() as patch:
-        patch.setattr(mapping, "keep_snapshots", lambda work: (keep(work), stop()))
+        patch.setattr(incremental_mapper, "keep_snapshots", lambda work: (keep(work), stop()))
         with pytest.raises(KeyboardInterrupt), stop_requests(interrupts=True):
             reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1), console())
     assert any((output / "work" / "kept").iterdir())
-    monkeypatch.setattr(mapping, "find_models", lambda work, *_: pytest.fail("kept") if work.kept.exists() else done())
+    monkeypatch.setattr(incremental_mapper, "find_models", lambda work, *_: pytest.fail("kept") if work.kept.exists() else done())
 
     def done():
         raise CaptureError("begun anew")
@@ -296,7 +296,7 @@ def test_a_disk_that_fills_while_photographs_are_written_is_said_and_nothing_is_
         with pytest.raises(VdgsError, match=r"No space left on device\). Free some space .* same command"):
             reconstruct(request, console())
     assert len(list(output.glob("images*/*.JPG"))) == 7
-    for room in (features, matching, mapping):
+    for room in (feature_extraction, feature_matching, incremental_mapper):
         monkeypatch.setattr(room, "call", lambda *_, **__: pytest.fail("was done already"))
     whole_capture(output, flight, reconstruct(request, console()))
 
@@ -307,7 +307,7 @@ def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight
     if step in begun:
         copy_folder(begun[step], output)
     request = SfmRequest(photographs=(flight.folder,), output=output, threads=1)
-    monkeypatch.setattr(matching, "AT_ONCE", 4)
+    monkeypatch.setattr(feature_matching, "AT_ONCE", 4)
 
     def full(function, *arguments, **named):
         full.calls += 1
@@ -326,5 +326,5 @@ def test_a_disk_that_is_full_for_the_database_is_said_and_nothing_is_lost(flight
     calls = []
     monkeypatch.setattr(room, "call", lambda *a, **n: (calls.append(a[0]), call(*a, **n))[1])
     whole_capture(output, flight, reconstruct(request, console()))
-    assert len(calls) < (5 if room is features else 9)  # of five, and nine with the four pairs of each
+    assert len(calls) < (5 if room is feature_extraction else 9)  # of five, and nine with the four pairs of each
     shutil.rmtree(output)

@@ -19,27 +19,27 @@ from rich.console import Console
 from support.clusters import COARSE, alive, copy_run, evaluated, merge_run, train_here
 from support.commands import CommandsHere, begun, do_tasks_here, python, threads_as_before, vdgs, wait_until
 from support.forking import start_tasks
+from vdgs.config.executor_options import ExecutorOptions
+from vdgs.config.serialization import to_dict
+from vdgs.distributed import run_shard as entry
+from vdgs.distributed.job_folders import clear, remove
+from vdgs.distributed.job_labels import shard_kind
+from vdgs.distributed.shard import WORKERS, Results, Shard, run_shard, shard_session
+from vdgs.distributed.sharded_job import REQUEST, ShardedJob, ShardNeeds, Wish, spans_of
 from vdgs.errors import RunError, Stopped, VdgsError
+from vdgs.evaluation.block_seams import BlockFigures
 from vdgs.evaluation.by_block import BlockMetrics, SeamMetrics
 from vdgs.evaluation.by_visibility import VisibilityHistogram
+from vdgs.evaluation.comparison_images import Thumbnail
 from vdgs.evaluation.depth_errors import DepthErrors
-from vdgs.evaluation.pictures import Thumbnail
-from vdgs.evaluation.records import load_view, save_view
-from vdgs.evaluation.seams import BlockFigures
-from vdgs.evaluation.view import ViewFigures
-from vdgs.executors import run_shard as entry
-from vdgs.executors.job_folders import clear, remove
-from vdgs.executors.kinds import shard_kind
-from vdgs.executors.shard import WORKERS, Results, Shard, run_shard, shard_session
-from vdgs.executors.sharded_job import REQUEST, ShardedJob, ShardNeeds, Wish, spans_of
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.locks import hold
+from vdgs.evaluation.view_metrics import ViewFigures
+from vdgs.evaluation.view_metrics_io import load_view, save_view
+from vdgs.pipeline.evaluate_stage import is_measured
+from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder
-from vdgs.settings.executors import ExecutorOptions
-from vdgs.settings.plain import to_dict
-from vdgs.stages.evaluate import is_measured
-from vdgs.storage.files import write_json
-from vdgs.watching.interrupts import stop_if_asked, stop_requests
+from vdgs.system.atomic_files import write_json
+from vdgs.system.file_locks import hold
+from vdgs.system.stop_signals import stop_if_asked, stop_requests
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("shards")]  # one worker, which trains once
 
@@ -201,7 +201,7 @@ def test_workers_are_there():
 
 
 def test_a_job_keeps_what_is_done_and_is_gathered_in_the_order_of_its_items(tmp_path, halves, monkeypatch):
-    monkeypatch.setattr("vdgs.executors.choosing.LocalExecutor", CommandsHere)
+    monkeypatch.setattr("vdgs.distributed.backend_selection.LocalExecutor", CommandsHere)
     job, console = job_of(tmp_path, "this"), Console(file=io.StringIO(), width=200)
     needs, wish = ShardNeeds(1, lambda: pytest.fail("asked of this machine")), Wish(ExecutorOptions(), jobs=2)
     with pytest.raises(AssertionError, match="exit code 1"), job.held():
@@ -411,7 +411,7 @@ def test_what_a_shard_cannot_do_is_said_in_its_words(merged, tmp_path):
     assert done.stderr.count("none.pth") >= 2
     assert "NN/output.log. The same command tries them again" in done.stderr
     (job,) = (run / "evaluation/shards").iterdir()
-    done = python(f"import sys\nfrom vdgs.executors.run_shard import main\nsys.exit(main([{str(job)!r}, '7']))")
+    done = python(f"import sys\nfrom vdgs.distributed.run_shard import main\nsys.exit(main([{str(job)!r}, '7']))")
     assert done.returncode == 1
     assert "vdgs shard: " in done.stderr
     assert "there is no shard 7; they are 0 to 1" in done.stderr

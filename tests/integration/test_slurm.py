@@ -22,11 +22,11 @@ from support.clusters import (
 )  # fmt: skip
 from support.commands import Command, begun, do_tasks_here, vdgs, wait_until
 from support.slurm import is_installed, real, stand_in
-from vdgs.executors import slurm_commands
-from vdgs.executors.executor import Needs
-from vdgs.executors.on_slurm import script
-from vdgs.executors.slurm_commands import Element, Fate, Listed, SlurmError
-from vdgs.settings.executors import SlurmOptions
+from vdgs.config.executor_options import SlurmOptions
+from vdgs.distributed import slurm_commands
+from vdgs.distributed.executor import Needs
+from vdgs.distributed.slurm_commands import Element, Fate, Listed, SlurmError
+from vdgs.distributed.slurm_executor import script
 
 pytestmark = [
     pytest.mark.slow,

@@ -12,12 +12,12 @@ import torch
 
 from support.small_pipeline import after_the_coarse_stage, psnr, train_coarse
 from vdgs import kernels
-from vdgs.kernels import reference
+from vdgs.kernels import torch_ref
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.partition.assignment.saving import load_scores
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import open_run
-from vdgs.runs.visibility import visibility_of_run
+from vdgs.partition.assignment.score_file import load_scores
+from vdgs.runs.open_run import open_run
+from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.visibility_store import visibility_of_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("composition")]
 
@@ -30,7 +30,7 @@ def runs(native_small, tmp_path_factory) -> tuple[Path, Path, Path]:
     shutil.copytree(native_small.coarse, shared)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(kernels.VARIABLE, "reference")
-        assert kernels.choose(torch.device("cpu")) is reference
+        assert kernels.choose(torch.device("cpu")) is torch_ref
         train_coarse(native_small.capture, twin)
         after_the_coarse_stage(twin)
         after_the_coarse_stage(shared)

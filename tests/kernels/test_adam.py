@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.instruction_sets import every_instruction_set, on_threads, using
-from vdgs.kernels.native import adam as native
-from vdgs.kernels.reference import adam as reference
-from vdgs.kernels.types import AdamState
+from vdgs.kernels.cpu import adam as native
+from vdgs.kernels.kernel_types import AdamState
+from vdgs.kernels.torch_ref import adam as reference
 
 
 def adam_rows(implementation, parameter, rows, gradient, first, second, *, learning_rate, step, **settings):

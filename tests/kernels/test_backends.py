@@ -2,8 +2,8 @@
 
 import inspect
 
-import vdgs.kernels.native as native
-import vdgs.kernels.reference as reference
+import vdgs.kernels.cpu as native
+import vdgs.kernels.torch_ref as reference
 from vdgs.kernels.operations import OPERATIONS
 
 

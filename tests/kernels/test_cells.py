@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.instruction_sets import every_instruction_set, on_threads, using
-from vdgs.kernels.native import cells as native
-from vdgs.kernels.reference import cells as reference
+from vdgs.kernels.cpu import cells as native
+from vdgs.kernels.torch_ref import cells as reference
 
 BOTH = pytest.mark.parametrize("implementation", [reference, native])
 KEYS = st.lists(

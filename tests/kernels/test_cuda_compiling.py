@@ -13,7 +13,7 @@ from experiments.microbench.cuda_resources import resources_of
 from support.commands import python_begun
 from support.cuda_on_host import COMPILER, needs_nvrtc
 from vdgs.errors import VdgsError
-from vdgs.kernels.cuda import cache, launching, nvrtc
+from vdgs.kernels.cuda import compile_cache, launch, nvrtc
 from vdgs.kernels.cuda.nvrtc import CompileError, CudaUnavailable, Found, Nvrtc, Target
 
 ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
@@ -21,7 +21,7 @@ ARCHITECTURES = (75, 80, 86, 89, 90, 100, 120)
 
 @pytest.fixture(autouse=True)
 def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "code"))
+    monkeypatch.setenv(compile_cache.VARIABLE, str(tmp_path / "code"))
 
 
 class StandIn:
@@ -80,23 +80,23 @@ def test_every_source_compiles_for_every_card_and_spills_nothing(source, archite
 
 def test_shared_headers_lean_on_nothing_of_the_processors():
     """Those who bring vectors of their own include them, not the other way round."""
-    shared = Path(launching.__file__).parents[1] / "shared"
+    shared = Path(launch.__file__).parents[1] / "shared"
     names = {path.name for path in shared.glob("*.h")}
     assert names >= {"gaussian_math.h", "image_formation.h"}
     for name in names:
-        assert set(re.findall(r'#include "(.*)"', launching.read_header(name))) <= names
+        assert set(re.findall(r'#include "(.*)"', launch.read_header(name))) <= names
 
 
 @needs_nvrtc
 def test_compiled_code_names_its_kernels():
-    code = launching.compile_source("loss.cu", Target("sm_86"))
+    code = launch.compile_source("loss.cu", Target("sm_86"))
     assert code[:4] == b"\x7fELF"
     assert all(kernel.encode() in code for kernel in SOURCES["loss.cu"][1])
 
 
 @needs_nvrtc
 def test_ptx_names_the_kernels():
-    code = launching.compile_source("loss.cu", Target("compute_75"))
+    code = launch.compile_source("loss.cu", Target("compute_75"))
     assert b".target sm_75" in code
     assert b".entry photometric_forward" in code
 
@@ -105,8 +105,8 @@ def test_ptx_names_the_kernels():
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_the_mathematics_of_the_processor_compiles_for_every_card(architecture):
     """gaussian_math.h is written once for both: every function of it in one kernel."""
-    headers = {name: launching.read_header(name) for name in ("gaussian_math.h", "image_formation.h")}
-    code = COMPILER.compile("gaussian.cu", GAUSSIAN, headers, Target(f"sm_{architecture}"), launching.OPTIONS)
+    headers = {name: launch.read_header(name) for name in ("gaussian_math.h", "image_formation.h")}
+    code = COMPILER.compile("gaussian.cu", GAUSSIAN, headers, Target(f"sm_{architecture}"), launch.OPTIONS)
     assert b"there_and_back" in code
 
 
@@ -191,58 +191,58 @@ class TestCache:
     def test_made_once_and_found_again(self):
         made = []
         for _ in range(3):
-            assert cache.cached("k", PARTS, lambda: made.append(1) or b"code") == b"code"
+            assert compile_cache.cached("k", PARTS, lambda: made.append(1) or b"code") == b"code"
         assert len(made) == 1
-        (entry,) = cache.cache_folder().iterdir()
+        (entry,) = compile_cache.cache_folder().iterdir()
         assert entry.name.startswith("k-")
 
     @pytest.mark.parametrize("part", ["source", "target", "header h", "options", "NVRTC"])
     def test_everything_that_it_is_made_from_counts(self, part):
-        assert cache.cached("k", PARTS, lambda: b"old") == b"old"
-        assert cache.cached("k", PARTS | {part: "other"}, lambda: b"new") == b"new"
-        assert cache.cached("k", PARTS, lambda: b"never") == b"old"
+        assert compile_cache.cached("k", PARTS, lambda: b"old") == b"old"
+        assert compile_cache.cached("k", PARTS | {part: "other"}, lambda: b"new") == b"new"
+        assert compile_cache.cached("k", PARTS, lambda: b"never") == b"old"
 
     def test_a_name_is_told_from_a_text(self):
-        assert cache.key_of({"ab": "c"}) != cache.key_of({"a": "bc"})
+        assert compile_cache.key_of({"ab": "c"}) != compile_cache.key_of({"a": "bc"})
 
     @pytest.mark.parametrize("damage", [lambda b: b[:-1], lambda b: b[:20], lambda b: b"", lambda b: b[:-1] + b"?"])
     def test_a_damaged_entry_is_made_again(self, damage):
-        cache.cached("k", PARTS, lambda: b"code")
-        (entry,) = cache.cache_folder().iterdir()
+        compile_cache.cached("k", PARTS, lambda: b"code")
+        (entry,) = compile_cache.cache_folder().iterdir()
         whole = entry.read_bytes()
         entry.write_bytes(damage(whole))
-        assert cache.cached("k", PARTS, lambda: b"code") == b"code"
+        assert compile_cache.cached("k", PARTS, lambda: b"code") == b"code"
         assert entry.read_bytes() == whole
 
     def test_a_folder_that_cannot_be_made_costs_nothing_but_time(self, tmp_path, monkeypatch):
         (tmp_path / "file").touch()
-        monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file" / "below"))
-        assert cache.cached("k", PARTS, lambda: b"code") == b"code"
+        monkeypatch.setenv(compile_cache.VARIABLE, str(tmp_path / "file" / "below"))
+        assert compile_cache.cached("k", PARTS, lambda: b"code") == b"code"
 
     def test_processes_at_once(self):
-        code = "from vdgs.kernels.cuda.cache import cached\n"
+        code = "from vdgs.kernels.cuda.compile_cache import cached\n"
         code += "for _ in range(3): assert cached('k', {'source': 'same'}, lambda: b'x' * 100_000) == b'x' * 100_000"
-        environment = {cache.VARIABLE: str(cache.cache_folder())}
+        environment = {compile_cache.VARIABLE: str(compile_cache.cache_folder())}
         with python_begun(code, **environment) as one, python_begun(code, **environment) as other:
             assert [each.finished().returncode for each in (one, other)] == [0, 0]
-        (entry,) = cache.cache_folder().iterdir()  # and no temporary file beside it
+        (entry,) = compile_cache.cache_folder().iterdir()  # and no temporary file beside it
         assert entry.stat().st_size > 100_000
 
     def test_the_folder_follows_the_platform(self, monkeypatch):
-        monkeypatch.delenv(cache.VARIABLE)
-        monkeypatch.setattr(cache.sys, "platform", "linux")
+        monkeypatch.delenv(compile_cache.VARIABLE)
+        monkeypatch.setattr(compile_cache.sys, "platform", "linux")
         monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
-        assert cache.cache_folder() == Path("/somewhere/vdgs/cuda")
-        monkeypatch.setattr(cache.sys, "platform", "win32")
+        assert compile_cache.cache_folder() == Path("/somewhere/vdgs/cuda")
+        monkeypatch.setattr(compile_cache.sys, "platform", "win32")
         monkeypatch.setenv("LOCALAPPDATA", "/local")
-        assert cache.cache_folder() == Path("/local/vdgs/cuda")
+        assert compile_cache.cache_folder() == Path("/local/vdgs/cuda")
 
     @needs_nvrtc
     def test_another_header_is_another_entry(self, monkeypatch):
-        monkeypatch.setattr(launching, "read_source", lambda name: '#include "h.h"\n__device__ int f() { return N; }')
+        monkeypatch.setattr(launch, "read_source", lambda name: '#include "h.h"\n__device__ int f() { return N; }')
         made = []
         for text in ("#define N 1", "#define N 2"):
-            monkeypatch.setattr(launching, "read_header", lambda name, text=text: text)
-            made.append(launching.compile_source("s.cu", Target("compute_80"), headers=("h.h",)))
+            monkeypatch.setattr(launch, "read_header", lambda name, text=text: text)
+            made.append(launch.compile_source("s.cu", Target("compute_80"), headers=("h.h",)))
         first, second = made
-        assert first != second or len(list(cache.cache_folder().iterdir())) == 2
+        assert first != second or len(list(compile_cache.cache_folder().iterdir())) == 2

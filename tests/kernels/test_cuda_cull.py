@@ -9,12 +9,12 @@ import torch
 
 from support.cuda_on_host import ORDERS, HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
 from support.decode_scenes import CAMERAS, anchors, ellipse_touches_image, looking_down
-from vdgs.cameras import Camera
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.cpu.cull import cull as native
 from vdgs.kernels.cuda.cull import PROGRAM, cull
 from vdgs.kernels.cuda.driver import cuda_driver
-from vdgs.kernels.cuda.launching import Program, read_source
-from vdgs.kernels.native.cull import cull as native
-from vdgs.kernels.reference.cull import cull as reference
+from vdgs.kernels.cuda.launch import Program, read_source
+from vdgs.kernels.torch_ref.cull import cull as reference
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_cull")]
 

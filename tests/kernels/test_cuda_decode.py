@@ -11,17 +11,17 @@ import torch
 
 from support.cuda_on_host import ORDERS, HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
 from support.decode_scenes import Scene, looking_down, moved_by, turned
-from vdgs.cameras import Camera
-from vdgs.kernels.cuda.camera import PackedCamera
+from vdgs.geometry.camera import Camera
 from vdgs.kernels.cuda.decode import PROGRAM, decode, decode_to_train, sources_of
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.driver import cuda_driver
-from vdgs.kernels.cuda.launching import Program, read_header, read_source
-from vdgs.kernels.cuda.room import Room
-from vdgs.kernels.reference.decode import decode as reference
-from vdgs.kernels.reference.decode_adam import decode_backward_adam as by_reference
-from vdgs.kernels.runs import Shown
-from vdgs.kernels.types import AdamState, AnchorSplats, SplatGradients, Splats, TrainingSplats
+from vdgs.kernels.cuda.launch import Program, read_header, read_source
+from vdgs.kernels.cuda.packed_camera import PackedCamera
+from vdgs.kernels.cuda.splat_capacity import Room
+from vdgs.kernels.kernel_types import AdamState, AnchorSplats, SplatGradients, Splats, TrainingSplats
+from vdgs.kernels.splat_segments import Shown
+from vdgs.kernels.torch_ref.decode import decode as reference
+from vdgs.kernels.torch_ref.decode_adam import decode_backward_adam as by_reference
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_decode")]
 

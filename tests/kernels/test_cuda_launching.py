@@ -15,7 +15,7 @@ from torch._subclasses import FakeTensorMode
 from vdgs.errors import VdgsError
 from vdgs.kernels.cuda import driver as driver_module
 from vdgs.kernels.cuda.driver import CudaDriver, CudaUnavailable, DriverError, cuda_driver
-from vdgs.kernels.cuda.launching import Program, common_device, pack
+from vdgs.kernels.cuda.launch import Program, common_device, pack
 
 CARD = torch.device("cuda", 1)
 

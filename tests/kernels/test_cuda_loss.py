@@ -12,8 +12,8 @@ from support.cuda_on_host import HostDriver, build_on_host, needs_a_compiler, ne
 from support.loss_scenes import scene, with_gradient
 from vdgs.kernels.cuda import loss as cuda
 from vdgs.kernels.cuda.driver import CudaUnavailable, cuda_driver
-from vdgs.kernels.cuda.launching import Program, read_source
-from vdgs.kernels.reference import loss as reference
+from vdgs.kernels.cuda.launch import Program, read_source
+from vdgs.kernels.torch_ref import loss as reference
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_loss")]
 

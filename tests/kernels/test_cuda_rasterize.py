@@ -21,10 +21,10 @@ from support.rasterize_scenes import (
     splats_of,
 )
 from vdgs.kernels.cuda.driver import cuda_driver
-from vdgs.kernels.cuda.launching import Program, read_source
-from vdgs.kernels.cuda.rasterise import PROGRAM, rasterise, rasterise_vjp
-from vdgs.kernels.reference.rasterise import rasterise as reference
-from vdgs.kernels.types import Raster, Splats
+from vdgs.kernels.cuda.launch import Program, read_source
+from vdgs.kernels.cuda.rasterize import PROGRAM, rasterise, rasterise_vjp
+from vdgs.kernels.kernel_types import Raster, Splats
+from vdgs.kernels.torch_ref.rasterize import rasterise as reference
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_rasterise")]
 

@@ -12,10 +12,10 @@ import torch
 from support.cuda_on_host import ORDERS, HostDriver, build_on_host, needs_a_compiler, needs_nvrtc
 from support.decode_scenes import view_statistics
 from vdgs.kernels.cuda.driver import cuda_driver
-from vdgs.kernels.cuda.launching import Program, read_source
+from vdgs.kernels.cuda.launch import Program, read_source
 from vdgs.kernels.cuda.statistics import PROGRAM, add_view_statistics
-from vdgs.kernels.reference.statistics import add_view_statistics as by_reference
-from vdgs.kernels.types import Statistics
+from vdgs.kernels.kernel_types import Statistics
+from vdgs.kernels.torch_ref.statistics import add_view_statistics as by_reference
 
 pytestmark = [needs_nvrtc, pytest.mark.usefixtures("compiled_once"), pytest.mark.xdist_group("cuda_statistics")]
 

@@ -19,7 +19,7 @@ from support.cuda_traffic import Bytes, CountedProgram, Traffic, total
 from support.decode_scenes import CAMERAS, Scene, anchors, moved_by, turned, view_statistics
 from support.loss_scenes import scene as pictures
 from support.rasterize_scenes import in_runs, make_scene, splats_of
-from vdgs.kernels.cuda import cache
+from vdgs.kernels.cuda import compile_cache
 from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.cull import cull
 from vdgs.kernels.cuda.decode import ANCHORS_OF_A_BLOCK, decode_to_train, sources_of
@@ -27,11 +27,11 @@ from vdgs.kernels.cuda.decode import PROGRAM as DECODE
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam
 from vdgs.kernels.cuda.loss import PROGRAM as LOSS
 from vdgs.kernels.cuda.loss import photometric_loss
-from vdgs.kernels.cuda.rasterise import PROGRAM as RASTERISE
-from vdgs.kernels.cuda.rasterise import rasterise_vjp
+from vdgs.kernels.cuda.rasterize import PROGRAM as RASTERISE
+from vdgs.kernels.cuda.rasterize import rasterise_vjp
 from vdgs.kernels.cuda.statistics import PROGRAM as STATISTICS
 from vdgs.kernels.cuda.statistics import add_view_statistics
-from vdgs.kernels.types import Statistics
+from vdgs.kernels.kernel_types import Statistics
 
 GCC = (compiler := host_compiler()) and "Free Software" in subprocess.run(
     [compiler, "--version"], capture_output=True, text=True, check=False
@@ -83,7 +83,7 @@ def counted(tmp_path_factory, compiled_code) -> Counted:
         return made
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(cache.VARIABLE, str(compiled_code))
+        patch.setenv(compile_cache.VARIABLE, str(compiled_code))
         source, opaque = count(DECODE, decoding)
         positions, log_scales = anchors(2048, seed=1)
         rows = count(CULL, lambda program: cull(positions, log_scales, CAMERAS[0], program=program))

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.decode_scenes import CAMERAS, anchors, ellipse_touches_image, looking_down
-from vdgs.cameras import NEAR
-from vdgs.kernels.native import module
-from vdgs.kernels.native.cull import cull as native_cull
-from vdgs.kernels.reference.cull import cull as twin_cull
+from vdgs.geometry.camera import NEAR
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.cpu.cull import cull as native_cull
+from vdgs.kernels.torch_ref.cull import cull as twin_cull
 
 BOTH = pytest.mark.parametrize("cull", [twin_cull, native_cull])
 
@@ -39,9 +39,9 @@ def test_keeps_little_else(cull, camera):
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("n", [0, 1, 15, 17, 5000])
-@pytest.mark.parametrize("isa", module.supported())
+@pytest.mark.parametrize("isa", extension.supported())
 def test_native_equals_the_twin(camera, n, isa, monkeypatch):
-    monkeypatch.setattr(module, "native", lambda: module.load(isa))
+    monkeypatch.setattr(extension, "native", lambda: extension.load(isa))
     positions, log_scales = anchors(n, seed=2)
     ours = set(native_cull(positions, log_scales, camera).tolist())
     twin = set(twin_cull(positions.double(), log_scales.double(), camera).tolist())

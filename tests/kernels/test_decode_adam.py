@@ -7,8 +7,8 @@ import torch
 
 from support.decode_scenes import Scene, looking_down, turned
 from support.instruction_sets import every_instruction_set, on_threads, using
-from vdgs.kernels import native, reference
-from vdgs.kernels.types import AdamState, SplatGradients
+from vdgs.kernels import cpu, torch_ref
+from vdgs.kernels.kernel_types import AdamState, SplatGradients
 
 CAMERA = turned(96, 64)
 #: A few of the anchors, some of them neighbours.
@@ -33,7 +33,7 @@ def states_of(scene: Scene) -> list[AdamState]:
 
 def gradients_of(scene: Scene, rows: torch.Tensor = ROWS, depths: bool = False) -> SplatGradients:
     with torch.no_grad():
-        splats = native.decode(*scene.arguments, CAMERA, rows)
+        splats = cpu.decode(*scene.arguments, CAMERA, rows)
     g = torch.Generator().manual_seed(8)
     parts = {name: torch.randn(getattr(splats, name).shape, generator=g)
              for name in ("means_px", "conics", "colours", "opacities")}  # fmt: skip
@@ -65,7 +65,7 @@ def apart(scene: Scene, gradients: SplatGradients) -> list[torch.Tensor]:
     states = states_of(scene)
     leaves = [state.parameter[ROWS].requires_grad_(True) for state in states]
     weights = scene.weights.map(lambda t: t.clone().requires_grad_(True))
-    splats = native.decode(scene.positions[ROWS], *leaves, weights, CAMERA)
+    splats = cpu.decode(scene.positions[ROWS], *leaves, weights, CAMERA)
     outputs = [splats.means_px, splats.conics, splats.colours, splats.opacities, splats.volumes]
     received = [gradients.means_px, gradients.conics, gradients.colours, gradients.opacities,
                 torch.full_like(splats.volumes, gradients.volume)]  # fmt: skip
@@ -73,7 +73,7 @@ def apart(scene: Scene, gradients: SplatGradients) -> list[torch.Tensor]:
         outputs, received = [*outputs, splats.depths], [*received, gradients.depths]
     found = torch.autograd.grad(outputs, [*leaves, *weights.tensors()], received)
     for state, gradient in zip(states, found, strict=False):
-        assert native.adam_rows(state, ROWS, gradient, counted(ROWS)[ROWS])
+        assert cpu.adam_rows(state, ROWS, gradient, counted(ROWS)[ROWS])
     return [*(t for state in states for t in state[:3]), *found[3:]]
 
 
@@ -87,7 +87,7 @@ def test_the_bits_are_those_of_autograd_and_adam_for_any_number_of_threads(instr
         expected = apart(scene, gradients)
         for count in (1, 3):
             with on_threads(count):
-                finite, ours = fused(native, scene, gradients)
+                finite, ours = fused(cpu, scene, gradients)
             assert finite
             assert all(torch.equal(a, b) for a, b in zip(ours, expected, strict=True))
 
@@ -96,11 +96,11 @@ def test_the_bits_are_those_of_autograd_and_adam_for_any_number_of_threads(instr
 def test_native_equals_the_twin(with_distance, depths):
     scene = Scene.random(700, k=3, with_distance=with_distance, seed=3)
     gradients = gradients_of(scene, depths=depths)
-    for ours, twins in zip(fused(native, scene, gradients)[1], fused(reference, scene, gradients)[1], strict=True):
+    for ours, twins in zip(fused(cpu, scene, gradients)[1], fused(torch_ref, scene, gradients)[1], strict=True):
         torch.testing.assert_close(ours, twins, rtol=2e-3, atol=2e-4 * float(twins.abs().max()))
 
 
-@pytest.mark.parametrize("kernels", [native, reference])
+@pytest.mark.parametrize("kernels", [cpu, torch_ref])
 def test_a_gradient_by_depth_moves_anchors_and_one_of_nothing_does_not(kernels):
     scene = Scene.random(700, seed=2)
     gradients = gradients_of(scene)
@@ -115,7 +115,7 @@ def test_a_gradient_by_depth_moves_anchors_and_one_of_nothing_does_not(kernels):
 def test_rows_that_are_not_given_keep_their_bits():
     scene = Scene.random(700, seed=2)
     before = [t for state in states_of(scene) for t in state[:3]]
-    _, after = fused(native, scene, gradients_of(scene))
+    _, after = fused(cpu, scene, gradients_of(scene))
     others = torch.ones(700, dtype=torch.bool)
     others[ROWS] = False
     for a, b in zip(before, after, strict=False):
@@ -128,7 +128,7 @@ def test_a_gradient_that_is_not_a_number_is_reported_and_stays_out_of_its_anchor
     gradients = gradients_of(scene)
     spoilt = gradients.colours.clone()
     spoilt[100, 1] = float("nan")
-    finite, after = fused(native, scene, replace(gradients, colours=spoilt))
+    finite, after = fused(cpu, scene, replace(gradients, colours=spoilt))
     assert not finite
     assert all(bool(torch.isfinite(t).all()) for t in after[:9])
 
@@ -136,17 +136,17 @@ def test_a_gradient_that_is_not_a_number_is_reported_and_stays_out_of_its_anchor
 def test_a_frozen_decoder_gets_no_gradients():
     scene = Scene.random(700, seed=2)
     gradients, states = gradients_of(scene), states_of(scene)
-    answer = native.decode_backward_adam(
+    answer = cpu.decode_backward_adam(
         scene.positions, states, scene.weights, CAMERA, ROWS, gradients, UPDATES.clone()
     )
     assert answer == (True, None)
-    _, expected = fused(native, scene, gradients)
+    _, expected = fused(cpu, scene, gradients)
     assert all(torch.equal(a, b) for a, b in zip([t for s in states for t in s[:3]], expected, strict=False))
 
 
 def test_nothing_visible_moves_nothing():
     scene, none = Scene.random(5, seed=1), torch.empty(0, dtype=torch.int64)
-    finite, after = fused(native, scene, gradients_of(scene, none), none)
+    finite, after = fused(cpu, scene, gradients_of(scene, none), none)
     before = [t for state in states_of(scene) for t in state[:3]]
     assert finite
     assert all(torch.equal(a, b) for a, b in zip(before, after, strict=False))
@@ -158,14 +158,14 @@ def test_rows_are_read_where_they_stand():
     gathered = replace(scene, **{name: getattr(scene, name)[ROWS]
                                  for name in ("positions", "features", "offsets", "log_scales")})  # fmt: skip
     camera = looking_down()
-    ours, expected = native.decode(*scene.arguments, camera, ROWS), native.decode(*gathered.arguments, camera)
-    twin = reference.decode(*scene.arguments, camera, ROWS)
+    ours, expected = cpu.decode(*scene.arguments, camera, ROWS), cpu.decode(*gathered.arguments, camera)
+    twin = torch_ref.decode(*scene.arguments, camera, ROWS)
     assert len(ours.source) > 100
     assert torch.equal(ours.source, twin.source)
     for name in vars(ours):
         assert torch.equal(getattr(ours, name), getattr(expected, name))
     features = scene.features.clone().requires_grad_(True)
-    native.decode(*replace(scene, features=features).arguments, camera, ROWS).opacities.sum().backward()
+    cpu.decode(*replace(scene, features=features).arguments, camera, ROWS).opacities.sum().backward()
     assert features.grad is not None
     assert set(features.grad.abs().sum(1).nonzero()[:, 0].tolist()) <= set(ROWS.tolist())
 
@@ -177,10 +177,10 @@ def test_rows_are_read_where_they_stand():
 def test_rows_that_are_not_there_are_refused(rows, error):
     scene = Scene.random(700, seed=2)
     with pytest.raises(error):
-        native.decode(*scene.arguments, CAMERA, torch.tensor(rows))
+        cpu.decode(*scene.arguments, CAMERA, torch.tensor(rows))
     gradients, states = gradients_of(scene), states_of(scene)
     with pytest.raises(error):
-        native.decode_backward_adam(
+        cpu.decode_backward_adam(
             scene.positions, states, scene.weights, CAMERA, torch.tensor(rows), gradients, UPDATES.clone()
         )
     assert torch.equal(states[0].parameter, scene.features)
@@ -197,12 +197,12 @@ def test_a_state_that_does_not_fit_is_refused():
         states = states_of(scene)
         states[0] = states[0]._replace(**damage)
         with pytest.raises(ValueError, match="moments"):
-            native.decode_backward_adam(
+            cpu.decode_backward_adam(
                 scene.positions, states, scene.weights, CAMERA, ROWS, gradients, UPDATES.clone()
             )
 
 
-@pytest.mark.parametrize("kernels", [native, reference])
+@pytest.mark.parametrize("kernels", [cpu, torch_ref])
 @pytest.mark.parametrize("updates", [torch.zeros(699, dtype=torch.int32), torch.zeros(700), UPDATES - 1])
 def test_counts_that_do_not_fit_are_refused(kernels, updates):
     scene = Scene.random(700, seed=2)

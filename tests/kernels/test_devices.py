@@ -9,16 +9,16 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from vdgs.cli.main.doctor import cuda_checks as doctor_cuda
 
-from vdgs.doctor import cuda as doctor_cuda
 from vdgs.errors import VdgsError
-from vdgs.kernels import composed, cuda, devices, gsplat, native, operations, reference
-from vdgs.kernels.composed import rasteriser
+from vdgs.kernels import cpu, cuda, device_selection, gpu, gsplat, operations, torch_ref
 from vdgs.kernels.cuda import driver
 from vdgs.kernels.cuda import nvrtc as nvrtc_module
 from vdgs.kernels.cuda.driver import Card, CudaUnavailable
-from vdgs.kernels.devices import Choice, DeviceUnavailable, choose
-from vdgs.kernels.gsplat.rasterise import GsplatUnavailable
+from vdgs.kernels.device_selection import Choice, DeviceUnavailable, choose
+from vdgs.kernels.gpu import rasterizer
+from vdgs.kernels.gsplat.rasterize import GsplatUnavailable
 
 
 @pytest.fixture
@@ -33,19 +33,19 @@ def _two_cards(monkeypatch: pytest.MonkeyPatch):
 def test_the_sets_are_complete():
     assert tuple(sorted(operations.ON_A_CARD)) == operations.OPERATIONS
     for name in operations.OPERATIONS:
-        assert all(callable(getattr(room, name)) for room in (native, reference, composed))
+        assert all(callable(getattr(room, name)) for room in (cpu, torch_ref, gpu))
 
 
 @pytest.mark.parametrize("operation", operations.OPERATIONS)
 def test_the_table_says_who_does_what(operation):
     """Each operation of the composed set is the one that the table names; where it names two, both have it."""
     ways = [import_module(f"vdgs.kernels.{way}") for way in operations.taken(operation, "cuda")]
-    found = getattr(composed, operation)
+    found = getattr(gpu, operation)
     assert all(hasattr(way, operation) for way in ways)
     if len(ways) == 1:
         assert found is getattr(ways[0], operation)
     else:
-        assert found.__module__ == "vdgs.kernels.composed.rasteriser"
+        assert found.__module__ == "vdgs.kernels.gpu.rasterizer"
     assert operations.taken(operation, "cpu") == ("native",)
     assert operations.taken(operation, "mps") == ("reference",)
 
@@ -53,28 +53,28 @@ def test_the_table_says_who_does_what(operation):
 class TestWhichRasteriserDraws:
     @pytest.fixture(autouse=True)
     def _asked_anew(self):
-        rasteriser.chosen.cache_clear()
+        rasterizer.chosen.cache_clear()
         yield
-        rasteriser.chosen.cache_clear()
+        rasterizer.chosen.cache_clear()
 
     def test_gsplat_where_it_can_be_used_but_not_for_depth(self, monkeypatch):
-        monkeypatch.delenv(rasteriser.VARIABLE, raising=False)
-        monkeypatch.setattr(rasteriser, "load", lambda: None)
-        assert rasteriser._drawing(depth=False) is gsplat
-        assert rasteriser._drawing(depth=True) is cuda
+        monkeypatch.delenv(rasterizer.VARIABLE, raising=False)
+        monkeypatch.setattr(rasterizer, "load", lambda: None)
+        assert rasterizer._drawing(depth=False) is gsplat
+        assert rasterizer._drawing(depth=True) is cuda
 
     def test_the_own_kernels_elsewhere(self, monkeypatch):
         def none() -> None:
             raise GsplatUnavailable("gsplat is not here")
 
-        monkeypatch.setattr(rasteriser, "load", none)
-        assert rasteriser.chosen("") is rasteriser.chosen("cuda") is cuda
+        monkeypatch.setattr(rasterizer, "load", none)
+        assert rasterizer.chosen("") is rasterizer.chosen("cuda") is cuda
         with pytest.raises(GsplatUnavailable, match="not here"):
-            rasteriser.chosen("gsplat")
+            rasterizer.chosen("gsplat")
 
     def test_another_word_is_refused(self):
         with pytest.raises(VdgsError, match="VDGS_RASTERISER must be gsplat, cuda or not set"):
-            rasteriser.chosen("native")
+            rasterizer.chosen("native")
 
 
 def test_auto_takes_the_processor_until_a_card_has_run_it():
@@ -84,7 +84,7 @@ def test_auto_takes_the_processor_until_a_card_has_run_it():
 
 @pytest.mark.parametrize("asked", ["cuda", "cuda:1"])
 def test_a_card_that_cannot_be_used_is_refused(asked, monkeypatch):
-    monkeypatch.setattr(devices, "_no_card", lambda index: f"there is no card {index}")
+    monkeypatch.setattr(device_selection, "_no_card", lambda index: f"there is no card {index}")
     with pytest.raises(DeviceUnavailable, match=rf"--device {asked}: there is no card \d\. Use --device cpu"):
         choose(asked)
 
@@ -103,7 +103,7 @@ class TestWithCards:
         assert choose("auto").device == "cpu"
 
     def test_auto_takes_the_first_card_once_one_has_run_it(self, monkeypatch):
-        monkeypatch.setattr(devices, "RUN_ON_A_CARD", True)
+        monkeypatch.setattr(device_selection, "RUN_ON_A_CARD", True)
         assert choose("auto") == Choice("cuda:0", "there is a card that can be used")
 
     def test_a_card_that_is_not_there(self):
@@ -115,7 +115,7 @@ class TestWithCards:
             raise CudaUnavailable("There is no NVIDIA driver here")
 
         monkeypatch.setattr(driver, "cuda_driver", none)
-        monkeypatch.setattr(devices, "RUN_ON_A_CARD", True)
+        monkeypatch.setattr(device_selection, "RUN_ON_A_CARD", True)
         assert choose("auto") == Choice("cpu", "There is no NVIDIA driver here")
         with pytest.raises(DeviceUnavailable, match="no NVIDIA driver here"):
             choose("cuda")
@@ -127,7 +127,7 @@ class TestWithCards:
 
 
 def test_deciding_needs_no_torch():
-    code = "import sys, vdgs.kernels.devices as d; d.choose('auto'); print('torch' in sys.modules)"
+    code = "import sys, vdgs.kernels.device_selection as d; d.choose('auto'); print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "False"
 
 
@@ -141,7 +141,7 @@ def test_deciding_needs_no_torch():
     ],
 )
 def test_every_verb_that_computes_refuses_before_it_begins(arguments, tmp_path, monkeypatch, capsys):
-    from vdgs.cli import main
+    from vdgs.cli.main import main
 
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
@@ -153,7 +153,7 @@ def test_every_verb_that_computes_refuses_before_it_begins(arguments, tmp_path, 
 
 @pytest.mark.parametrize("device", ["auto", "cpu"])
 def test_a_device_that_can_is_no_news(device, tmp_path, monkeypatch, capsys):
-    from vdgs.cli import main
+    from vdgs.cli.main import main
 
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:

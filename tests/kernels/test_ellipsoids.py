@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.instruction_sets import on_threads, using
-from vdgs.kernels.native import ellipsoids as native
-from vdgs.kernels.native import module
-from vdgs.kernels.reference import ellipsoids as reference
-from vdgs.kernels.reference.ellipsoids import ellipsoids, logarithms
+from vdgs.kernels.cpu import ellipsoids as native
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.torch_ref import ellipsoids as reference
+from vdgs.kernels.torch_ref.ellipsoids import ellipsoids, logarithms
 
 BOTH = pytest.mark.parametrize("kernels", [native, reference], ids=["native", "reference"])
 
@@ -29,7 +29,7 @@ def seen(counts: list[int], seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, 
 def test_every_instruction_set_means_what_the_twin_means(counts, seed):
     given_pairs = seen(counts, seed)
     expected = logarithms(*reference.mean_ellipsoids(*given_pairs))
-    for isa in module.supported():
+    for isa in extension.supported():
         with using(isa):
             found = native.mean_ellipsoids(*given_pairs)
         # Ellipsoids as a whole: where two axes are alike, rounding decides where these two point.

@@ -18,10 +18,10 @@ from support.rasterize_scenes import (
     splats_of,
 )
 from vdgs.errors import VdgsError
-from vdgs.kernels.gsplat import rasterise, rasterise_vjp
-from vdgs.kernels.gsplat.rasterise import GsplatUnavailable, load, reach_px
-from vdgs.kernels.reference.rasterise import rasterise as reference
-from vdgs.kernels.reference.rasterise import rasterise_vjp as reference_vjp
+from vdgs.kernels.gsplat import rasterise_vjp, rasterize
+from vdgs.kernels.gsplat.rasterize import GsplatUnavailable, load, reach_px
+from vdgs.kernels.torch_ref.rasterize import rasterise as reference
+from vdgs.kernels.torch_ref.rasterize import rasterise_vjp as reference_vjp
 
 SCENES = {
     "ordinary": make_scene(120, 37, 29),
@@ -45,7 +45,7 @@ def _compiled(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.parametrize("name", SCENES)
 def test_it_draws_and_differentiates_what_the_reference_does(name):
     scene = SCENES[name]
-    ours = rasterise(*splats_of(scene.tensors), scene.width, scene.height, depth=True)
+    ours = rasterize(*splats_of(scene.tensors), scene.width, scene.height, depth=True)
     exact_scene = scene.to(torch.float64)
     exact = reference(*splats_of(exact_scene.tensors), scene.width, scene.height, depth=True)
     for actual, expected in zip(smooth(ours), smooth(exact), strict=True):
@@ -92,9 +92,9 @@ def test_gradients_of_the_first_splats_are_those_that_they_have_among_all():
 def test_unsuitable_arguments_are_refused():
     scene, engine = SCENES["ordinary"], SimpleNamespace()
     with pytest.raises(TypeError, match="means_px must be float32"):
-        rasterise(*splats_of(scene.to(torch.float64).tensors), 37, 29, engine=engine)
+        rasterize(*splats_of(scene.to(torch.float64).tensors), 37, 29, engine=engine)
     with pytest.raises(ValueError, match="width"):
-        rasterise(*splats_of(scene.tensors), 0, 29, engine=engine)
+        rasterize(*splats_of(scene.tensors), 0, 29, engine=engine)
 
 
 def test_without_compiled_kernels_the_error_says_so(monkeypatch: pytest.MonkeyPatch):
@@ -125,7 +125,7 @@ def test_without_gsplat_the_error_says_what_to_install(monkeypatch: pytest.Monke
     monkeypatch.setitem(sys.modules, "gsplat", None)
     scene = SCENES["ordinary"]
     with pytest.raises(GsplatUnavailable, match=r"import of gsplat halted.*vdgs\[gsplat\]") as raised:
-        rasterise(*splats_of(scene.tensors), scene.width, scene.height)
+        rasterize(*splats_of(scene.tensors), scene.width, scene.height)
     assert isinstance(raised.value, VdgsError)
 
 
@@ -135,7 +135,7 @@ def test_gsplat_itself_draws_what_the_reference_does(name):
     pytest.importorskip("gsplat")
     scene = SCENES[name]
     there = [tensor.detach().cuda().requires_grad_() for tensor in scene.tensors]
-    ours = rasterise(*splats_of(there), scene.width, scene.height, depth=True)
+    ours = rasterize(*splats_of(there), scene.width, scene.height, depth=True)
     exact = reference(*splats_of(scene.to(torch.float64).tensors), scene.width, scene.height, depth=True)
     for actual, expected in zip(smooth(ours), smooth(exact), strict=True):
         assert_close(actual.cpu(), expected, 1e-3)

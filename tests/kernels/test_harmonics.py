@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.instruction_sets import on_threads, using
-from vdgs.export.baking import RIDGE
-from vdgs.kernels.native import harmonics as native
-from vdgs.kernels.native import module
-from vdgs.kernels.reference import harmonics as reference
+from vdgs.export.bake import RIDGE
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.cpu import harmonics as native
 from vdgs.kernels.spherical_harmonics import basis, function_count, view_colours
+from vdgs.kernels.torch_ref import harmonics as reference
 
 BOTH = pytest.mark.parametrize("kernels", [native, reference], ids=["native", "reference"])
 
@@ -55,7 +55,7 @@ def test_each_regression_is_solved_as_if_it_were_alone(kernels, degree):
 def test_every_instruction_set_fits_what_the_twin_fits(counts, degree, seed):
     given_pairs = seen(counts, seed)
     expected = reference.fit_harmonics(*given_pairs, degree, RIDGE)
-    for isa in module.supported():
+    for isa in extension.supported():
         with using(isa):
             found = native.fit_harmonics(*given_pairs, degree, RIDGE)
         torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
@@ -120,7 +120,7 @@ def test_every_instruction_set_shows_what_the_twin_shows(n, degree, seed):
     rows = torch.randint(n, (2 * n,), generator=generator)
     means, eye = 9 * torch.randn(len(rows), 3, generator=generator), torch.tensor([0.3, -0.4, 20.0])
     expected = reference.harmonic_colours(means, coefficients, rows, eye, degree)
-    for isa in module.supported():
+    for isa in extension.supported():
         with using(isa):
             shown = native.harmonic_colours(means, coefficients, rows, eye, degree)
             one = native.harmonic_colours(means[:1], coefficients, rows[:1], means[0], degree)

@@ -7,7 +7,7 @@ import pytest
 
 HOLED = """
 import torch
-from vdgs.memory.process import return_unused
+from vdgs.system.memory.process_memory import return_unused
 
 def resident():
     with open("/proc/self/status") as status:

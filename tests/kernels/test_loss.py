@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from support.instruction_sets import every_instruction_set, on_threads, using
 from support.loss_scenes import scene, with_gradient
-from vdgs.kernels.native import loss as native
-from vdgs.kernels.reference import loss as reference
+from vdgs.kernels.cpu import loss as native
+from vdgs.kernels.torch_ref import loss as reference
 
 SIZES = [(1, 1), (1, 7), (3, 2), (5, 40), (37, 1), (13, 29), (64, 33), (131, 70)]
 

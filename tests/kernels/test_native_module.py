@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from support.commands import python
-from vdgs.kernels.native import module as native_module
-from vdgs.kernels.native.module import NativeUnavailable, load, native, supported
+from vdgs.kernels.cpu import extension as native_module
+from vdgs.kernels.cpu.extension import NativeUnavailable, load, native, supported
 
 ISAS = supported()
 
@@ -37,7 +37,7 @@ def test_unknown_instruction_set_is_refused_by_name() -> None:
 
 
 def test_environment_chooses_instruction_set_and_threads() -> None:
-    code = "from vdgs.kernels.native import module as m; print(m.isa(), m.threads())"
+    code = "from vdgs.kernels.cpu import module as m; print(m.isa(), m.threads())"
     done = python(code, VDGS_ISA="portable", VDGS_THREADS="3")
     assert done.stdout.split() == ["portable", "3"]
 
@@ -50,7 +50,7 @@ def test_environment_chooses_instruction_set_and_threads() -> None:
     ],
 )
 def test_environment_errors_say_what_is_wrong(variable: str, value: str, message: str) -> None:
-    done = python("from vdgs.kernels.native import module as m; m.native()", **{variable: value})
+    done = python("from vdgs.kernels.cpu import module as m; m.native()", **{variable: value})
     assert done.returncode != 0
     assert message in done.stderr
 
@@ -151,7 +151,7 @@ def test_an_exception_in_a_task_reaches_the_caller(isa: str) -> None:
 
 FORK = """
 import os, sys
-from vdgs.kernels.native.module import load, supported
+from vdgs.kernels.cpu.extension import load, supported
 modules = [load(name) for name in supported()]
 for m in modules:
     m.set_threads(4)

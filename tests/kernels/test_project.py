@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.decode_scenes import looking_down, turned
-from vdgs.cameras import Camera
+from vdgs.geometry.camera import Camera
 from vdgs.kernels import constants
 from vdgs.kernels.constants import DILATION_PX2
-from vdgs.kernels.native import module
-from vdgs.kernels.native.project import project as native_project
-from vdgs.kernels.reference.project import project as twin_project
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.cpu.project import project as native_project
 from vdgs.kernels.rotations import rotation_matrices
+from vdgs.kernels.torch_ref.project import project as twin_project
 
 CAMERAS = [looking_down(), looking_down("orthographic"), turned(), turned().cropped(20, 5, 50, 40)]
 
@@ -93,9 +93,9 @@ def test_what_is_not_valid_is_zero_and_has_no_gradient(camera):
 
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("make", [awkward, lambda: gaussians(333, seed=3), lambda: gaussians(0)])
-@pytest.mark.parametrize("isa", module.supported())
+@pytest.mark.parametrize("isa", extension.supported())
 def test_native_equals_the_twin(camera, make, isa, monkeypatch):
-    monkeypatch.setattr(module, "native", lambda: module.load(isa))
+    monkeypatch.setattr(extension, "native", lambda: extension.load(isa))
     exact = [t.float().double().requires_grad_() for t in make()]
     single = [t.detach().float().requires_grad_() for t in exact]
     twin = twin_project(*exact, camera)
@@ -138,9 +138,9 @@ def test_moving_the_world_and_the_camera_together_changes_nothing(seed, angle):
     torch.testing.assert_close(a.conics, b.conics)
 
 
-@pytest.mark.parametrize("isa", module.supported())
+@pytest.mark.parametrize("isa", extension.supported())
 def test_the_constants_of_the_kernels_are_those_of_the_twins(isa):
-    for name, value in module.load(isa).constants.items():
+    for name, value in extension.load(isa).constants.items():
         assert value == pytest.approx(getattr(constants, name), rel=1e-6), name
 
 

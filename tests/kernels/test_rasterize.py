@@ -27,11 +27,11 @@ from support.rasterize_scenes import (
     splats_of,
 )
 from vdgs.kernels import constants
-from vdgs.kernels.native.module import load, supported
-from vdgs.kernels.native.rasterise import rasterise, rasterise_vjp, shares
-from vdgs.kernels.reference.rasterise import rasterise as reference
-from vdgs.kernels.reference.shares import shares as twin
-from vdgs.kernels.types import Raster, Splats
+from vdgs.kernels.cpu.extension import load, supported
+from vdgs.kernels.cpu.rasterize import rasterise, rasterise_vjp, shares
+from vdgs.kernels.kernel_types import Raster, Splats
+from vdgs.kernels.torch_ref.rasterize import rasterise as reference
+from vdgs.kernels.torch_ref.splat_contributions import shares as twin
 
 ISAS = supported()
 NAMES = ("means_px", "conics", "colours", "opacities", "depths", "background")

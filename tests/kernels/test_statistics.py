@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-import vdgs.kernels.native.statistics as native
-import vdgs.kernels.reference.statistics as reference
+import vdgs.kernels.cpu.statistics as native
+import vdgs.kernels.torch_ref.statistics as reference
 from support.decode_scenes import view_statistics
 from support.instruction_sets import every_instruction_set, on_threads, using
-from vdgs.kernels.types import Statistics
+from vdgs.kernels.kernel_types import Statistics
 
 
 @every_instruction_set

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.instruction_sets import every_instruction_set, on_threads, using
-from vdgs.cameras import NEAR, Camera
-from vdgs.kernels.native import visibility as native
-from vdgs.kernels.reference import visibility as reference
+from vdgs.geometry.camera import NEAR, Camera
+from vdgs.kernels.cpu import visibility as native
+from vdgs.kernels.torch_ref import visibility as reference
 
 
 def rotation(generator: np.random.Generator) -> np.ndarray:

@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vdgs.cameras import Camera
-from vdgs.model.gaps import CELL_VOXELS, LARGEST_SHARE, gap_points
+from vdgs.geometry.camera import Camera
+from vdgs.model.initialization.gap_filling import CELL_VOXELS, LARGEST_SHARE, gap_points
 
 VOXEL = 0.25
 

@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from support.hand_made_models import camera_above, model_at, quadrant_of, quadrants
+from vdgs.config.method import MergeConfig
 from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata, Part
 from vdgs.model.anchors import Anchors
-from vdgs.model.render import decode_view, render, render_values
+from vdgs.model.renderer import decode_view, render, render_values
 from vdgs.partition.merging import merge
-from vdgs.settings.method import MergeConfig
 
 VIEWS = [camera_above(0.3, -0.2), camera_above(-2.0, 1.0, tilt_deg=30.0), camera_above(40.0, 40.0)]
 

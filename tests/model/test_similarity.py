@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from support.gaussians import overhead, picture, psnr, random_gaussians
-from vdgs.cameras import Camera
+from vdgs.geometry.camera import Camera
 from vdgs.kernels.spherical_harmonics import view_colours
-from vdgs.model.similarity import band_rotation, covariances, quaternion_of, rotate_harmonics, transformed
+from vdgs.model.gaussian_transform import band_rotation, covariances, quaternion_of, rotate_harmonics, transformed
 
 
 def moved(camera: Camera, scale: float, rotation: np.ndarray, translation: np.ndarray) -> Camera:

@@ -13,11 +13,19 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
-from vdgs.stereo import Cell, StereoInputs, StereoView, dense, dense_points, depth_of_pair, partners
-from vdgs.stereo.dense import SIZES, SPACING
-from vdgs.stereo.rectification import Rectified
+from vdgs.geometry.camera import Camera
+from vdgs.model.initialization.stereo import (
+    Cell,
+    StereoInputs,
+    StereoView,
+    dense_points,
+    depth_of_pair,
+    fusion,
+    view_selection,
+)
+from vdgs.model.initialization.stereo.fusion import SIZES, SPACING
+from vdgs.model.initialization.stereo.rectification import Rectified
 
 HEIGHT, ROOF, HALF = 20.0, 4.0, 5.0  # of the flight, of a roof about the origin, and half its edge
 SLOPE = 0.05
@@ -178,15 +186,15 @@ def test_the_same_points_for_any_number_of_threads(tmp_path):
 def test_a_place_that_many_photographs_show_takes_no_more_memory(monkeypatch):
     """However often it is shown, as many cells are held as it has, and once more so many; each is the sum of all."""
     rng, shown = np.random.default_rng(0), 200
-    photographs = [dense._Cells(np.sort(rng.permutation(300)[:100]), rng.normal(size=(100, 8))) for _ in range(shown)]
-    at_once = dense._Cells.together(photographs)
-    held, of = list[int](), dense._Cells.of
-    monkeypatch.setattr(dense._Cells, "of", lambda keys, values: held.append(len(keys)) or of(keys, values))
-    found = dense._summed(iter(photographs), most_waiting=150)
+    photographs = [fusion._Cells(np.sort(rng.permutation(300)[:100]), rng.normal(size=(100, 8))) for _ in range(shown)]
+    at_once = fusion._Cells.together(photographs)
+    held, of = list[int](), fusion._Cells.of
+    monkeypatch.setattr(fusion._Cells, "of", lambda keys, values: held.append(len(keys)) or of(keys, values))
+    found = fusion._summed(iter(photographs), most_waiting=150)
     assert max(held) <= 300 + 300 + 100
     assert np.array_equal(found.keys, at_once.keys)
     assert np.array_equal(found.sums, at_once.sums)
-    assert len(dense._summed(iter([])).keys) == 0
+    assert len(fusion._summed(iter([])).keys) == 0
 
 
 def test_two_photographs_are_enough_and_one_is_not(tmp_path):
@@ -244,10 +252,10 @@ def test_partners_stand_on_all_sides_and_see_the_same_ground():
     grid = [camera(x, y) for y in (-4.0, 0.0, 4.0) for x in (-4.0, 0.0, 4.0)]
     elsewhere = [camera(100.0 + x, 0.0) for x in (-2.0, 2.0)]
     points = np.concatenate([sparse(), sparse() + np.array([100.0, 0, 5.0])])
-    found = partners([*grid, *elsewhere], points, count=4)
+    found = view_selection([*grid, *elsewhere], points, count=4)
     middle = np.array([grid[other].position[:2] for other in found[4]])
     assert (middle.min(0) < 0).all()
     assert (middle.max(0) > 0).all()
     assert all(other < 9 for mine in found[:9] for other in mine)
     assert (found[9], found[10]) == ([10], [9])
-    assert partners(grid, np.zeros((0, 3))) == [[]] * 9
+    assert view_selection(grid, np.zeros((0, 3))) == [[]] * 9

@@ -14,13 +14,13 @@ from rich.console import Console
 
 from support.assignment import CONFIG, MODES, camera, hand_made, scene, skyward, strips
 from vdgs.errors import RunError
-from vdgs.kernels import native as kernels
-from vdgs.partition.assignment.assign import ABOVE_THRESHOLD, BEST_BLOCK, NOT_ASSIGNED, TOPPED_UP, assign
-from vdgs.partition.assignment.saving import load_scores, save_scores
-from vdgs.partition.assignment.scores import score_matrix
-from vdgs.partition.assignment.tables import assignment_rows, assignment_table, explain
-from vdgs.partition.records import AssignedBlock
-from vdgs.storage.records import plain, record_of
+from vdgs.kernels import cpu as kernels
+from vdgs.partition.assignment.assign_cameras import ABOVE_THRESHOLD, BEST_BLOCK, NOT_ASSIGNED, TOPPED_UP, assign
+from vdgs.partition.assignment.assignment_tables import assignment_rows, assignment_table, explain
+from vdgs.partition.assignment.score_file import load_scores, save_scores
+from vdgs.partition.assignment.score_matrix import score_matrix
+from vdgs.partition.block_records import AssignedBlock
+from vdgs.system.records import plain, record_of
 
 # Whom each block gets
 

@@ -10,13 +10,13 @@ import torch
 
 from support.assignment import CONFIG, MODES, RENDERED, WIDTH, camera, flight, scene, skyward, strips
 from support.instruction_sets import every_instruction_set, on_threads, using
-from vdgs.cameras import Camera
-from vdgs.kernels import native as kernels
+from vdgs.config.method import AssignmentConfig
+from vdgs.geometry.camera import Camera
+from vdgs.kernels import cpu as kernels
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.render import decode_rows, render, visible_rows
-from vdgs.partition.assignment.scores import score_matrix, select_splats
+from vdgs.model.renderer import decode_rows, render, visible_rows
+from vdgs.partition.assignment.score_matrix import score_matrix, select_splats
 from vdgs.partition.blocks import Blocks
-from vdgs.settings.method import AssignmentConfig
 
 
 @pytest.mark.parametrize("mode", RENDERED)

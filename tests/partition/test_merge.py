@@ -12,15 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.hand_made_models import camera_above, model_at, opaque_plane, quadrant_of, quadrants
+from vdgs.config.method import MergeConfig
 from vdgs.errors import VdgsError
-from vdgs.kernels import native as kernels
+from vdgs.kernels import cpu as kernels
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
-from vdgs.model.render import render
+from vdgs.model.renderer import render
+from vdgs.partition.block_records import MergedBlock
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.merging import giver_of_places, merge
-from vdgs.partition.records import MergedBlock
-from vdgs.settings.method import MergeConfig
 
 OWNER, BEST_SEEN = MergeConfig("owner"), MergeConfig("best_seen")
 NO_CAMERAS = [[]] * 4

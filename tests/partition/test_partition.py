@@ -15,18 +15,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.affinity import translate
 
-from vdgs.cameras import Camera
 from vdgs.captures.capture import GroundFrame
-from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
+from vdgs.config.method import BlockConfig, MethodConfig, PartitionConfig
+from vdgs.config.presets import PRESETS
 from vdgs.errors import RunError, VdgsError
-from vdgs.partition import cluster
+from vdgs.geometry.camera import Camera
+from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
+from vdgs.partition import clustering
 from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks, save_blocks_wgs84
 from vdgs.partition.boundary import alpha_shape, widen
-from vdgs.partition.cut import choose_block_count, cut_scene
-from vdgs.runs.folder import RunFolder
-from vdgs.settings.method import BlockConfig, MethodConfig, PartitionConfig
-from vdgs.settings.presets import PRESETS
-from vdgs.stages.train import _block_bytes
+from vdgs.partition.partition_scene import choose_block_count, cut_scene
+from vdgs.pipeline.train_blocks import _block_bytes
+from vdgs.runs.run_folder import RunFolder
 
 
 def town(n: int = 4000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -195,9 +195,9 @@ def test_balanced_blocks_hold_about_equally_many_anchors() -> None:
 def test_weights_of_balanced_clusters_are_those_of_a_look_at_all_costs_in_each_step(count: int, digits: int) -> None:
     """Ties too, among features that were rounded."""
     features = np.round(np.random.default_rng(count).normal(size=(60 * count, 3)), digits)
-    squares = cluster._squares(features, features[:count])
+    squares = clustering._squares(features, features[:count])
     share, weights = 60, np.zeros(count)
-    for _ in range(cluster.BALANCED_SWEEPS * count):
+    for _ in range(clustering.BALANCED_SWEEPS * count):
         costs = squares - weights
         sizes = np.bincount(costs.argmin(axis=1), minlength=count)
         worst = int(np.abs(sizes - share).argmax())
@@ -206,7 +206,7 @@ def test_weights_of_balanced_clusters_are_those_of_a_look_at_all_costs_in_each_s
         costs[:, worst] = np.inf
         margins = np.sort(squares[:, worst] - costs.min(axis=1))
         weights[worst] = (margins[share - 1] + margins[share]) / 2
-    assert np.array_equal(cluster._balance(squares, np.zeros(count)), weights - weights.mean())
+    assert np.array_equal(clustering._balance(squares, np.zeros(count)), weights - weights.mean())
 
 
 def test_anchors_that_cannot_be_cut_are_refused() -> None:

@@ -12,20 +12,20 @@ import shapely
 import torch
 from scipy import ndimage
 
-from vdgs.cameras import Camera
+from vdgs.config.method import AssignmentConfig, MergeConfig
+from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.frustum import Frusta, project
-from vdgs.model.groups import GROUP, Groups
-from vdgs.model.sizes import REACH, SPAN, largest_log_scales
+from vdgs.model.scale_bounds import REACH, SPAN, largest_log_scales
 from vdgs.partition import boundary
-from vdgs.partition.assignment import scores as scoring
+from vdgs.partition.assignment import score_matrix as scoring
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.merging import merge
-from vdgs.partition.nearest import Cores
-from vdgs.settings.method import AssignmentConfig, MergeConfig
-from vdgs.synth import sparse, surveying
+from vdgs.partition.polygon_lookup import Cores
+from vdgs.synth import synthetic_points, true_visibility
+from vdgs.visibility.frustum import Frusta, project
+from vdgs.visibility.spatial_groups import GROUP, Groups
 
 
 def flight(count: int, extent: float, seed: int = 0) -> list[Camera]:
@@ -267,16 +267,16 @@ def test_matches_are_drawn_alike_in_any_pieces(monkeypatch: pytest.MonkeyPatch) 
     cameras, places = flight(9, 60.0), site(300, 60.0).double().numpy()
     visible = np.stack([camera.sees(places) for camera in cameras], axis=1)
     home = np.random.default_rng(1).integers(0, 9, len(places))
-    whole = sparse._matched(cameras, places, home, visible, np.random.default_rng(2))
-    monkeypatch.setattr(sparse, "_PAIRS", 70)
-    pieces = sparse._matched(cameras, places, home, visible, np.random.default_rng(2))
+    whole = synthetic_points._matched(cameras, places, home, visible, np.random.default_rng(2))
+    monkeypatch.setattr(synthetic_points, "_PAIRS", 70)
+    pieces = synthetic_points._matched(cameras, places, home, visible, np.random.default_rng(2))
     assert whole.any()
     assert np.array_equal(whole, pieces)
 
 
 def test_observations_by_image_are_all_of_them_in_order() -> None:
     image = np.random.default_rng(3).integers(0, 7, 200)
-    found = sparse.observations_by_image(image, 9)
+    found = synthetic_points.observations_by_image(image, 9)
     assert [part.tolist() for part in found] == [np.flatnonzero(image == k).tolist() for k in range(9)]
 
 
@@ -285,7 +285,7 @@ def test_cameras_about_places_are_all_that_see_any() -> None:
     for seed in range(20):
         middle = np.random.default_rng(seed).uniform(0, 500, 2)
         places = np.random.default_rng(seed).normal([*middle, 3.0], [15, 15, 2], (50, 3))
-        about = surveying._about(cameras, places)
+        about = true_visibility._about(cameras, places)
         assert {id(c) for c in cameras if c.sees(places).any()} <= {id(c) for c in about}
         assert len(about) < len(cameras)
-    assert surveying._about(cameras, np.zeros((0, 3))) == []
+    assert true_visibility._about(cameras, np.zeros((0, 3))) == []

@@ -7,14 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.captures import tiny_scene
-from vdgs.partition.assignment.assign import assign
-from vdgs.partition.assignment.saving import load_scores, save_scores
-from vdgs.partition.assignment.scores import Scores
+from vdgs.config.method import AssignmentConfig
+from vdgs.partition.assignment.assign_cameras import assign
+from vdgs.partition.assignment.score_file import load_scores, save_scores
+from vdgs.partition.assignment.score_matrix import Scores
 from vdgs.partition.strategies import STRATEGIES
 from vdgs.partition.strategies.citygaussian import contract, expand
 from vdgs.partition.strategies.strategy import grid_shape
 from vdgs.partition.strategies.vastgaussian import covered_share
-from vdgs.settings.method import AssignmentConfig
 
 SCENE = tiny_scene(6, 4)
 CAMERAS = list(SCENE.cameras.values())

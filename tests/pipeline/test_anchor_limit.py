@@ -11,17 +11,17 @@ from rich.console import Console
 
 from experiments.bench.plan import Choices, make_plan
 from support.captures import tiny_scene, write_colmap
-from vdgs.runs.beginning import begin_run
-from vdgs.runs.folder import RunFolder
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.checks import validate
-from vdgs.settings.method import BlockConfig, GrowthConfig, MethodConfig, block_limit
-from vdgs.settings.watching import WatchOptions
-from vdgs.stages.block import train_block
-from vdgs.stages.coarse import train_coarse
-from vdgs.stages.merge import merge_run
-from vdgs.stages.partition import partition_run
-from vdgs.stages.visibility import measure_visibility
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.method import BlockConfig, GrowthConfig, MethodConfig, block_limit
+from vdgs.config.validation_rules import validate
+from vdgs.pipeline.count_visibility import measure_visibility
+from vdgs.pipeline.merge_blocks import merge_run
+from vdgs.pipeline.partition_stage import partition_run
+from vdgs.pipeline.train_block import train_block
+from vdgs.pipeline.train_coarse import train_coarse
+from vdgs.runs.create_or_resume import begin_run
+from vdgs.runs.run_folder import RunFolder
 
 counts = st.lists(st.integers(0, 10**6), min_size=1, max_size=16).filter(any)
 

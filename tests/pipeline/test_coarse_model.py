@@ -13,23 +13,23 @@ from support.captures import tiny_scene, write_colmap
 from support.fake_device import CARD, pretended_card
 from support.hand_made_models import model_at
 from vdgs.captures.capture import Capture
-from vdgs.captures.facts import capture_facts
+from vdgs.captures.capture_metadata import capture_facts
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.method import AnchorConfig, GrowthConfig, MethodConfig, TrainConfig
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
-from vdgs.runs.beginning import begin_run
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import open_run
+from vdgs.pipeline.count_visibility import measure_visibility
+from vdgs.pipeline.train_coarse import train_coarse
+from vdgs.runs.create_or_resume import begin_run
+from vdgs.runs.open_run import open_run
 from vdgs.runs.run_context import RunContext
-from vdgs.runs.standing import standing_of
+from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_status import standing_of
 from vdgs.runs.status import Status
-from vdgs.runs.visibility import keep_visibility
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.method import AnchorConfig, GrowthConfig, MethodConfig, TrainConfig
-from vdgs.settings.watching import WatchOptions
-from vdgs.stages.coarse import train_coarse
-from vdgs.stages.visibility import measure_visibility
-from vdgs.storage.files import write_json
-from vdgs.storage.tensors import identity
+from vdgs.runs.visibility_store import keep_visibility
+from vdgs.system.atomic_files import write_json
+from vdgs.system.tensors import identity
 
 UP, QUIET = CaptureOptions(up="z"), Console(quiet=True)
 #: Some steps, at the end of which all that was seen is taken for transparent.

@@ -18,18 +18,18 @@ from rich.console import Console
 from experiments.bench.worker import Job, work
 from support.captures import tiny_scene, write_colmap
 from support.flights import write_photograph
-from vdgs.captures.facts import capture_facts
-from vdgs.cli import main
+from vdgs.captures.capture_metadata import capture_facts
+from vdgs.cli.main import main
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.commands import RunRequest
+from vdgs.config.presets import PRESETS
+from vdgs.config.serialization import to_dict
 from vdgs.errors import RunError
-from vdgs.pipeline import with_capture
-from vdgs.runs.beginning import begin_run, driven_run
-from vdgs.runs.folder import RunFolder
+from vdgs.pipeline.run_pipeline import with_capture
+from vdgs.runs.create_or_resume import begin_run, driven_run
+from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.status import Status
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.plain import to_dict
-from vdgs.settings.presets import PRESETS
-from vdgs.settings.requests import RunRequest
-from vdgs.storage.files import write_json
+from vdgs.system.atomic_files import write_json
 
 #: Another process that drives a run: it holds the lock of which it is told until its input ends.
 DRIVER = (

@@ -10,18 +10,18 @@ import pytest
 from rich.console import Console
 
 from support.captures import tiny_scene, write_colmap
-from vdgs.cli import main
+from vdgs.cli.main import main
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.commands import RenderRequest
+from vdgs.config.method import AnchorConfig, MethodConfig, TrainConfig
 from vdgs.errors import CaptureError, RunError, VdgsError
-from vdgs.films.film import render_run
-from vdgs.runs.beginning import begin_run
-from vdgs.runs.flight import flight_of, kept_flight
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import open_capture, open_model, open_run, remember_capture
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.method import AnchorConfig, MethodConfig, TrainConfig
-from vdgs.settings.requests import RenderRequest
-from vdgs.settings.watching import WatchOptions
-from vdgs.stages.coarse import train_coarse
+from vdgs.pipeline.train_coarse import train_coarse
+from vdgs.rendering.render_run import render_run
+from vdgs.runs.create_or_resume import begin_run
+from vdgs.runs.open_run import open_capture, open_model, open_run, remember_capture
+from vdgs.runs.run_cameras import flight_of, kept_flight
+from vdgs.runs.run_folder import RunFolder
 
 pytestmark = pytest.mark.xdist_group("moved_capture")
 
@@ -178,7 +178,7 @@ def test_damaged_cameras_are_said_or_read_anew(folder, tmp_path, text):
 
 
 def test_pictures_too_large_for_memory_are_refused_before_they_are_drawn(trained, tmp_path, monkeypatch):
-    monkeypatch.setattr("vdgs.films.film.available_bytes", lambda: 1_000_000)
+    monkeypatch.setattr("vdgs.rendering.render_run.available_bytes", lambda: 1_000_000)
     with pytest.raises(VdgsError, match=r"a picture of 1000x750 takes about \d+ MB.*smaller --width"):
         render_run(RenderRequest(run=trained / "run", output=tmp_path / "o", width=1000, device="cpu"), QUIET)
     with pytest.raises(VdgsError, match=r"pictures of 12000x\d+ are too large|takes about"):

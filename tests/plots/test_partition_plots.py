@@ -15,17 +15,17 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from vdgs.cameras import Camera
 from vdgs.captures.capture import GroundFrame
-from vdgs.figures.seen_map import without_speckles
-from vdgs.figures.style import DPI, titles
+from vdgs.config.method import PartitionConfig
+from vdgs.geometry.camera import Camera
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.figures import maps as figures
-from vdgs.partition.figures.facts import block_facts
-from vdgs.partition.figures.scores import order_of_cameras
-from vdgs.partition.figures.words import PALETTE, block_colour
-from vdgs.settings.method import PartitionConfig
-from vdgs.stages.partition import how_cut
+from vdgs.pipeline.partition_stage import how_cut
+from vdgs.plots.partition import block_maps as figures
+from vdgs.plots.partition.block_stats import block_facts
+from vdgs.plots.partition.score_heatmap import order_of_cameras
+from vdgs.plots.partition.words import PALETTE, block_colour
+from vdgs.plots.style import DPI, titles
+from vdgs.plots.visibility_map import without_speckles
 
 #: Names of x and y.
 METRES = ("east (m)", "north (m)")

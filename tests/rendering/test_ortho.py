@@ -17,22 +17,22 @@ from rich.console import Console
 
 from support.captures import look_down
 from support.hand_made_models import model_at, opaque_plane
-from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.config.commands import MapRequest
 from vdgs.errors import VdgsError
-from vdgs.maps import folder, mapping, sharpening, tiles
-from vdgs.maps.geotiff import CACHE_BYTES, bounded_cache
-from vdgs.maps.grid import TILE_PX, Grid, extent_of, grid_over, ground_sampling
-from vdgs.maps.overhead import Overhead
-from vdgs.maps.pictures import hillshade, round_length
-from vdgs.maps.sharpening import Sharpener
-from vdgs.maps.tiles import NO_COUNT, NO_HEIGHT, Surveyor, samples_for
+from vdgs.geometry.camera import Camera
+from vdgs.geometry.map_projection import Placement
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
-from vdgs.model.render import render
-from vdgs.placing.placement import Placement
+from vdgs.model.renderer import render
+from vdgs.rendering.ortho import detail_transfer, ortho_folder, render_ortho, tile_renderer
+from vdgs.rendering.ortho.detail_transfer import Sharpener
+from vdgs.rendering.ortho.geotiff import CACHE_BYTES, bounded_cache
+from vdgs.rendering.ortho.nadir_camera import Overhead
+from vdgs.rendering.ortho.pixel_grid import TILE_PX, Grid, extent_of, grid_over, ground_sampling
+from vdgs.rendering.ortho.previews import hillshade, round_length
+from vdgs.rendering.ortho.tile_renderer import NO_COUNT, NO_HEIGHT, Surveyor, samples_for
 from vdgs.runs.run_context import RunContext
-from vdgs.settings.requests import MapRequest
 
 rasterio = pytest.importorskip("rasterio")
 pytest.importorskip("pyproj")
@@ -100,12 +100,12 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """`vdgs map` of a model and a capture that were never trained; returns the folder of the maps."""
 
     def run(capture: Capture, model: AnchorModel, **asked) -> Path:
-        folder = SimpleNamespace(path=tmp_path / "run")
+        ortho_folder = SimpleNamespace(path=tmp_path / "run")
         status = SimpleNamespace(model="1-2")
-        opened = SimpleNamespace(folder=folder, capture=capture, model=model, name="coarse", status=status)
+        opened = SimpleNamespace(folder=ortho_folder, capture=capture, model=model, name="coarse", status=status)
         monkeypatch.setattr(RunContext, "open_model", lambda *_: opened)
         request = MapRequest(run=tmp_path / "run", device="cpu", **asked)
-        return mapping.map_run(RunContext.from_path(request.run), request, Console(file=sys.stderr, soft_wrap=True))
+        return render_ortho.map_run(RunContext.from_path(request.run), request, Console(file=sys.stderr, soft_wrap=True))
 
     run.path = tmp_path / "run"
     return run
@@ -135,10 +135,10 @@ def test_every_place_falls_on_its_pixel_to_a_tenth(crs, away):
 
 def test_files_open_at_the_right_place_with_the_right_heights(house, make):
     capture, model = house
-    folder = make(capture, model, gsd=0.1)
+    ortho_folder = make(capture, model, gsd=0.1)
     corners = np.array([[HOUSE[0], HOUSE[1], ROOF], [HOUSE[2], HOUSE[3], ROOF]])
     easting, northing, height = Placement.of(capture.ground).places(corners.mean(axis=0, keepdims=True))[0]
-    with rasterio.open(folder / "dsm.tif") as file:
+    with rasterio.open(ortho_folder / "dsm.tif") as file:
         assert file.crs.to_epsg() == 32632
         heights = file.read(1)
         roof = np.argwhere(heights > height - ROOF / 2)
@@ -151,17 +151,17 @@ def test_files_open_at_the_right_place_with_the_right_heights(house, make):
     camera = capture.views[2].camera
     depth = render(model, camera, depth=True).median_depth
     place = Placement.of(capture.ground).places(camera.unproject(depth.numpy())[24, 32][None])[0]
-    with rasterio.open(folder / "dsm.tif") as file:
+    with rasterio.open(ortho_folder / "dsm.tif") as file:
         assert file.read(1)[file.index(*place[:2])] == pytest.approx(place[2], abs=0.05)
 
 
 def test_files_are_cloud_optimised_and_say_what_they_are(house, make):
-    folder = make(*house, gsd=0.03)
-    names = {file.name for file in folder.iterdir()}
+    ortho_folder = make(*house, gsd=0.03)
+    names = {file.name for file in ortho_folder.iterdir()}
     assert names == {"orthophoto.tif", "dsm.tif", "visibility.tif", "hillshade.png", "preview.png", "map.json"}
     layers = {"orthophoto": (4, "uint8", None), "dsm": (1, "float32", NO_HEIGHT), "visibility": (1, "uint16", NO_COUNT)}
     for name, (count, dtype, nodata) in layers.items():
-        with rasterio.open(folder / f"{name}.tif") as file:
+        with rasterio.open(ortho_folder / f"{name}.tif") as file:
             assert (file.count, file.dtypes[0], file.nodata) == (count, dtype, nodata)
             structure = file.tags(ns="IMAGE_STRUCTURE")
             assert (structure["LAYOUT"], structure["COMPRESSION"]) == ("COG", "DEFLATE")
@@ -169,19 +169,19 @@ def test_files_are_cloud_optimised_and_say_what_they_are(house, make):
             assert file.overviews(1)
             assert "ellipsoidal" in file.tags()["HEIGHTS"]
             assert file.tags()["MODEL"] == "coarse"
-    with rasterio.open(folder / "dsm.tif") as file:
+    with rasterio.open(ortho_folder / "dsm.tif") as file:
         assert file.units == ("m",)
         assert "ellipsoidal" in file.descriptions[0]
 
 
 def test_overviews_have_no_height_between_roof_and_street_either(house, make):
-    folder = make(*house, gsd=0.03)
+    ortho_folder = make(*house, gsd=0.03)
     for name, nothing in (("dsm", NO_HEIGHT), ("visibility", NO_COUNT)):
-        with rasterio.open(folder / f"{name}.tif") as file:
+        with rasterio.open(ortho_folder / f"{name}.tif") as file:
             whole, factors = file.read(1), file.overviews(1)
         assert factors
         for level in range(len(factors)):
-            with rasterio.open(folder / f"{name}.tif", overview_level=level) as file:
+            with rasterio.open(ortho_folder / f"{name}.tif", overview_level=level) as file:
                 values = file.read(1)
             assert set(np.unique(values)) <= set(np.unique(whole))
             assert (values != nothing).mean() == pytest.approx((whole != nothing).mean(), abs=0.02)
@@ -275,9 +275,9 @@ def _above(x: float, y: float, z: float) -> Camera:
 
 def test_a_capture_without_georeference_has_a_map_that_says_so(house, make, capsys):
     capture, model = house
-    folder = make(replace(capture, ground=replace(capture.ground, origin_geo=None, metric=False)), model, gsd=0.2)
+    ortho_folder = make(replace(capture, ground=replace(capture.ground, origin_geo=None, metric=False)), model, gsd=0.2)
     assert "units without known size" in capsys.readouterr().err
-    with rasterio.open(folder / "dsm.tif") as file:
+    with rasterio.open(ortho_folder / "dsm.tif") as file:
         assert file.crs.to_epsg() is None
         assert "local units" in file.crs.to_wkt()
         assert file.units == ("units",)
@@ -344,9 +344,9 @@ def test_maps_of_others_are_not_written_over(house, make, tmp_path, monkeypatch,
         (tmp_path / "map.json").write_text(facts)
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
     with pytest.raises(VdgsError, match=r"holds dsm\.tif.*Nothing was drawn"):
-        mapping.map_run(context, MapRequest(run=tmp_path / "run", output=tmp_path), Console(quiet=True))
+        render_ortho.map_run(context, MapRequest(run=tmp_path / "run", output=tmp_path), Console(quiet=True))
     with pytest.raises(VdgsError, match="is a file"):
-        mapping.map_run(context, MapRequest(run=tmp_path / "run", output=tmp_path / "dsm.tif"), Console(quiet=True))
+        render_ortho.map_run(context, MapRequest(run=tmp_path / "run", output=tmp_path / "dsm.tif"), Console(quiet=True))
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
@@ -361,35 +361,35 @@ def test_a_map_killed_while_its_files_take_their_places_is_known_as_ours_and_as_
 
     capture, model = house
     with monkeypatch.context() as patch:
-        patch.setattr(folder.os, "replace", kill)
+        patch.setattr(ortho_folder.os, "replace", kill)
         with pytest.raises(Killed):
             make(capture, model, gsd=0.5)
     run = SimpleNamespace(path=make.path, merged=SimpleNamespace(status=lambda: SimpleNamespace(model="1-2")))
     assert (make.path / "maps" / "dsm.tif").exists()
-    assert not mapping.is_mapped(run)
+    assert not render_ortho.is_mapped(run)
     make(capture, model, gsd=0.4)
-    assert mapping.is_mapped(run)
+    assert render_ortho.is_mapped(run)
 
 
 def test_a_disk_without_room_is_named_before_anything_is_drawn(house, make, monkeypatch):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 9, 1))
-    monkeypatch.setattr(tiles.Surveyor, "tile", lambda *_: pytest.fail("drawn"))
+    monkeypatch.setattr(tile_renderer.Surveyor, "tile", lambda *_: pytest.fail("drawn"))
     with pytest.raises(VdgsError, match=r"0 MB are free\. Give a larger --gsd"):
         make(*house, gsd=0.2)
 
 
 def test_a_map_that_fails_leaves_the_old_one_whole(house, make, monkeypatch):
-    folder = make(*house, gsd=0.5)
-    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    ortho_folder = make(*house, gsd=0.5)
+    before = {file.name: file.read_bytes() for file in ortho_folder.iterdir()}
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(mapping, "preview_png", full)
+    monkeypatch.setattr(render_ortho, "preview_png", full)
     with pytest.raises(VdgsError, match=r"No space left on device.*maps that were there are kept"):
         make(*house, gsd=0.4)
-    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+    assert {file.name: file.read_bytes() for file in ortho_folder.iterdir()} == before
 
 
 def test_without_rasterio_the_remedy_is_named(house, make, monkeypatch):
@@ -435,8 +435,8 @@ def photographed(capture: Capture, model: AnchorModel, folder: Path, woven: floa
         places = sharp.unproject(drawn.median_depth.numpy())
         low = (places[..., 2] < 1.0)[..., None]
         image = (drawn.image.numpy() + woven * low * pattern(places)[..., None]).clip(0, 1)
-        Image.fromarray((image * 255 + 0.5).astype(np.uint8)).save(folder / view.name)
-        views.append(replace(view, camera=sharp, image_path=folder / view.name))
+        Image.fromarray((image * 255 + 0.5).astype(np.uint8)).save(ortho_folder / view.name)
+        views.append(replace(view, camera=sharp, image_path=ortho_folder / view.name))
     return replace(capture, views=tuple(views))
 
 
@@ -478,15 +478,15 @@ def misted(capture: Capture, folder: Path) -> Capture:
         sharp = view.camera.resized(320, 240)
         x, y, _ = np.moveaxis(sharp.unproject(np.full((240, 320), sharp.position[2])), -1, 0)
         light = 0.5 + 0.1 * np.sin(2 * np.pi * (x + 0.3 * number) / 4.1) * np.cos(2 * np.pi * y / 5.3)
-        Image.fromarray((light[..., None].repeat(3, axis=2) * 255 + 0.5).astype(np.uint8)).save(folder / view.name)
-        views.append(replace(view, camera=sharp, image_path=folder / view.name))
+        Image.fromarray((light[..., None].repeat(3, axis=2) * 255 + 0.5).astype(np.uint8)).save(ortho_folder / view.name)
+        views.append(replace(view, camera=sharp, image_path=ortho_folder / view.name))
     return replace(capture, views=tuple(views))
 
 
 @pytest.mark.parametrize("most", [12, 2])
 def test_detail_knows_no_borders_of_tiles(house, tmp_path, monkeypatch, most):
     """Also where only some of the photographs are looked up."""
-    monkeypatch.setattr(sharpening, "_MOST_VIEWS", most)
+    monkeypatch.setattr(detail_transfer, "_MOST_VIEWS", most)
     capture, _ = house
     capture, model = misted(capture, tmp_path), grey(GROUND)
     sharpener = Sharpener(model, capture)

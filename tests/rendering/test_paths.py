@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from vdgs.cameras import Camera
 from vdgs.captures.capture import GroundFrame
 from vdgs.errors import VdgsError
-from vdgs.films.path_files import load_path
-from vdgs.films.paths import flyover, frame_count, interpolate, look_at, orbit
-from vdgs.films.video import VideoWriter, best_encoder
+from vdgs.geometry.camera import Camera
+from vdgs.rendering.camera_paths import flyover, frame_count, interpolate, look_at, orbit
+from vdgs.rendering.path_io import load_path
+from vdgs.rendering.video import VideoWriter, best_encoder
 
 TEMPLATE = Camera(camera_from_world=np.eye(4), fx=400.0, fy=410.0, cx=160.0, cy=90.0, width=320, height=180)
 
@@ -389,9 +389,9 @@ def test_a_film_that_fails_leaves_nothing(tmp_path: Path):
 
 
 def test_a_missing_encoder_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("vdgs.films.video.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("vdgs.rendering.video.importlib.util.find_spec", lambda name: None)
     assert best_encoder() == "mpeg4"
-    monkeypatch.setattr("vdgs.films.video.cv2.VideoWriter.fourcc", lambda *letters: 0, raising=False)
+    monkeypatch.setattr("vdgs.rendering.video.cv2.VideoWriter.fourcc", lambda *letters: 0, raising=False)
 
     class Closed:
         fourcc = staticmethod(lambda *letters: 0)
@@ -401,7 +401,7 @@ def test_a_missing_encoder_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         def isOpened(self) -> bool:
             return False
 
-    monkeypatch.setattr("vdgs.films.video.cv2.VideoWriter", Closed)
+    monkeypatch.setattr("vdgs.rendering.video.cv2.VideoWriter", Closed)
     with (
         pytest.raises(VdgsError, match="pip install imageio-ffmpeg"),
         VideoWriter(tmp_path / "film.mp4", 30.0) as film,

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
+from vdgs.config.commands import RenderRequest
 from vdgs.errors import VdgsError
-from vdgs.figures.style import SEEN
-from vdgs.films import folder, legend
-from vdgs.films.film import _check
-from vdgs.films.maps import NOTHING, alpha_scale, depth_scale, depth_span, seen_scale
-from vdgs.settings.requests import RenderRequest
+from vdgs.plots.style import SEEN
+from vdgs.rendering import colorbar, render_folder
+from vdgs.rendering.render_run import _check
+from vdgs.rendering.scalar_maps import NOTHING, alpha_scale, depth_scale, depth_span, seen_scale
 
 SCALES = {
     "depth": depth_scale((31.7, 48.2), "m"),
@@ -31,9 +31,9 @@ def picture(names: list[str], place: Path, text: bytes = b"picture") -> None:
 
 
 def rendered(place: Path, names: list[str]) -> None:
-    earlier = folder.begin(place, names)
+    earlier = render_folder.begin(place, names)
     picture(names, place)
-    folder.finish(place, earlier, names, {"kind": "image"})
+    render_folder.finish(place, earlier, names, {"kind": "image"})
 
 
 def names_in(place: Path) -> list[str]:
@@ -53,7 +53,7 @@ def test_what_no_render_wrote_is_never_touched(tmp_path: Path) -> None:
     rendered(tmp_path, ["a.png"])
     picture(["mine.png"], tmp_path, b"mine")
     with pytest.raises(VdgsError, match=r"1 files or folders that no render wrote \(mine\.png\)"):
-        folder.begin(tmp_path, ["mine.png"])
+        render_folder.begin(tmp_path, ["mine.png"])
     assert (tmp_path / "mine.png").read_bytes() == b"mine"
     assert json.loads((tmp_path / "render.json").read_text())["files"] == ["a.png"]
 
@@ -63,7 +63,7 @@ def test_a_list_that_is_not_ours_claims_nothing(tmp_path: Path, text: str) -> No
     picture(["a.png"], tmp_path)
     (tmp_path / "render.json").write_text(text)
     with pytest.raises(VdgsError, match=r"2 files or folders that no render wrote \(a\.png, render\.json\)"):
-        folder.begin(tmp_path, ["a.png"])
+        render_folder.begin(tmp_path, ["a.png"])
 
 
 def test_a_list_that_was_edited_reaches_nothing_else(tmp_path: Path) -> None:
@@ -79,17 +79,17 @@ def test_a_list_that_was_edited_reaches_nothing_else(tmp_path: Path) -> None:
 
 def test_a_render_that_was_cut_off_is_known_again(tmp_path: Path) -> None:
     rendered(tmp_path, ["a.png", "b.png"])
-    folder.begin(tmp_path, ["c.png", "d.png"])
+    render_folder.begin(tmp_path, ["c.png", "d.png"])
     picture(["c.png"], tmp_path)  # and here the power fails
-    assert folder.begin(tmp_path, ["e.png"]) == ["a.png", "b.png", "c.png"]
-    folder.finish(tmp_path, ["a.png", "b.png", "c.png"], [], {})
+    assert render_folder.begin(tmp_path, ["e.png"]) == ["a.png", "b.png", "c.png"]
+    render_folder.finish(tmp_path, ["a.png", "b.png", "c.png"], [], {})
     assert names_in(tmp_path) == ["render.json"]
 
 
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
     (tmp_path / "film").write_bytes(b"")
     with pytest.raises(VdgsError, match="is a file"):
-        folder.begin(tmp_path / "film", ["a.png"])
+        render_folder.begin(tmp_path / "film", ["a.png"])
 
 
 def test_the_range_of_depths_holds_every_view() -> None:
@@ -131,7 +131,7 @@ def test_v_has_the_colours_of_all_other_figures_and_whole_steps() -> None:
 def test_legends_fit_below_every_picture(name: str, size: tuple[int, int]) -> None:
     scale, (height, width) = SCALES[name], size
     picture = np.full((height, width, 3), 7, np.uint8)
-    whole = legend.with_legend(picture, scale)
+    whole = colorbar.with_legend(picture, scale)
     assert whole.shape[1] == width
     assert whole.shape[0] % 2 == 0
     np.testing.assert_array_equal(whole[:height], picture)

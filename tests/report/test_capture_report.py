@@ -15,11 +15,11 @@ from rich.console import Console
 
 from support.captures import TinyScene, data_folder, tiny_scene, write_colmap
 from vdgs.captures.loading import load_capture
-from vdgs.figures.sampling import sample_points
-from vdgs.inspection.inspect import inspect_capture, print_report
-from vdgs.inspection.measure import length
-from vdgs.model.visibility import imbalance, visibility_of
-from vdgs.settings.capture import CaptureOptions
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.geometry.row_sampling import sample_points
+from vdgs.report.capture_report import inspect_capture, print_report
+from vdgs.report.capture_stats import length
+from vdgs.visibility.visibility_counts import imbalance, visibility_of
 
 
 @pytest.fixture

@@ -15,10 +15,10 @@ from PIL import Image
 from vdgs.errors import RunError
 from vdgs.report import write_report
 from vdgs.report.charts import running_median
-from vdgs.report.page import escaped
-from vdgs.report.pictures import MOST_BYTES, reduced
-from vdgs.report.words import gain
-from vdgs.runs.folder import RunFolder
+from vdgs.report.embedded_images import MOST_BYTES, reduced
+from vdgs.report.formatting import gain
+from vdgs.report.html_page import escaped
+from vdgs.runs.run_folder import RunFolder
 
 pytestmark = pytest.mark.xdist_group("report")
 

@@ -5,11 +5,11 @@ import json
 import pytest
 
 from vdgs.errors import RunError, VdgsError
-from vdgs.partition.records import AssignedBlock, CutBlock, MergedBlock, PartitionRecord
-from vdgs.runs.folder import RunFolder
+from vdgs.partition.block_records import AssignedBlock, CutBlock, MergedBlock, PartitionRecord
+from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
-from vdgs.storage.records import known, plain, record_of
+from vdgs.system.records import known, plain, record_of
 
 MERGED = Status(
     state="done",

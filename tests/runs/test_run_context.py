@@ -13,12 +13,12 @@ import torch
 from support.captures import tiny_scene, write_colmap
 from support.clusters import copy_run
 from support.commands import CommandsHere
-from vdgs.cli import main
+from vdgs.cli.main import main
+from vdgs.distributed import backend_selection
+from vdgs.distributed.executor import Listener, Outcome, Task
 from vdgs.errors import VdgsError
-from vdgs.executors import choosing
-from vdgs.executors.executor import Listener, Outcome, Task
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.runs import beginning, opening
+from vdgs.runs import create_or_resume, open_run
 from vdgs.runs.run_context import RunContext
 
 SETTINGS = (
@@ -33,7 +33,7 @@ class Reads:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.process = "driver"
         self.captures, self.models = Counter[str](), Counter[tuple[str, str]]()
-        load_capture, load_model = opening.load_capture, AnchorModel.load
+        load_capture, load_model = open_run.load_capture, AnchorModel.load
 
         def read_capture(*given):
             self.captures[self.process] += 1
@@ -43,7 +43,7 @@ class Reads:
             self.models[self.process, path.parent.name] += 1
             return load_model(path)
 
-        for module in (opening, beginning):
+        for module in (open_run, create_or_resume):
             monkeypatch.setattr(module, "load_capture", read_capture)
         monkeypatch.setattr(AnchorModel, "load", read_model)
         reads = self
@@ -57,7 +57,7 @@ class Reads:
                 reads.process = "driver"
                 return outcomes
 
-        monkeypatch.setattr(choosing, "LocalExecutor", TasksHere)
+        monkeypatch.setattr(backend_selection, "LocalExecutor", TasksHere)
 
 
 @pytest.fixture

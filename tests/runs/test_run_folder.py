@@ -7,20 +7,20 @@ import pytest
 import yaml
 
 from support.captures import tiny_scene, write_colmap
-from vdgs.captures.facts import capture_facts
+from vdgs.captures.capture_metadata import capture_facts
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.method import BlockConfig, GrowthConfig, MethodConfig, TrainConfig, with_iterations
+from vdgs.config.presets import PRESETS
+from vdgs.config.serialization import differences, from_dict, to_dict
+from vdgs.config.validation_rules import validate
 from vdgs.errors import RunError
-from vdgs.runs.beginning import begin_run
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.keys import NEEDS, counted, stage_keys
+from vdgs.runs.create_or_resume import begin_run
+from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.stage_folder import StageFolder
+from vdgs.runs.stage_keys import NEEDS, counted, stage_keys
 from vdgs.runs.status import Status
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.checks import validate
-from vdgs.settings.method import BlockConfig, GrowthConfig, MethodConfig, TrainConfig, with_iterations
-from vdgs.settings.plain import differences, from_dict, to_dict
-from vdgs.settings.presets import PRESETS
-from vdgs.storage.files import write_json, write_text
+from vdgs.system.atomic_files import write_json, write_text
 
 
 def settings(**changes) -> RunSettings:

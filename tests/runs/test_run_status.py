@@ -15,22 +15,22 @@ import pytest
 import yaml
 
 from support.hand_made_models import model_at
-from vdgs.cli import main
+from vdgs.cli.main import main
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.method import MergeConfig, MethodConfig
 from vdgs.errors import RunError
 from vdgs.model.anchor_model import ModelMetadata
 from vdgs.report import write_report
-from vdgs.report.terminal import NOT_WHOLE, next_step, whole_standing
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.locks import hold, is_locked
-from vdgs.runs.opening import open_model, open_run
+from vdgs.report.status_cli import NOT_WHOLE, next_step, whole_standing
+from vdgs.runs.model_integrity import load_vouched
+from vdgs.runs.open_run import open_model, open_run
+from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
-from vdgs.runs.standing import OTHER_BLOCKS, OTHER_CUT, OTHER_MODEL, OTHER_SETTINGS, standing_of
+from vdgs.runs.run_status import OTHER_BLOCKS, OTHER_CUT, OTHER_MODEL, OTHER_SETTINGS, standing_of
 from vdgs.runs.status import Status
-from vdgs.runs.vouching import load_vouched
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.method import MergeConfig, MethodConfig
-from vdgs.storage.files import write_json
-from vdgs.storage.tensors import identity
+from vdgs.system.atomic_files import write_json
+from vdgs.system.file_locks import hold, is_locked
+from vdgs.system.tensors import identity
 
 PLACES = [[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]
 COMMAND = "vdgs run here --output there"
@@ -251,8 +251,8 @@ def test_models_that_were_copied_to_where_they_do_not_belong_are_refused(run):
 
 @pytest.fixture
 def opened_without_photographs(monkeypatch):
-    monkeypatch.setattr("vdgs.runs.opening.open_capture", lambda run: SimpleNamespace(test_views=(), train_views=()))
-    monkeypatch.setattr("vdgs.runs.opening.refuse_another_capture", lambda *_: None)
+    monkeypatch.setattr("vdgs.runs.open_run.open_capture", lambda run: SimpleNamespace(test_views=(), train_views=()))
+    monkeypatch.setattr("vdgs.runs.open_run.refuse_another_capture", lambda *_: None)
 
 
 def test_the_model_that_is_opened_says_what_it_is(run, opened_without_photographs):

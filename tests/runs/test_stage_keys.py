@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from vdgs.runs.keys import stage_keys
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.method import MethodConfig
 from vdgs.runs.run_settings import RunSettings
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.method import MethodConfig
+from vdgs.runs.stage_keys import stage_keys
 
 PLAIN = MethodConfig()
 CHANGED = {

@@ -17,15 +17,15 @@ pytest.importorskip("pyproj")
 import pyproj
 
 from support.flights import ALTITUDE_M, HEIGHT, ORIGIN, WIDTH, Flight, copy_folder, sightings, write_photograph
-from vdgs.captures.geodesy import enu_from_geodetic, geodetic_from_enu
 from vdgs.captures.loading import load_capture
 from vdgs.captures.reconstruction import facts_rows, read_reconstruction, survey_table
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
-from vdgs.settings.sfm import SfmOptions, SfmRequest
-from vdgs.sfm.collection import Collection, LeftOut, collect
-from vdgs.sfm.control import Control, check_near, read_control
-from vdgs.sfm.preparing import prepare
+from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
+from vdgs.sfm.gcp_list import Control, check_near, read_control
+from vdgs.sfm.image_list import Collection, LeftOut, collect
 from vdgs.sfm.reconstruct import reconstruct
+from vdgs.sfm.reconstruction_plan import prepare
 
 pytestmark = pytest.mark.xdist_group("sfm")
 

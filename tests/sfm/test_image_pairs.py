@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from vdgs.sfm.pairs import SHARED_TIMES, near
+from vdgs.sfm.pair_selection import SHARED_TIMES, near
 
 NEIGHBOURS = 16
 

@@ -15,19 +15,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.flights import FOCAL, FOCAL_MM, ORIGIN, SENSOR_MM, add_xmp, write_photograph
-from vdgs.captures.geodesy import geodetic_from_enu
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
-from vdgs.settings.sfm import SfmOptions, SfmRequest
-from vdgs.sfm import pairs
-from vdgs.sfm.aligning import tilt_against_attitudes
+from vdgs.geometry.geodesy import geodetic_from_enu
+from vdgs.sfm import pair_selection
 from vdgs.sfm.attitude import of_aircraft, of_gimbal
-from vdgs.sfm.collection import collect, only_photographs
-from vdgs.sfm.lens import CALIBRATED, Lens, find_lens
-from vdgs.sfm.look import look_at
-from vdgs.sfm.mapping import holds_focal
-from vdgs.sfm.photograph import Photograph, Unusable, read_photograph
-from vdgs.sfm.positions import find_positions
-from vdgs.sfm.preparing import prepare
+from vdgs.sfm.focal_length import CALIBRATED, Lens, find_lens
+from vdgs.sfm.georegistration import tilt_against_attitudes
+from vdgs.sfm.gps_priors import find_positions
+from vdgs.sfm.image_list import collect, only_photographs
+from vdgs.sfm.image_metadata import Photograph, Unusable, read_photograph
+from vdgs.sfm.incremental_mapper import holds_focal
+from vdgs.sfm.preflight import look_at
+from vdgs.sfm.reconstruction_plan import prepare
 from vdgs.sfm.xmp import LONGEST_PACKET, number, read_xmp
 
 NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
@@ -365,19 +365,19 @@ def test_without_attitudes_the_focal_length_is_held_where_positions_are_those_of
 @given(st.integers(2, 40), st.integers(1, 8), st.integers(0, 4))
 def test_pairs_are_sorted_and_none_is_of_one_photograph(count, following, doublings):
     order = list(np.random.default_rng(count).permutation(count))
-    chosen = pairs.in_order(order, following, doublings) | pairs.near(np.random.default_rng(0).random((count, 3)), 4)
+    chosen = pair_selection.in_order(order, following, doublings) | pair_selection.near(np.random.default_rng(0).random((count, 3)), 4)
     assert all(0 <= i < j < count for i, j in chosen)
     assert {tuple(sorted(pair)) for pair in pairwise(order)} <= chosen
 
 
 def test_near_ones_are_matched_and_those_without_a_place_are_not():
     places = np.array([[0, 0, 9], [1, 0, 5], [2, 0, 9], [90, 0, 9], [np.nan, 0, 0]])
-    assert pairs.near(places, 1) == {(0, 1), (1, 2), (2, 3)}
+    assert pair_selection.near(places, 1) == {(0, 1), (1, 2), (2, 3)}
 
 
 def test_photographs_that_look_alike_find_each_other():
     rng = np.random.default_rng(0)
     kinds = rng.integers(0, 255, (2, 30, 128))
     looks = [(kinds[k % 2] + rng.normal(0, 3, (30, 128))).clip(0, 255).astype(np.uint8) for k in range(30)]
-    chosen = pairs.alike(looks, [0, 1])
+    chosen = pair_selection.alike(looks, [0, 1])
     assert sum((i + j) % 2 == 0 for i, j in chosen) > 0.95 * len(chosen)

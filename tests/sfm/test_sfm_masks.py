@@ -16,20 +16,20 @@ pytest.importorskip("embreex")
 import pycolmap
 
 from support.flights import Flight, copy_folder, write_photograph
-from vdgs.captures.images import load_picture
+from vdgs.captures.image_cache import load_picture
+from vdgs.captures.image_files import decode_mask
 from vdgs.captures.loading import load_capture
-from vdgs.captures.photographs import decode_mask
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.commands import RunRequest
+from vdgs.config.presets import PRESETS
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.presets import PRESETS
-from vdgs.settings.requests import RunRequest
-from vdgs.settings.sfm import SfmOptions, SfmRequest
-from vdgs.sfm import features, mapping, reconstruct
-from vdgs.sfm.collection import collect
+from vdgs.sfm import feature_extraction, incremental_mapper, reconstruct
+from vdgs.sfm.image_list import collect
 from vdgs.sfm.masking import kept_of, write_upright_masks
-from vdgs.sfm.preparing import prepare, tell
-from vdgs.sfm.request import sfm_request
-from vdgs.sfm.work import Work, quiet_colmap
+from vdgs.sfm.reconstruction_plan import prepare, tell
+from vdgs.sfm.run_request import sfm_request
+from vdgs.sfm.workspace import Work, quiet_colmap
 
 pytestmark = pytest.mark.xdist_group("sfm")
 
@@ -169,11 +169,11 @@ def test_features_lie_where_masks_are_white(masked, tmp_path):
     seen = (collection.photographs[0], collection.photographs[5])
     black = write_mask(tmp_path / "black.png", np.zeros((300, 400), bool))
     seen = (*seen, replace(collection.photographs[1], mask=black))
-    work, kinds = Work(tmp_path / "work"), features.kinds_of(seen)
-    features.open_database(work, kinds)
-    features.stand_upright(work, seen)
+    work, kinds = Work(tmp_path / "work"), feature_extraction.kinds_of(seen)
+    feature_extraction.open_database(work, kinds)
+    feature_extraction.stand_upright(work, seen)
     write_upright_masks(work, seen, 1)
-    counts = features.find_features(work, kinds, 300, 500, 1, console())
+    counts = feature_extraction.find_features(work, kinds, 300, 500, 1, console())
     database = pycolmap.Database.open(work.database)
     found = {image.name: image.image_id for image in database.read_all_images()}
     x, y = np.asarray(database.read_keypoints(found[seen[0].name]))[:, :2].T
@@ -182,7 +182,7 @@ def test_features_lie_where_masks_are_white(masked, tmp_path):
     assert 0 < counts[seen[0].name] < counts[seen[1].name]
     assert counts[seen[2].name] == 0
     with pytest.raises(CaptureError, match="shows only 0 features where its mask is white"):
-        features.without_features(seen, counts)
+        feature_extraction.without_features(seen, counts)
 
 
 def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_again(nine_begun, masked, tmp_path):
@@ -199,7 +199,7 @@ def test_masks_are_written_with_the_capture_and_what_depends_on_them_is_done_aga
     write_mask(first, left_half(300, 400))
     prepared, work = prepare(request), Work(output / "work")
     write_upright_masks(work, prepared.collection.photographs, 1)
-    model = mapping.read_models(work)[0]
+    model = incremental_mapper.read_models(work)[0]
     write_mask(output / "masks/old.png", left_half())  # of other masks
     reconstruct._write(prepared, work, model, "key", 1, console())
     reconstruct.writing.write_model(output, model, reconstruct._lenses(model, 200))

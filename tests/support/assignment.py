@@ -10,13 +10,13 @@ import shapely
 import torch
 
 from support.captures import look_down
-from vdgs.cameras import Camera
+from vdgs.config.method import AssignmentConfig
+from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.partition.assignment.scores import Scores
+from vdgs.partition.assignment.score_matrix import Scores
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.settings.method import AssignmentConfig
 
 MODES = ("coverage", "literal", "leave_one_out", "frustum")
 RENDERED = MODES[:3]

@@ -15,7 +15,7 @@ from experiments.bench.results import Result
 from experiments.bench.worker import Job, work
 from support.captures import tiny_scene, write_colmap
 from support.commands import threads_as_before
-from vdgs.executors.executor import Listener, Outcome, Task
+from vdgs.distributed.executor import Listener, Outcome, Task
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ import shapely
 import torch
 
 from support.checkerboard import Photographs
+from vdgs.config.method import AnchorConfig, BlockConfig, CompensationConfig, GrowthConfig, TrainConfig
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.start import initial_anchors
+from vdgs.model.initialization.initialize import initial_anchors
+from vdgs.partition.block_regions import drawn_by, holds, ramp, split_anchors
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.regions import drawn_by, holds, ramp, split_anchors
-from vdgs.settings.method import AnchorConfig, BlockConfig, CompensationConfig, GrowthConfig, TrainConfig
 from vdgs.training import Stage, Surroundings, TrainingState, start_state
 
 CONFIG = TrainConfig(

@@ -14,7 +14,7 @@ from typing import Any
 
 from support.captures import tiny_scene, write_colmap
 from support.commands import PATIENCE_SECONDS, do_tasks_here, vdgs
-from vdgs.runs.folder import RunFolder
+from vdgs.runs.run_folder import RunFolder
 
 #: What makes a run of two blocks that is small enough to be trained again and again.
 COARSE = (
@@ -132,7 +132,7 @@ def parent_of(process: int) -> int:
 def shard_of(process: int) -> int:
     """Which shard, or block, a process does."""
     words = Path(f"/proc/{process}/cmdline").read_bytes().decode().split("\0")
-    return int(words[words.index("vdgs.executors.run_shard") + 2])
+    return int(words[words.index("vdgs.distributed.run_shard") + 2])
 
 
 def make_run(folder: Path) -> Path:

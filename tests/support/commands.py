@@ -7,7 +7,7 @@
 
 One server for each worker of the tests imports the package once; every command is forked from it, and so are the
 processes that it starts itself, such as those of blocks (`forking`), unless it is asked to start them as people's do
-(`start_tasks`) or to do in its own what they would (`do_tasks_here`). `entry_point` is a whole `python -m vdgs.cli`,
+(`start_tasks`) or to do in its own what they would (`do_tasks_here`). `entry_point` is a whole `python -m vdgs.cli.main`,
 `python` any code in such a process.
 """
 
@@ -33,7 +33,7 @@ from support.forking import fork_tasks
 from support.pausing import Pause, pause_where_asked
 
 if TYPE_CHECKING:
-    from vdgs.executors.executor import Listener, Outcome, Task
+    from vdgs.distributed.executor import Listener, Outcome, Task
 
 #: What nothing takes that still goes on, however busy the machine is. The limit of a whole test is larger still.
 PATIENCE_SECONDS = 900.0
@@ -42,8 +42,8 @@ GLANCE_SECONDS = 0.01
 
 #: What the server imports, as far as it is there; the last ones are what commands import when they need it.
 IMPORTED = [
-    "vdgs.cli", "vdgs.verbs", "vdgs.pipeline", "vdgs.films.film", "experiments.bench.bench", "vdgs.export.exporting",
-    "vdgs.stages.block", "vdgs.kernels.native", "vdgs.kernels.reference", "vdgs.kernels.differentiable",
+    "vdgs.cli.main", "vdgs.cli", "vdgs.pipeline.run_pipeline", "vdgs.rendering.render_run", "experiments.bench.bench", "vdgs.export.export_run",
+    "vdgs.pipeline.train_block", "vdgs.kernels.cpu", "vdgs.kernels.torch_ref", "vdgs.kernels.autograd",
     "typeguard", "contourpy", "PIL.PngImagePlugin", "sklearn.cluster", "rasterio",
 ]  # fmt: skip
 # Only Linux forks safely what has imported this much.
@@ -59,14 +59,14 @@ class CommandsHere:
     at_once: int
 
     def run(self, tasks: Sequence[Task], _listener: Listener) -> list[Outcome]:
-        from vdgs.executors.executor import Outcome
+        from vdgs.distributed.executor import Outcome
 
         for task in tasks:
-            python, option, module, *arguments = task.command
+            python, option, extension, *arguments = task.command
             assert (python, option) == (sys.executable, "-m")
             task.output.parent.mkdir(parents=True, exist_ok=True)
             with task.output.open("a") as output, redirect_stdout(output), redirect_stderr(output), threads_as_before():
-                code = _exit_code(importlib.import_module(module).main, arguments)
+                code = _exit_code(importlib.import_module(extension).main, arguments)
             assert not code, f"{task.name}: exit code {code}, see {task.output}"
         return [Outcome(name=task.name, state="done", attempts=1) for task in tasks]
 
@@ -83,13 +83,13 @@ def threads_as_before() -> Iterator[None]:
     """Undo what a command that runs in this process sets: how many threads compute."""
     import torch
 
-    from vdgs.kernels.native import module
+    from vdgs.kernels.cpu import extension
 
-    kernels, of_torch = module.threads(), torch.get_num_threads()
+    kernels, of_torch = extension.threads(), torch.get_num_threads()
     try:
         yield
     finally:
-        module.set_threads(kernels)
+        extension.set_threads(kernels)
         torch.set_num_threads(of_torch)
 
 
@@ -190,9 +190,9 @@ def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 def do_tasks_here() -> None:
     """Let this process do itself what it would start processes for."""
     from experiments.bench import bench
-    from vdgs.executors import choosing
+    from vdgs.distributed import backend_selection
 
-    bench.LocalExecutor = choosing.LocalExecutor = CommandsHere  # type: ignore[assignment,misc]
+    bench.LocalExecutor = backend_selection.LocalExecutor = CommandsHere  # type: ignore[assignment,misc]
 
 
 def limit_files(most_bytes: int) -> None:
@@ -203,8 +203,8 @@ def limit_files(most_bytes: int) -> None:
 
 
 def entry_point(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """The same as a person starts it: `python -m vdgs.cli`, with all that it imports."""
-    command = [sys.executable, "-m", "vdgs.cli", *map(str, arguments)]
+    """The same as a person starts it: `python -m vdgs.cli.main`, with all that it imports."""
+    command = [sys.executable, "-m", "vdgs.cli.main", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_SECONDS)
 
 
@@ -219,7 +219,7 @@ def wait_until(condition: Callable[[], object]) -> None:
 def is_free(run: Path) -> bool:
     """Whether no process works on a run."""
     from vdgs.errors import RunError
-    from vdgs.runs.folder import RunFolder
+    from vdgs.runs.run_folder import RunFolder
 
     try:
         with RunFolder(run).locked():
@@ -257,7 +257,7 @@ def _vdgs(arguments: list[str], prepare: Callable[[], None] | None) -> None:
     fork_tasks()
     if prepare is not None:
         prepare()
-    from vdgs.cli import main
+    from vdgs.cli.main import main
 
     main(arguments)
 

@@ -15,13 +15,13 @@ from typing import Any
 import pytest
 import torch
 
-from vdgs.kernels.cuda import launching, nvrtc
+from vdgs.kernels.cuda import launch, nvrtc
 from vdgs.kernels.cuda.driver import Grid
-from vdgs.kernels.cuda.launching import read_source
+from vdgs.kernels.cuda.launch import read_source
 from vdgs.kernels.cuda.nvrtc import CudaUnavailable, Nvrtc
 
 HERE = Path(__file__).parent
-SHARED = Path(launching.__file__).parents[1] / "shared"
+SHARED = Path(launch.__file__).parents[1] / "shared"
 #: Orders in which threads and warps take turns: forwards, backwards, and two shuffles.
 ORDERS = (0, 1, 2, 3)
 

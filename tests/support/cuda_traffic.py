@@ -11,7 +11,7 @@ from pathlib import Path
 from torch import Tensor
 
 from support.cuda_on_host import HostDriver, build_on_host
-from vdgs.kernels.cuda.launching import Argument, Program, read_source
+from vdgs.kernels.cuda.launch import Argument, Program, read_source
 
 
 @dataclass(frozen=True)

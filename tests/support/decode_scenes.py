@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vdgs.cameras import Camera, CameraModel
-from vdgs.kernels import native
-from vdgs.kernels.reference.project import project
-from vdgs.kernels.runs import Shown
-from vdgs.kernels.types import AdamState, DecoderWeights, SplatGradients
+from vdgs.geometry.camera import Camera, CameraModel
+from vdgs.kernels import cpu
+from vdgs.kernels.kernel_types import AdamState, DecoderWeights, SplatGradients
+from vdgs.kernels.splat_segments import Shown
+from vdgs.kernels.torch_ref.project import project
 
 
 def looking_down(model: CameraModel = "pinhole", width: int = 64, height: int = 48) -> Camera:
@@ -132,7 +132,7 @@ def moved_by(
     """Whether all was finite, and after a step of Adam: parameters and moments, updates, gradients of the decoder.
     `shown`: where splats stand, if not in the order of the anchors."""
     with torch.no_grad():
-        splats = native.decode(scene.positions, *scene.trainable[:3], scene.weights, camera, rows)
+        splats = cpu.decode(scene.positions, *scene.trainable[:3], scene.weights, camera, rows)
     g = torch.Generator().manual_seed(8)
     m = len(splats.source)
     gradients = SplatGradients(

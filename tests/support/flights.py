@@ -15,14 +15,14 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from vdgs.cameras import Camera
-from vdgs.captures.geodesy import geodetic_from_enu
-from vdgs.settings.sfm import SfmRequest
-from vdgs.synth.flight import look_from
+from vdgs.config.sfm_options import SfmRequest
+from vdgs.geometry.camera import Camera
+from vdgs.geometry.geodesy import geodetic_from_enu
+from vdgs.synth.flight_cameras import look_from
+from vdgs.synth.image_renderer import photograph
 from vdgs.synth.lighting import sky_map
-from vdgs.synth.photography import photograph
+from vdgs.synth.ray_tracing import Tracer
 from vdgs.synth.town import build_town
-from vdgs.synth.tracing import Tracer
 
 #: Where the town lies: latitude, longitude in degrees, altitude in metres. South and west, where signs go wrong.
 ORIGIN = (-33.5, -70.6, 500.0)

@@ -19,7 +19,7 @@ from multiprocessing.process import BaseProcess
 from types import SimpleNamespace
 from typing import IO
 
-from vdgs.executors.parent import PARENT
+from vdgs.distributed.parent import PARENT
 
 #: Seconds between two looks at a process that is waited for.
 GLANCE_SECONDS = 0.01
@@ -36,16 +36,16 @@ def fork_tasks() -> None:
     class Forked(_Forked):
         orders = here
 
-    from vdgs.executors import process
+    from vdgs.distributed import task_process
 
-    process.subprocess = SimpleNamespace(Popen=Forked, DEVNULL=None, STDOUT=None)  # type: ignore[assignment]
+    task_process.subprocess = SimpleNamespace(Popen=Forked, DEVNULL=None, STDOUT=None)  # type: ignore[assignment]
 
 
 def start_tasks() -> None:
     """Let this process start what it starts, as people's do."""
-    from vdgs.executors import process
+    from vdgs.distributed import task_process
 
-    process.subprocess = subprocess  # type: ignore[attr-defined]
+    task_process.subprocess = subprocess  # type: ignore[attr-defined]
 
 
 class _Forked:

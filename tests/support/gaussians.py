@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from vdgs.cameras import Camera
+from vdgs.geometry.camera import Camera
 from vdgs.model.gaussians import Gaussians, draw_gaussians
 
 

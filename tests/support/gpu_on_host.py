@@ -9,13 +9,13 @@ import pytest
 
 from support import fake_gsplat
 from support.cuda_on_host import HostDriver, build_on_host
-from vdgs.kernels.composed import rasteriser as choosing
-from vdgs.kernels.cuda import cache, loss
+from vdgs.kernels.cuda import compile_cache, loss
 from vdgs.kernels.cuda.cull import PROGRAM as CULL
 from vdgs.kernels.cuda.decode import PROGRAM as DECODE
-from vdgs.kernels.cuda.rasterise import PROGRAM as RASTERISE
+from vdgs.kernels.cuda.rasterize import PROGRAM as RASTERISE
 from vdgs.kernels.cuda.statistics import PROGRAM as STATISTICS
-from vdgs.kernels.reference import adam
+from vdgs.kernels.gpu import rasterizer as choosing
+from vdgs.kernels.torch_ref import adam
 
 PROGRAMS = (loss.PROGRAM, RASTERISE, DECODE, CULL, STATISTICS)
 
@@ -34,7 +34,7 @@ def install(
     drivers: dict[str, HostDriver], code: Path, monkeypatch: pytest.MonkeyPatch, device_type: str, rasteriser: str
 ) -> None:
     """Let tensors of a kind of device be computed on by the composed set, with one of its rasterisers."""
-    monkeypatch.setenv(cache.VARIABLE, str(code))
+    monkeypatch.setenv(compile_cache.VARIABLE, str(code))
     for program in PROGRAMS:
         driver = drivers[program.name]
         driver.device_type = device_type

@@ -10,8 +10,8 @@ import shapely
 import torch
 
 from support.captures import look_down
-from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder

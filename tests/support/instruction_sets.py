@@ -8,25 +8,25 @@ from unittest.mock import patch
 
 import pytest
 
-from vdgs.kernels.native import module
+from vdgs.kernels.cpu import extension
 
 #: Runs a test once for every instruction set that this processor supports.
-every_instruction_set = pytest.mark.parametrize("instructions", module.supported())
+every_instruction_set = pytest.mark.parametrize("instructions", extension.supported())
 
 
 @contextmanager
 def using(instructions: str) -> Iterator[None]:
     """Run the kernels built for one instruction set."""
-    with patch.object(module, "native", lambda: module.load(instructions)):
+    with patch.object(extension, "native", lambda: extension.load(instructions)):
         yield
 
 
 @contextmanager
 def on_threads(count: int) -> Iterator[None]:
     """Let the kernels use `count` threads."""
-    before = module.threads()
-    module.set_threads(count)
+    before = extension.threads()
+    extension.set_threads(count)
     try:
         yield
     finally:
-        module.set_threads(before)
+        extension.set_threads(before)

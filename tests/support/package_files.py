@@ -21,6 +21,6 @@ def files_with_shapes() -> list[Path]:
 
 
 def module_name(file: Path) -> str:
-    """`vdgs.model.gaps` for src/vdgs/model/gaps.py, `experiments.bench.seen` for experiments/bench/seen.py."""
+    """`vdgs.model.initialization.gap_filling` for src/vdgs/model/initialization/gap_filling.py, `experiments.bench.seen` for experiments/bench/seen.py."""
     parts = file.relative_to(PACKAGE.parent if file.is_relative_to(PACKAGE) else ROOT).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)

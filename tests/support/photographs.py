@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from vdgs.cameras import Camera
 from vdgs.captures.capture import View
-from vdgs.captures.photographs import decode_mask
+from vdgs.captures.image_files import decode_mask
 from vdgs.evaluation import metrics
+from vdgs.geometry.camera import Camera
 
 
 def photograph(rng: np.random.Generator, height: int = 48, width: int = 64) -> np.ndarray:

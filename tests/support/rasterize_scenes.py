@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vdgs.kernels.runs import Runs
-from vdgs.kernels.types import OrderedSplats, Raster, RasterPullback, Splats
+from vdgs.kernels.kernel_types import OrderedSplats, Raster, RasterPullback, Splats
+from vdgs.kernels.splat_segments import Runs
 
 
 def assert_first_gradients_are_those_of_all(

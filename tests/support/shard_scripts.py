@@ -10,8 +10,8 @@ from pathlib import Path
 from rich.console import Console
 
 from support.commands import PATIENCE_SECONDS
-from vdgs.executors.local import LocalExecutor
-from vdgs.executors.pieces import Piece, run_pieces
+from vdgs.distributed.local_executor import LocalExecutor
+from vdgs.distributed.shard_runner import Piece, run_pieces
 from vdgs.runs.stage_folder import StageFolder
 
 #: What every fake block begins with: it knows its folder, can say how far it is, and lists the SIGTERMs it gets.

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from support.checkerboard import Photographs
+from vdgs.config.method import AnchorConfig, GrowthConfig, TrainConfig
 from vdgs.model.decoder import Decoder
-from vdgs.model.start import initial_anchors
-from vdgs.settings.method import AnchorConfig, GrowthConfig, TrainConfig
+from vdgs.model.initialization.initialize import initial_anchors
 from vdgs.training import Stage, start_state, to_saved, train
 
 BLACK = (0.0, 0.0, 0.0)

@@ -26,10 +26,10 @@ from websockets.sync.client import ClientConnection, connect
 
 from support.captures import tiny_scene, write_colmap
 from support.commands import vdgs
-from vdgs.cameras import Camera
 from vdgs.evaluation.metrics import to_8bit
-from vdgs.model.render import render
-from vdgs.viewer.serving import Viewer
+from vdgs.geometry.camera import Camera
+from vdgs.model.renderer import render
+from vdgs.viewer.server import Viewer
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 #: A busy machine may need long; nothing waits so long where all is well.

@@ -11,21 +11,21 @@ import pytest
 
 pytest.importorskip("embreex")
 
+from vdgs.captures.ground_truth import load_truth, pack_depth, unpack_depth
 from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import VdgsError
-from vdgs.settings.capture import CaptureOptions
 from vdgs.synth import SynthOptions, generate
-from vdgs.synth.disturbances import disturbed, exposure_gains, with_outliers
-from vdgs.synth.flight import fly, pinhole
-from vdgs.synth.held_out import held_out_cameras
-from vdgs.synth.imbalance import flight_imbalance, survey
+from vdgs.synth.flight_cameras import fly, pinhole
+from vdgs.synth.flight_stats import flight_imbalance, survey
 from vdgs.synth.mesh import Material, MeshBuilder
 from vdgs.synth.options import ResolvedOptions
-from vdgs.synth.sparse import SparseCloud
-from vdgs.synth.surveying import count_visibility, surface_places, view_truth
+from vdgs.synth.perturbations import disturbed, exposure_gains, with_outliers
+from vdgs.synth.ray_tracing import Tracer
+from vdgs.synth.synthetic_points import SparseCloud
+from vdgs.synth.test_cameras import held_out_cameras
 from vdgs.synth.town import Town, build_town
-from vdgs.synth.tracing import Tracer
-from vdgs.synth.truth import load_truth, pack_depth, unpack_depth
+from vdgs.synth.true_visibility import count_visibility, surface_places, view_truth
 
 pytestmark = pytest.mark.xdist_group("synth_flights")
 

@@ -14,16 +14,16 @@ from PIL import Image
 pytest.importorskip("embreex")
 import pycolmap
 
-from vdgs.cameras import Camera
+from vdgs.captures.ground_truth import load_truth
 from vdgs.captures.loading import load_capture
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import VdgsError
-from vdgs.evaluation.of_run import true_depth
-from vdgs.settings.capture import CaptureOptions
+from vdgs.evaluation.evaluate_run import true_depth
+from vdgs.geometry.camera import Camera
 from vdgs.synth import SynthOptions, generate
-from vdgs.synth.photography import sample_offsets
+from vdgs.synth.image_renderer import sample_offsets
 from vdgs.synth.streets import street_plan
 from vdgs.synth.town import build_town
-from vdgs.synth.truth import load_truth
 from vdgs.synth.zones import Zone
 
 pytestmark = pytest.mark.xdist_group("synth")

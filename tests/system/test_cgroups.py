@@ -7,10 +7,10 @@ from types import SimpleNamespace
 
 import psutil
 import pytest
+from vdgs.cli.main.doctor import system_checks as doctor
 
-from vdgs.doctor import checks as doctor
-from vdgs.memory import process
-from vdgs.memory.groups import GroupLimit, group_limits, slurm_limit
+from vdgs.system.memory import process_memory
+from vdgs.system.memory.cgroups import GroupLimit, group_limits, slurm_limit
 
 GB = 10**9
 #: What version 1 says where there is no limit.
@@ -146,18 +146,18 @@ def large(monkeypatch) -> None:
 
 def test_a_process_may_take_what_its_group_leaves(large, monkeypatch):
     for groups, free in (([], 500), ([GroupLimit(NONE, GB)], 500), ([GroupLimit(32 * GB, 2 * GB)], 30)):
-        monkeypatch.setattr(process, "group_limits", lambda groups=groups: groups)
-        assert process.available_bytes() == free * GB
+        monkeypatch.setattr(process_memory, "group_limits", lambda groups=groups: groups)
+        assert process_memory.available_bytes() == free * GB
 
 
 def test_a_job_that_no_group_limits_takes_what_it_asked_for(large, monkeypatch):
-    monkeypatch.setattr(process, "group_limits", lambda: [GroupLimit(NONE, GB)])
+    monkeypatch.setattr(process_memory, "group_limits", lambda: [GroupLimit(NONE, GB)])
     monkeypatch.setenv("SLURM_JOB_ID", "7")
     monkeypatch.setenv("SLURM_MEM_PER_NODE", str(64 << 10))
-    taken = (64 << 30) - process.available_bytes()
+    taken = (64 << 30) - process_memory.available_bytes()
     assert 0 < taken < 20 * GB  # this process and its children
-    monkeypatch.setattr(process, "group_limits", lambda: [GroupLimit(128 * GB, GB)])
-    assert process.available_bytes() == 127 * GB
+    monkeypatch.setattr(process_memory, "group_limits", lambda: [GroupLimit(128 * GB, GB)])
+    assert process_memory.available_bytes() == 127 * GB
 
 
 def test_the_doctor_sees_the_same_limit(large, monkeypatch):

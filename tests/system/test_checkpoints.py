@@ -10,8 +10,8 @@ import torch
 from safetensors import SafetensorError
 
 from vdgs.errors import VdgsError
-from vdgs.storage.checkpoints import SavedState, load_newest, remove_leftovers, save_state
-from vdgs.storage.files import write_atomically
+from vdgs.system.atomic_files import write_atomically
+from vdgs.system.checkpoints import SavedState, load_newest, remove_leftovers, save_state
 
 
 def state(iteration: int) -> SavedState:

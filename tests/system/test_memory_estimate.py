@@ -22,8 +22,10 @@ from rich.console import Console
 
 from support.captures import tiny_scene, write_colmap
 from support.commands import entry_point, vdgs
-from vdgs.cameras import Camera
-from vdgs.memory.estimate import (
+from vdgs.config.method import CompensationConfig
+from vdgs.config.presets import PRESETS
+from vdgs.geometry.camera import Camera
+from vdgs.system.memory.memory_estimate import (
     COMPENSATED_GROWTH,
     GROWTH,
     Need,
@@ -35,12 +37,10 @@ from vdgs.memory.estimate import (
     most_growth,
     need_of_block,
 )
-from vdgs.memory.process import available_bytes, is_out_of_memory
-from vdgs.settings.method import CompensationConfig
-from vdgs.settings.presets import PRESETS
-from vdgs.watching import anchors as watching
-from vdgs.watching import memory_notes
-from vdgs.watching.memory_notes import announce
+from vdgs.system.memory.process_memory import available_bytes, is_out_of_memory
+from vdgs.training.session import memory_advice
+from vdgs.training.session import trainer as watching
+from vdgs.training.session.memory_advice import announce
 
 needs = st.builds(
     Need,
@@ -157,14 +157,14 @@ def test_the_line_for_people_says_what_takes_it_and_what_there_is():
 def test_a_warning_comes_before_training_where_it_will_not_fit(kind, said, monkeypatch, capsys):
     need = Need(anchors=1_000_000, max_anchors=0, offsets=10, seen=0.4, pixels=2 * 10**7, images_bytes=10**9)
     taken = psutil.Process().memory_info().rss  # it grows with the tests that ran before
-    monkeypatch.setattr(memory_notes, "available_bytes", lambda: int(5.4e9) - taken)
+    monkeypatch.setattr(memory_advice, "available_bytes", lambda: int(5.4e9) - taken)
     announce(need, kind, Console(width=2000))
     line, warning, *_ = capsys.readouterr().out.splitlines()
     assert line.startswith("memory by estimate")
     assert warning.startswith("warning it may run out of memory: ")
     assert ("--growth.max-anchors 1000000" in warning) == (kind == "coarse")
     assert warning.endswith(said)
-    monkeypatch.setattr(memory_notes, "available_bytes", lambda: 10**11)
+    monkeypatch.setattr(memory_advice, "available_bytes", lambda: 10**11)
     announce(need, kind, Console(width=2000))
     assert "warning" not in capsys.readouterr().out
 
@@ -192,7 +192,7 @@ def test_other_errors_are_not_taken_for_it():
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of address space")
 def test_a_limit_of_the_process_counts():
     code = (
-        "import resource, psutil; from vdgs.memory.process import available_bytes\n"
+        "import resource, psutil; from vdgs.system.memory.process_memory import available_bytes\n"
         "vms = psutil.Process().memory_info().vms\n"
         "resource.setrlimit(resource.RLIMIT_AS, (vms + 10**8,) * 2); print(available_bytes())"
     )

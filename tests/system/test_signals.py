@@ -7,7 +7,7 @@ from contextlib import suppress
 import pytest
 
 from vdgs.errors import Interrupted
-from vdgs.watching.interrupts import stop_if_asked, stop_requests
+from vdgs.system.stop_signals import stop_if_asked, stop_requests
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

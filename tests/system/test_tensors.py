@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from vdgs.storage.tensors import DTYPES, checksum, read_whole, size_and_checksum, write_tensors
+from vdgs.system.tensors import DTYPES, checksum, read_whole, size_and_checksum, write_tensors
 
 SHAPES = st.lists(st.integers(0, 4), max_size=3)
 
@@ -81,7 +81,7 @@ TRANSIENT = """
 import sys
 from pathlib import Path
 import torch
-from vdgs.storage.checkpoints import SavedState, load_newest, save_state
+from vdgs.system.checkpoints import SavedState, load_newest, save_state
 
 def memory(key):
     with open("/proc/self/status") as status:

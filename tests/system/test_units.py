@@ -7,7 +7,7 @@ import re
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vdgs.units import ABSENT, clock, count, data_size, duration, rough_duration
+from vdgs.system.units import ABSENT, clock, count, data_size, duration, rough_duration
 
 
 def test_figures_that_are_not_there_are_a_dash():

@@ -16,17 +16,17 @@ from hypothesis import strategies as st
 from support.checkerboard import Photographs
 from support.hand_made_models import capture_at
 from support.small_training import CONFIG, bits, run, stage, start
-from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, View
-from vdgs.captures.order import places_in_flights
-from vdgs.evaluation.exposures import Exposures, as_photographed, exposures_of
-from vdgs.evaluation.metering import Metering, learnt, metered
-from vdgs.evaluation.solidity import Rendered
+from vdgs.captures.capture_order import places_in_flights
+from vdgs.evaluation.auto_exposure import Metering, learnt, metered
+from vdgs.evaluation.opacity_coverage import Rendered
+from vdgs.evaluation.view_exposures import Exposures, as_photographed, exposures_of
+from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.model.exposure import REACH, exposed, exposure_of, interpolated, neutral_exposures
-from vdgs.model.render import render
+from vdgs.model.renderer import render
 from vdgs.training import Stage, from_saved, start_state, to_saved, train_step
 
 pytestmark = pytest.mark.xdist_group("training")

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.small_training import CONFIG, run, stage, start
+from vdgs.config.method import GrowthConfig, TrainConfig
 from vdgs.model.anchors import TRAINED
-from vdgs.settings.method import GrowthConfig, TrainConfig
-from vdgs.storage.checkpoints import load_newest, save_state
-from vdgs.training import from_saved, loop, to_saved, train_step
-from vdgs.training.averaging import MODELS, counts_in_mean
+from vdgs.system.checkpoints import load_newest, save_state
+from vdgs.training import from_saved, to_saved, train_step, training_loop
+from vdgs.training.weight_averaging import MODELS, counts_in_mean
 
 #: Growth ends at iteration 30, the mean begins after 36.
 MEAN = replace(CONFIG, average=0.4, growth=replace(CONFIG.growth, until=0.5))
@@ -43,7 +43,7 @@ def test_the_mean_is_one_of_many_models_after_growth_and_of_the_last(iterations,
 
 
 def test_it_is_the_mean_of_the_models_and_changes_none_of_them(monkeypatch):
-    monkeypatch.setattr(loop, "REORDER_INTERVAL", 10**9)  # rows must stay where they are to be added up here
+    monkeypatch.setattr(training_loop, "REORDER_INTERVAL", 10**9)  # rows must stay where they are to be added up here
     plain, averaged = start(MEAN), start(MEAN)
     off, on = stage(replace(MEAN, average=0.0)), stage(MEAN)
     models = []
@@ -68,7 +68,7 @@ def test_without_it_the_result_is_the_last_model():
 
 
 def test_a_stopped_and_continued_run_ends_with_the_same_mean(tmp_path, monkeypatch):
-    monkeypatch.setattr(loop, "REORDER_INTERVAL", 7)
+    monkeypatch.setattr(training_loop, "REORDER_INTERVAL", 7)
     unbroken = tensors_of(*run(start(MEAN), stage(MEAN)).result())
     state = start(MEAN)
     for stop_at in (20, 37, 38, 50):
@@ -84,7 +84,7 @@ def test_rows_of_the_mean_follow_their_anchors(monkeypatch):
     """Put into Morton order within the mean or not: the same anchors have the same means."""
 
     def by_place(interval: int) -> np.ndarray:
-        monkeypatch.setattr(loop, "REORDER_INTERVAL", interval)
+        monkeypatch.setattr(training_loop, "REORDER_INTERVAL", interval)
         anchors, _ = run(start(MEAN), stage(MEAN)).result()
         rows = np.concatenate([each.reshape(len(anchors), -1).numpy() for each in anchors.tensors().values()], axis=1)
         return rows[np.lexsort(rows.T[:3])]

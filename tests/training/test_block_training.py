@@ -8,17 +8,17 @@ import torch
 
 from support.block_training import BLOCKS, CONFIG, block_stage, coarse
 from support.checkerboard import Photographs
-from vdgs.model.anchors import Anchors
-from vdgs.model.render import visible_rows
-from vdgs.partition.blocks import Block, Blocks, places_of
-from vdgs.partition.regions import drawn_by, holds, ramp, split_anchors
-from vdgs.settings.method import (
+from vdgs.config.method import (
     BlockConfig,
     CompensationConfig,
     GrowthConfig,
     MethodConfig,
     block_training,
 )
+from vdgs.model.anchors import Anchors
+from vdgs.model.renderer import visible_rows
+from vdgs.partition.block_regions import drawn_by, holds, ramp, split_anchors
+from vdgs.partition.blocks import Block, Blocks, places_of
 from vdgs.training import Stage, Surroundings, TrainingState, from_saved, start_state, to_saved, train, views_in_cycle
 
 

@@ -10,9 +10,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vdgs.kernels.types import Statistics
+from vdgs.config.method import CompensationConfig, GrowthConfig
+from vdgs.kernels.kernel_types import Statistics
 from vdgs.model.anchors import Anchors
-from vdgs.settings.method import CompensationConfig, GrowthConfig
 from vdgs.training.compensation import (
     Compensation,
     begin_cycle,
@@ -22,8 +22,8 @@ from vdgs.training.compensation import (
     low_visibility,
     update_cache,
 )
-from vdgs.training.growth import decide
-from vdgs.training.per_anchor import remap_rows
+from vdgs.training.densification import decide
+from vdgs.training.per_anchor_tensors import remap_rows
 
 K = 3
 PAPER = CompensationConfig()

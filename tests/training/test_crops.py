@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from support.block_training import BLOCKS, block_stage, coarse
 from support.decode_scenes import Scene, looking_down, turned
+from vdgs.config.method import BlockConfig, MethodConfig
 from vdgs.errors import RunError
-from vdgs.kernels import native, reference
+from vdgs.kernels import cpu, torch_ref
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.render import paint
-from vdgs.partition.regions import split_anchors
-from vdgs.settings.method import BlockConfig, MethodConfig
+from vdgs.model.renderer import paint
+from vdgs.partition.block_regions import split_anchors
 from vdgs.training import from_saved, to_saved, train, train_step
 from vdgs.training.crops import (
     CUT_OFF,
@@ -49,7 +49,7 @@ def drawn(scene: Scene, camera, part, kernels) -> torch.Tensor:
     return kernels.rasterise(splats, torch.tensor([0.1, 0.5, 0.9]), part.width, part.height).image
 
 
-@pytest.mark.parametrize("kernels", [native, reference], ids=["native", "twin"])
+@pytest.mark.parametrize("kernels", [cpu, torch_ref], ids=["native", "twin"])
 @pytest.mark.parametrize("camera", CAMERAS, ids=["down", "orthographic", "turned"])
 @pytest.mark.parametrize("log_scale", [-1.5, 0.5], ids=["small", "large"])
 def test_a_part_draws_what_the_whole_picture_shows_there(kernels, camera, log_scale):
@@ -72,7 +72,7 @@ def test_its_gradients_are_those_of_the_pixels_that_it_holds(camera):
     found = []
     for part, incoming in ((ALL_OF, weight * inside), ((left, top, right, bottom), weight[top:bottom, left:right])):
         scene_ = replace(scene, features=scene.features.clone().requires_grad_(True))
-        (drawn(scene_, camera, part, native) * incoming).sum().backward()
+        (drawn(scene_, camera, part, cpu) * incoming).sum().backward()
         found.append(scene_.features.grad)
     assert torch.allclose(found[0], found[1], atol=1e-3 * float(found[0].abs().max()))
     assert float(found[0].abs().max()) > 0
@@ -223,7 +223,7 @@ def test_anchors_outside_of_all_parts_do_not_move():
     seen = torch.zeros(len(before), dtype=torch.bool)
     for camera in stage.images.cameras:
         part = camera.cropped(*stage.crops[0].pixels(camera.width, camera.height))
-        seen[native.cull(positions, state.anchors.log_scales, part)] = True
+        seen[cpu.cull(positions, state.anchors.log_scales, part)] = True
     moved = (state.anchors.features[: len(before)] != before).any(1)
     assert moved.any()
     assert not (moved & ~seen).any()

@@ -7,12 +7,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vdgs.kernels import native
-from vdgs.kernels.types import Statistics
+from vdgs.config.method import GrowthConfig
+from vdgs.kernels import cpu
+from vdgs.kernels.kernel_types import Statistics
 from vdgs.model.anchors import Anchors
-from vdgs.settings.method import GrowthConfig
-from vdgs.training import growth
-from vdgs.training.growth import decide
+from vdgs.training import densification
+from vdgs.training.densification import decide
 
 K = 4
 ALWAYS = GrowthConfig(gate=0.0, levels=1, coarsest_cell=1.0, threshold=1.0)
@@ -137,7 +137,7 @@ def test_a_view_is_counted_where_it_was_drawn():
     source = torch.tensor([0, 2, K + 1], dtype=torch.int32)  # anchor 1: offsets 0, 2; anchor 3: offset 1
     gradient = torch.tensor([[3.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
     inside = torch.tensor([False, True])
-    native.add_view_statistics(
+    cpu.add_view_statistics(
         stats, visible, inside, source, torch.tensor([0.5, 0.25, 1.0]), gradient, width=4, height=2
     )
     assert stats.gradient[1].tolist() == [6.0, 0.0, 1.0, 0.0]
@@ -179,7 +179,7 @@ def test_new_anchors_stay_where_they_may_be_and_no_budget_is_spent_elsewhere():
 
 
 def test_the_order_of_anchors_does_not_decide_where_new_ones_come(monkeypatch):
-    monkeypatch.setattr(growth, "_random", lambda index, count, generator: torch.ones(len(index)))
+    monkeypatch.setattr(densification, "_random", lambda index, count, generator: torch.ones(len(index)))
     before, stats = anchors(80), statistics(80)
     order = torch.randperm(80, generator=torch.Generator().manual_seed(1))
     config = GrowthConfig(gate=0.0, levels=3, coarsest_cell=4.0, threshold=1.0)
@@ -195,10 +195,10 @@ def test_the_order_of_anchors_does_not_decide_where_new_ones_come(monkeypatch):
 @given(count=st.integers(1, 300), chunk=st.integers(1, 100), data=st.data())
 def test_random_numbers_are_those_of_one_draw(count, chunk, data):
     index = torch.tensor(sorted(data.draw(st.sets(st.integers(0, count - 1)))), dtype=torch.int64)
-    before = growth.RANDOM_CHUNK
-    growth.RANDOM_CHUNK = chunk
+    before = densification.RANDOM_CHUNK
+    densification.RANDOM_CHUNK = chunk
     try:
-        numbers = growth._random(index, count, torch.Generator().manual_seed(7))
+        numbers = densification._random(index, count, torch.Generator().manual_seed(7))
     finally:
-        growth.RANDOM_CHUNK = before
+        densification.RANDOM_CHUNK = before
     assert torch.equal(numbers, torch.rand(count, generator=torch.Generator().manual_seed(7))[index])

@@ -10,12 +10,12 @@ import torch
 from support.block_training import block_stage, coarse
 from support.checkerboard import Photographs
 from support.rasterize_scenes import make_scene, splats_of
+from vdgs.config.method import BlockConfig
 from vdgs.kernels import choose
-from vdgs.kernels.types import Splats
-from vdgs.settings.method import BlockConfig
-from vdgs.training import Stage, Surroundings, TrainingState, loop, start_state, train_step
+from vdgs.kernels.kernel_types import Splats
+from vdgs.training import Stage, Surroundings, TrainingState, start_state, train_step, training_loop
 from vdgs.training.crops import Crop
-from vdgs.training.reach import box_reached
+from vdgs.training.gradient_roi import box_reached
 
 SCENES = {
     "ordinary": make_scene(40, 61, 47),
@@ -84,9 +84,9 @@ def step(monkeypatch: pytest.MonkeyPatch, stage: Stage, own: bool, narrowing: bo
     state, drawn = start_state(small, decoder, stage), []
     with monkeypatch.context() as patch:
         if not narrowing:
-            patch.setattr(loop, "narrow", lambda stage, splats, camera, box: box)
-        draw = loop.draw_view
-        patch.setattr(loop, "draw_view", lambda *given: drawn.append(given) or draw(*given))
+            patch.setattr(training_loop, "narrow", lambda stage, splats, camera, box: box)
+        draw = training_loop.draw_view
+        patch.setattr(training_loop, "draw_view", lambda *given: drawn.append(given) or draw(*given))
         train_step(state, stage)
     ((_, camera, _, around),) = drawn
     return Stepped(state, camera.width * camera.height, len(around.depths))
@@ -123,7 +123,7 @@ def test_a_step_moves_a_block_as_if_it_had_drawn_all(monkeypatch, name, own):
 def test_a_block_with_nothing_around_it_draws_all(monkeypatch):
     stage, state = block_stage(BlockConfig())
     nothing = stage.surroundings.anchors.select(torch.zeros(0, dtype=torch.int64))
-    camera, drawn, draw = stage.images.camera(0), [], loop.draw_view
-    monkeypatch.setattr(loop, "draw_view", lambda *given: drawn.append(given[1]) or draw(*given))
+    camera, drawn, draw = stage.images.camera(0), [], training_loop.draw_view
+    monkeypatch.setattr(training_loop, "draw_view", lambda *given: drawn.append(given[1]) or draw(*given))
     train_step(state, replace(stage, surroundings=Surroundings(nothing, state.decoder)))
     assert [(each.width, each.height) for each in drawn] == [(camera.width, camera.height)]

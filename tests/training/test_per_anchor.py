@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from support.block_training import CONFIG, block_stage
-from vdgs.settings.method import BlockConfig, CompensationConfig
+from vdgs.config.method import BlockConfig, CompensationConfig
 from vdgs.training import TrainingState, to_saved
-from vdgs.training.averaging import Average
-from vdgs.training.per_anchor import remap, remap_rows
+from vdgs.training.per_anchor_tensors import remap, remap_rows
+from vdgs.training.weight_averaging import Average
 
 
 @pytest.mark.parametrize("pruned", [0, 3])

@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 
 from support.block_training import block_stage
 from support.checkerboard import Photographs
-from vdgs.cameras import NEAR, Camera
+from vdgs.config.method import BlockConfig, GrowthConfig, LossConfig
+from vdgs.geometry.camera import NEAR, Camera
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.frustum import project
 from vdgs.model.ground import BELOW_HORIZON_DEG, below_horizon
-from vdgs.model.render import decode_view, render
-from vdgs.model.sizes import REACH, SPAN, SPREAD, largest_log_scales
-from vdgs.settings.method import BlockConfig, GrowthConfig, LossConfig
+from vdgs.model.renderer import decode_view, render
+from vdgs.model.scale_bounds import REACH, SPAN, SPREAD, largest_log_scales
 from vdgs.training import Stage, train
 from vdgs.training.background import background_at
+from vdgs.visibility.frustum import project
 
 FOCAL, WIDTH, HEIGHT = 100.0, 200, 160
 

@@ -10,18 +10,18 @@ from hypothesis import strategies as st
 
 from support.checkerboard import Photographs
 from support.small_training import BLACK, CONFIG, bits, run, stage, start
+from vdgs.config.method import AnchorConfig, RateConfig
 from vdgs.errors import TrainingDiverged, VdgsError
-from vdgs.kernels import native
-from vdgs.kernels.native.module import set_threads, threads
+from vdgs.kernels import cpu
+from vdgs.kernels.cpu.extension import set_threads, threads
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
-from vdgs.model.render import render
-from vdgs.model.start import initial_anchors
-from vdgs.settings.method import AnchorConfig, RateConfig
-from vdgs.storage.checkpoints import load_newest, save_state
+from vdgs.model.initialization.initialize import initial_anchors
+from vdgs.model.renderer import render
+from vdgs.system.checkpoints import load_newest, save_state
 from vdgs.training import downscale_at, from_saved, to_saved, train_step, view_at
 from vdgs.training.crops import Crop, crop_at
-from vdgs.training.optimiser import rates_at
-from vdgs.training.step import coast_anchors
+from vdgs.training.optimizer import rates_at
+from vdgs.training.training_step import coast_anchors
 
 pytestmark = pytest.mark.xdist_group("training")
 
@@ -141,10 +141,10 @@ def test_transparent_anchors_go_where_they_are_seen_and_stay_just_outside_of_all
         tensor.requires_grad_(False)
     before = state.anchors.positions.clone()
     cameras = Photographs().cameras
-    times = native.count_visibility(before, cameras)
+    times = cpu.count_visibility(before, cameras)
     beside = torch.zeros(len(before), dtype=torch.bool)
     for camera in cameras:
-        beside[native.cull(before, state.anchors.log_scales, camera)] = True
+        beside[cpu.cull(before, state.anchors.log_scales, camera)] = True
     beside &= times == 0
     run(state, nothing)
     left = {tuple(place) for place in state.anchors.positions.tolist()}

@@ -8,8 +8,8 @@ import pytest
 
 pytest.importorskip("viser", reason="viser is not installed (pip install 'vdgs[viewer]')")
 
-from vdgs.viewer.door import Door
-from vdgs.viewer.serving import invitation
+from vdgs.viewer.access_control import Door
+from vdgs.viewer.server import invitation
 
 
 def test_the_door_knows_its_own_name():

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from support.captures import camera_at
-from vdgs.cameras import Camera
+from vdgs.geometry.camera import Camera
 from vdgs.viewer.layers import Shown
-from vdgs.viewer.studio import FEWEST_PX, REST, ROUND, TURN_ANCHORS, Frame, Studio, shrunk
+from vdgs.viewer.render_scheduler import FEWEST_PX, REST, ROUND, TURN_ANCHORS, Frame, Studio, shrunk
 
 
 class Clock:

@@ -24,20 +24,20 @@ import viser
 
 from support.commands import vdgs, wait_until
 from support.viewer import Guest, expected, quiet, trained
-from vdgs.cameras import Camera
 from vdgs.errors import RunError, VdgsError
-from vdgs.films.path_files import load_path
-from vdgs.films.paths import look_at
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import open_run
+from vdgs.geometry.camera import Camera
+from vdgs.rendering.camera_paths import look_at
+from vdgs.rendering.path_io import load_path
+from vdgs.runs.open_run import open_run
+from vdgs.runs.run_folder import RunFolder
 from vdgs.viewer import navigation
-from vdgs.viewer.following import newest, open_or_last_saved, standing_lines
+from vdgs.viewer.client_session import Visitor
 from vdgs.viewer.layers import Painter
+from vdgs.viewer.live_run import newest, open_or_last_saved, standing_lines
 from vdgs.viewer.path_panel import PathPanel
-from vdgs.viewer.place_panel import PlacePanel
-from vdgs.viewer.serving import free_port, serve
-from vdgs.viewer.studio import KEPT, Seat
-from vdgs.viewer.visitor import Visitor
+from vdgs.viewer.point_panel import PlacePanel
+from vdgs.viewer.render_scheduler import KEPT, Seat
+from vdgs.viewer.server import free_port, serve
 
 pytestmark = pytest.mark.xdist_group("viewer")
 
@@ -290,7 +290,7 @@ def test_ports_and_hosts_that_cannot_be_used_are_said_before_any_work(run):
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_it_ends_when_asked_to(run, how):
-    command = [sys.executable, "-c", "from vdgs.cli import main; main()", "view", str(run)]
+    command = [sys.executable, "-c", "from vdgs.cli.main import main; main()", "view", str(run)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stderr is not None
@@ -303,7 +303,7 @@ def test_it_ends_when_asked_to(run, how):
 
 
 def test_what_draws_charts_is_not_waited_for():
-    code = "import sys, vdgs.viewer.serving; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, vdgs.viewer.server; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 

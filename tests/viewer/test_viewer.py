@@ -16,28 +16,28 @@ from scipy.spatial.transform import Rotation
 
 from support.captures import camera_at, look_down
 from support.hand_made_models import opaque_plane, quadrants
-from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture, GroundFrame, View
-from vdgs.evaluation.exposures import as_photographed
-from vdgs.evaluation.metering import metered
+from vdgs.evaluation.auto_exposure import metered
 from vdgs.evaluation.metrics import to_8bit
-from vdgs.films.path_files import load_path
-from vdgs.films.paths import look_at
+from vdgs.evaluation.view_exposures import as_photographed
+from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel, Part
 from vdgs.model.exposure import exposure_of
-from vdgs.model.render import render
+from vdgs.model.renderer import render
 from vdgs.partition.blocks import save_blocks
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import TrainedRun
+from vdgs.rendering.camera_paths import look_at
+from vdgs.rendering.path_io import load_path
+from vdgs.runs.open_run import TrainedRun
+from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.status import Status
 from vdgs.viewer import navigation, overlays
+from vdgs.viewer.image_comparison import laid_over, nearest_view
 from vdgs.viewer.keyframes import at_time, path_json
 from vdgs.viewer.layers import LAYERS, Painter, Shown
-from vdgs.viewer.measuring import Ruler
-from vdgs.viewer.photographs import laid_over, nearest_view
-from vdgs.viewer.places import place_at, position_at, thumbnail
-from vdgs.viewer.scene import Scene
-from vdgs.viewer.thinning import Levels
+from vdgs.viewer.lod import Levels
+from vdgs.viewer.measurement import Ruler
+from vdgs.viewer.picking import place_at, position_at, thumbnail
+from vdgs.viewer.viewer_scene import Scene
 
 pytestmark = pytest.mark.xdist_group("viewer_scene")
 

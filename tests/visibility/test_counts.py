@@ -11,11 +11,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.captures import look_down
-from vdgs.cameras import NEAR, Camera, CameraModel
+from vdgs.config.method import TrainConfig
+from vdgs.geometry.camera import NEAR, Camera, CameraModel
 from vdgs.model.anchors import Anchors
-from vdgs.model.visibility import effective_count, imbalance, normalised, share_in_cycle, visibility_of, votes_of
-from vdgs.settings.method import TrainConfig
 from vdgs.training.sampling import shares_for
+from vdgs.visibility.visibility_counts import (
+    effective_count,
+    imbalance,
+    normalised,
+    share_in_cycle,
+    visibility_of,
+    votes_of,
+)
 
 
 def flight(count: int, model: CameraModel = "pinhole", seed: int = 0) -> list[Camera]:

@@ -19,13 +19,13 @@ import torch
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
-from vdgs.cameras import Camera
 from vdgs.errors import VdgsError
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import Raster
 from vdgs.kernels.spherical_harmonics import MAX_DEGREE, dc_of_colours, function_count
-from vdgs.kernels.types import Raster
 from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows
-from vdgs.storage.files import write_atomically
-from vdgs.storage.tensors import checksum, read_tensors, write_tensors
+from vdgs.system.atomic_files import write_atomically
+from vdgs.system.tensors import checksum, read_tensors, write_tensors
 
 FORMAT = "vdgs-gaussians-1"
 #: The smallest first size, as a share of the median one: coincident points would have none.

@@ -29,27 +29,27 @@ from experiments.baselines.gs3d.model import GaussiansModel
 from experiments.baselines.gs3d.session import continue_or_start, finish, train_watched
 from experiments.baselines.gs3d.training import GaussiansConfig, GaussiansStage, scene_extent
 from vdgs import __version__
-from vdgs.cameras import Camera
+from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture
-from vdgs.captures.facts import capture_facts, refuse_another_capture
-from vdgs.captures.heights import camera_height
-from vdgs.captures.images import ImageCache
+from vdgs.captures.capture_metadata import capture_facts, refuse_another_capture
+from vdgs.captures.image_cache import ImageCache
+from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.serialization import differences, to_dict
 from vdgs.errors import RunError, VdgsError
-from vdgs.evaluation.evaluate import evaluate
+from vdgs.evaluation.coverage import seen_map
+from vdgs.evaluation.evaluate_model import evaluate
+from vdgs.evaluation.evaluate_run import cached_photographs, true_depth
 from vdgs.evaluation.lpips import load_lpips
-from vdgs.evaluation.measured_model import EvaluationSettings, MeasuredModel, ModelFacts
-from vdgs.evaluation.of_run import cached_photographs, true_depth
-from vdgs.evaluation.seen import seen_map
-from vdgs.inspection.starting import refuse_unworkable
+from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ModelFacts
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import Raster
 from vdgs.kernels.spherical_harmonics import MAX_DEGREE
-from vdgs.kernels.types import Raster
-from vdgs.runs.folder import RunFolder
+from vdgs.report.starting import refuse_unworkable
+from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder
-from vdgs.settings.plain import differences, to_dict
-from vdgs.settings.watching import WatchOptions
-from vdgs.storage.files import read_json, write_json
+from vdgs.system.atomic_files import read_json, write_json
 from vdgs.training import mean_colour
-from vdgs.watching.images import image_budget
+from vdgs.training.session.images import image_budget
 
 #: What metrics.json calls this method.
 NAME = "3dgs"

@@ -1,6 +1,6 @@
 """Training of 3DGS, watched: shown, logged, checkpointed, stopped and continued.
 
-The twin of `vdgs.watching.anchors`, for another kind of state.
+The twin of `vdgs.training.session.trainer`, for another kind of state.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from experiments.baselines.gs3d.training import (
     train,
 )
 from vdgs.captures.capture import Capture
+from vdgs.config.checkpointing import WatchOptions
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.runs.status import Status
-from vdgs.settings.watching import WatchOptions
-from vdgs.storage.checkpoints import save_state
-from vdgs.watching.progress import LOG_INTERVAL, PLAIN_SECONDS
-from vdgs.watching.watch import Keeper, Watched, restore_or_start, watch
+from vdgs.system.checkpoints import save_state
+from vdgs.training.session.training_progress import LOG_INTERVAL, PLAIN_SECONDS
+from vdgs.training.session.training_session import Keeper, Watched, restore_or_start, watch
 
 
 def continue_or_start(

@@ -15,15 +15,15 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from experiments.baselines.gs3d.density import DensityConfig, control_density, reset_logits
-from vdgs.cameras import Camera
 from vdgs.errors import TrainingDiverged
+from vdgs.geometry.camera import Camera
 from vdgs.kernels import choose
-from vdgs.kernels.types import AdamState, Finite
+from vdgs.kernels.kernel_types import AdamState, Finite
 from vdgs.model.gaussians import Gaussians, draw_gaussians, visible_rows
-from vdgs.storage.checkpoints import SavedState
+from vdgs.system.checkpoints import SavedState
 from vdgs.training import PSNR_INTERVAL, TrainingImages, view_at
-from vdgs.training.optimiser import Moments
-from vdgs.training.per_anchor import Group, remap
+from vdgs.training.optimizer import Moments
+from vdgs.training.per_anchor_tensors import Group, remap
 from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
 
 

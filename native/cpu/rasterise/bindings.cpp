@@ -1,4 +1,4 @@
-// The rasteriser as Python sees it. Shapes and types are checked by vdgs.kernels.native.rasterise.
+// The rasteriser as Python sees it. Shapes and types are checked by vdgs.kernels.cpu.rasterize.
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/shared_ptr.h>
 

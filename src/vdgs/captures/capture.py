@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from vdgs.cameras import Camera
-from vdgs.captures.alignment import Similarity
 from vdgs.captures.sightings import Sightings
+from vdgs.geometry.camera import Camera
+from vdgs.geometry.similarity import Similarity
 
 Split = Literal["train", "test"]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.names import Lookup, ambiguity
+from vdgs.captures.name_resolution import Lookup, ambiguity
 from vdgs.errors import CaptureError
 
 _Find = Callable[[str], tuple[tuple[int, int], list[int]]]

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture
-from vdgs.captures.heights import camera_height
 
 #: Vertical angle of view of a first look (choice).
 FOV_DEG = 50.0

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.errors import CaptureError
-from vdgs.storage.files import read_json
-from vdgs.storage.records import record_of
+from vdgs.system.atomic_files import read_json
+from vdgs.system.records import record_of
 
 FILE, FIGURE = "reconstruction.json", "reconstruction.png"
 #: The folder of one that is not finished, or whose intermediate files are kept.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vdgs.cameras import Camera
+from vdgs.geometry.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)

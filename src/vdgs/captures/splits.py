@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.capture import Split, View
-from vdgs.captures.formats.source import listing
-from vdgs.captures.names import Names
+from vdgs.captures.formats.source_capture import listing
+from vdgs.captures.name_resolution import Names
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.settings.capture import CaptureOptions
 
 #: Lists that a capture may bring, in its root folder.
 TEST_LIST, VALIDATION_LIST = "test.txt", "validation.txt"

@@ -15,8 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from vdgs.captures.formats.source import Intrinsics
-from vdgs.captures.photographs import decode_mask, decode_photograph
+from vdgs.captures.formats.source_capture import Intrinsics
+from vdgs.captures.image_files import decode_mask, decode_photograph
 from vdgs.errors import CaptureError
 
 JPEG_QUALITY = 95

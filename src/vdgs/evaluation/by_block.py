@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int16
 
-from vdgs.cameras import Camera
 from vdgs.evaluation.metrics import psnr_of
-from vdgs.kernels.types import Raster
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import Raster
 from vdgs.partition.blocks import Blocks
-from vdgs.storage.documents import JsonObject
+from vdgs.system.documents import JsonObject
 
 #: Pixels this near to a change of label belong to the border.
 BORDER_PX = 10.0

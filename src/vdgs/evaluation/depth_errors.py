@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from vdgs.evaluation.by_block import DRAWN_ALPHA
 from vdgs.evaluation.by_visibility import KEYS, key_of, value_of
-from vdgs.kernels.types import Raster
+from vdgs.kernels.kernel_types import Raster
 
 #: Errors up to this share of the camera height count as within one percent.
 NEAR = 0.01

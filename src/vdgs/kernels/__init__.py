@@ -66,23 +66,23 @@ def _implementation(device_type: str, wanted: str) -> Operations:
 
         raise VdgsError(f"{VARIABLE} must be native, reference, composed or not set, not {wanted!r}.")
     if wanted == "reference" or (wanted != "composed" and device_type not in ("cpu", "cuda")):
-        from vdgs.kernels import reference
+        from vdgs.kernels import torch_ref
 
-        return reference
+        return torch_ref
     if wanted == "composed" or device_type == "cuda":
-        from vdgs.kernels import composed
+        from vdgs.kernels import gpu
 
-        return composed
-    from vdgs.kernels import native
+        return gpu
+    from vdgs.kernels import cpu
 
-    return native
+    return cpu
 
 
 def threads() -> int:
     """How many threads the operations use on the CPU."""
-    from vdgs.kernels.native import module
+    from vdgs.kernels.cpu import extension
 
-    return module.threads()
+    return extension.threads()
 
 
 def default_threads() -> int:
@@ -90,9 +90,9 @@ def default_threads() -> int:
 
     Raises VdgsError for another value of that variable.
     """
-    from vdgs.kernels import cores
+    from vdgs.kernels import thread_count
 
-    return cores.default_threads()
+    return thread_count.default_threads()
 
 
 def configure_threads(count: int | None = None) -> None:
@@ -114,14 +114,14 @@ def set_threads(count: int) -> None:
     """
     import torch
 
-    from vdgs.kernels.native import module
+    from vdgs.kernels.cpu import extension
 
-    module.set_threads(count)
+    extension.set_threads(count)
     torch.set_num_threads(count)
 
 
 def release_idle_memory() -> None:
     """Give back what implementations keep from picture to picture but do not use now."""
-    from vdgs.kernels.native import module
+    from vdgs.kernels.cpu import extension
 
-    module.native().drop_idle_frames()
+    extension.native().drop_idle_frames()

@@ -1,6 +1,6 @@
 """The typed set of operations that every implementation offers, and who does which on which device.
 
-What each does is said where it is written most readably: in `vdgs.kernels.reference`. Names and dimensions as in
+What each does is said where it is written most readably: in `vdgs.kernels.torch_ref`. Names and dimensions as in
 `vdgs.kernels`.
 """
 
@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from vdgs.cameras import Camera
-    from vdgs.kernels.runs import Shown
-    from vdgs.kernels.types import (
+    from vdgs.geometry.camera import Camera
+    from vdgs.kernels.kernel_types import (
         AdamState,
         AnchorSplats,
         DecoderWeights,
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
         Statistics,
         TrainingSplats,
     )
+    from vdgs.kernels.splat_segments import Shown
 
 
 class Operations(Protocol):

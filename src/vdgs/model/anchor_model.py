@@ -18,12 +18,12 @@ import torch
 from torch import Tensor
 
 from vdgs.errors import VdgsError
-from vdgs.kernels.types import FEATURE_SIZE
+from vdgs.kernels.kernel_types import FEATURE_SIZE
 from vdgs.model.anchors import TRAINED, Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.storage.documents import CaptureMetadata
-from vdgs.storage.files import write_atomically
-from vdgs.storage.tensors import REBUILD, checksum, read_tensors, write_tensors
+from vdgs.system.atomic_files import write_atomically
+from vdgs.system.documents import CaptureMetadata
+from vdgs.system.tensors import REBUILD, checksum, read_tensors, write_tensors
 
 FORMAT = "vdgs-anchors-1"
 #: Of a model whose blocks have decoders of their own: a reader that knows of one decoder must not take it.

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vdgs.kernels.types import FEATURE_SIZE, HIDDEN_SIZE, DecoderWeights, HeadWeights
+from vdgs.kernels.kernel_types import FEATURE_SIZE, HIDDEN_SIZE, DecoderWeights, HeadWeights
 from vdgs.model.exposure import exposure_of
 
 HEADS = {"opacity": 1, "covariance": 7, "colour": 3}  # outputs per offset

@@ -16,11 +16,11 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from vdgs.cameras import Camera
+from vdgs.geometry.camera import Camera
 from vdgs.kernels import choose
 from vdgs.kernels.constants import ALPHA_MIN
+from vdgs.kernels.kernel_types import Raster, Splats
 from vdgs.kernels.spherical_harmonics import view_colours
-from vdgs.kernels.types import Raster, Splats
 
 #: Beyond so many standard deviations not even an opaque Gaussian reaches the least alpha that is drawn.
 REACH = math.sqrt(-2 * math.log(ALPHA_MIN))

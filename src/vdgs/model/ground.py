@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool
 
-from vdgs.cameras import Camera
+from vdgs.geometry.camera import Camera
 
 #: Rays that lead down by at least this much, in degrees, end on the ground (choice: as far as the vertical of a capture
 #: without GPS may be wrong).

@@ -19,11 +19,11 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from vdgs.captures.capture import GroundFrame
-from vdgs.captures.geodesy import geodetic_from_enu
 from vdgs.errors import RunError
-from vdgs.partition.nearest import Cores
-from vdgs.storage.documents import JsonObject
-from vdgs.storage.files import write_json
+from vdgs.geometry.geodesy import geodetic_from_enu
+from vdgs.partition.polygon_lookup import Cores
+from vdgs.system.atomic_files import write_json
+from vdgs.system.documents import JsonObject
 
 
 def places_of(positions: Float[Tensor, "n 3"] | Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:

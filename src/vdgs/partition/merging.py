@@ -16,15 +16,15 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from vdgs.cameras import Camera
+from vdgs.config.method import MergeConfig
 from vdgs.errors import VdgsError
+from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel, Part
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.model.visibility import visibility_of
+from vdgs.partition.block_records import MergedBlock
 from vdgs.partition.blocks import Blocks, places_of
-from vdgs.partition.records import MergedBlock
-from vdgs.settings.method import MergeConfig
+from vdgs.visibility.visibility_counts import visibility_of
 
 
 def merge(

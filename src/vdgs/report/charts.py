@@ -12,8 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator
 
-from vdgs.figures.style import FAINT, INK
-from vdgs.report.pictures import Picture
+from vdgs.plots.style import FAINT, INK
+from vdgs.report.embedded_images import Picture
 
 SIZE_IN, DPI = (4.8, 3.0), 160
 #: Curves of one diagram that a legend names at most, and points of a curve that are drawn.

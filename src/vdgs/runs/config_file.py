@@ -14,11 +14,11 @@ from pathlib import Path
 import yaml
 
 from vdgs import __version__
+from vdgs.config.ranges import option
+from vdgs.config.serialization import differences
 from vdgs.errors import RunError
 from vdgs.runs.run_settings import SECTIONS, RunSettings
-from vdgs.settings.plain import differences
-from vdgs.settings.ranges import option
-from vdgs.storage.files import write_text
+from vdgs.system.atomic_files import write_text
 
 #: Those whose options have no prefix on the command line.
 PLAIN_SECTIONS = ("capture", "training", "partition")

@@ -7,9 +7,9 @@ from jaxtyping import Bool
 
 from vdgs.captures.capture import Capture
 from vdgs.errors import RunError
-from vdgs.partition.assignment.saving import load_scores
+from vdgs.partition.assignment.score_file import load_scores
 from vdgs.partition.blocks import Blocks, load_blocks
-from vdgs.runs.folder import RunFolder
+from vdgs.runs.run_folder import RunFolder
 
 
 def blocks_of(run: RunFolder) -> Blocks:

@@ -8,11 +8,11 @@ from pathlib import Path
 import torch
 
 from vdgs.captures.capture import Capture
+from vdgs.config.commands import ModelName
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.runs.folder import RunFolder
-from vdgs.runs.opening import FoundModel, TrainedRun, find_model, open_capture, remember_capture, with_capture
-from vdgs.runs.vouching import load_vouched
-from vdgs.settings.requests import ModelName
+from vdgs.runs.model_integrity import load_vouched
+from vdgs.runs.open_run import FoundModel, TrainedRun, find_model, open_capture, remember_capture, with_capture
+from vdgs.runs.run_folder import RunFolder
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vdgs.settings.capture import CaptureOptions
-from vdgs.settings.method import (
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.method import (
     AssignmentConfig,
     BlockConfig,
     MergeConfig,
@@ -16,8 +16,8 @@ from vdgs.settings.method import (
     PartitionConfig,
     TrainConfig,
 )
-from vdgs.settings.plain import from_dict, to_dict
-from vdgs.settings.ranges import outside
+from vdgs.config.ranges import outside
+from vdgs.config.serialization import from_dict, to_dict
 
 #: The parts of config.yaml.
 SECTIONS = ("capture", "training", "partition", "assignment", "block", "merge")

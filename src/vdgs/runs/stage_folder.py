@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.errors import RunError
-from vdgs.runs.locks import hold
 from vdgs.runs.status import Status
-from vdgs.storage.files import read_json, write_json, write_text
-from vdgs.storage.records import known, record_of
+from vdgs.system.atomic_files import read_json, write_json, write_text
+from vdgs.system.file_locks import hold
+from vdgs.system.records import known, record_of
 
 
 @dataclass(frozen=True)

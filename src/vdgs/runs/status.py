@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vdgs.partition.records import MergedBlock
+from vdgs.partition.block_records import MergedBlock
 
 
 @dataclass(frozen=True, kw_only=True)

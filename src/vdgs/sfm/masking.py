@@ -10,12 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vdgs.captures.photographs import decode_mask, decode_photograph, read_header, same_shape
+from vdgs.captures.image_files import decode_mask, decode_photograph, read_header, same_shape
 from vdgs.errors import CaptureError
-from vdgs.sfm.photograph import Photograph
-from vdgs.sfm.work import Work
-from vdgs.storage.files import write_bytes
-from vdgs.watching.interrupts import stop_if_asked
+from vdgs.sfm.image_metadata import Photograph
+from vdgs.sfm.workspace import Work
+from vdgs.system.atomic_files import write_bytes
+from vdgs.system.stop_signals import stop_if_asked
 
 
 def write_upright_masks(work: Work, photographs: Sequence[Photograph], threads: int) -> None:

@@ -14,7 +14,6 @@ import pycolmap
 from rich.console import Console
 
 from vdgs import __version__
-from vdgs.captures.alignment import Similarity
 from vdgs.captures.reconstruction import (
     FIGURE,
     FILE,
@@ -24,20 +23,29 @@ from vdgs.captures.reconstruction import (
     is_reconstruction,
     read_reconstruction,
 )
+from vdgs.config.serialization import to_dict
+from vdgs.config.sfm_options import SfmRequest
 from vdgs.errors import VdgsError
-from vdgs.runs.locks import hold
-from vdgs.settings.plain import to_dict
-from vdgs.settings.sfm import SfmRequest
-from vdgs.sfm import aligning, features, mapping, masking, matching, surveying, writing
-from vdgs.sfm.collection import LeftOut
-from vdgs.sfm.facts import Outcome, facts_of, why_left_out
-from vdgs.sfm.figures import draw_positions, draw_residuals
-from vdgs.sfm.preparing import Prepared, check_disk, in_time, prepare, tell
-from vdgs.sfm.telling import tell_facts
-from vdgs.sfm.work import Work, key_of, quiet_colmap
-from vdgs.storage.documents import JsonObject
-from vdgs.storage.files import jsonable, write_json
-from vdgs.storage.records import plain
+from vdgs.geometry.similarity import Similarity
+from vdgs.sfm import (
+    capture_writer,
+    feature_extraction,
+    feature_matching,
+    gcp_adjustment,
+    georegistration,
+    incremental_mapper,
+    masking,
+)
+from vdgs.sfm.console_report import tell_facts
+from vdgs.sfm.image_list import LeftOut
+from vdgs.sfm.position_plots import draw_positions, draw_residuals
+from vdgs.sfm.reconstruction_plan import Prepared, check_disk, in_time, prepare, tell
+from vdgs.sfm.reconstruction_report import Outcome, facts_of, why_left_out
+from vdgs.sfm.workspace import Work, key_of, quiet_colmap
+from vdgs.system.atomic_files import jsonable, write_json
+from vdgs.system.documents import JsonObject
+from vdgs.system.file_locks import hold
+from vdgs.system.records import plain
 
 #: Where the positions are shown before the work, inside the output.
 MAP = "photographs.png"
@@ -121,14 +129,14 @@ def _steps(prepared: Prepared, work: Work, keys: dict[str, str], console: Consol
     began = time.monotonic()
     request, output = prepared.request, prepared.request.output
     photographs, threads = prepared.collection.photographs, prepared.threads
-    kinds = features.kinds_of(photographs)
+    kinds = feature_extraction.kinds_of(photographs)
     lost = _features(prepared, work, kinds, keys["features"], console)
     usable = [photo for photo in photographs if photo.name not in {each.name for each in lost}]
     pairs = _matches(prepared, work, keys["matches"], console)
-    held = mapping.holds_focal(photographs, prepared.positions, request.options)
+    held = incremental_mapper.holds_focal(photographs, prepared.positions, request.options)
     models = _models(prepared, work, keys["model"], len(usable), held[0], console)
     left_out = why_left_out(
-        models[0], models[1:], [photo.name for photo in photographs], matching.verified_counts(work), lost
+        models[0], models[1:], [photo.name for photo in photographs], feature_matching.verified_counts(work), lost
     )
     placed, origin, surveyed = _place(models[0], prepared, held[0])
     _write(prepared, work, models[0], keys["capture"], threads, console)
@@ -138,46 +146,46 @@ def _steps(prepared: Prepared, work: Work, keys: dict[str, str], console: Consol
         seconds=time.monotonic() - began,
     )  # fmt: skip
     facts = facts_of(models[0], prepared, outcome)
-    points = aligning.points_of(models[0])
+    points = georegistration.points_of(models[0])
     marks = dict(zip((each.name for each in surveyed), _places(prepared), strict=False))
     draw_residuals(points, prepared.positions, outcome.on_earth, marks, output / FIGURE)
     if origin is not None:
         write_json(output / "georef.json", _georef(facts, origin))
-    writing.write_model(output, models[0], _lenses(models[0], request.options.max_size))
+    capture_writer.write_model(output, models[0], _lenses(models[0], request.options.max_size))
     write_json(output / FILE, jsonable(plain(facts)) | {"options": jsonable(to_dict(request.options))})
     Work(output).finish("capture", keys["capture"])
     return facts
 
 
 def _features(
-    prepared: Prepared, work: Work, kinds: Sequence[features.Kind], key: str, console: Console
+    prepared: Prepared, work: Work, kinds: Sequence[feature_extraction.Kind], key: str, console: Console
 ) -> list[LeftOut]:
     options, photographs = prepared.request.options, prepared.collection.photographs
     if not work.is_begun("features", key):
         work.remove()
         work.begin("features", key)
-    features.open_database(work, kinds)
-    failed = features.stand_upright(work, photographs)
-    counts = features.feature_counts(work)
+    feature_extraction.open_database(work, kinds)
+    failed = feature_extraction.stand_upright(work, photographs)
+    counts = feature_extraction.feature_counts(work)
     if not work.is_done("features", key):
         masking.write_upright_masks(work, photographs, prepared.threads)
-        counts = features.find_features(work, kinds, options.feature_size, options.features, prepared.threads, console)
+        counts = feature_extraction.find_features(work, kinds, options.feature_size, options.features, prepared.threads, console)
         work.finish("features", key)
     named = {each.name for each in failed}
-    return failed + [each for each in features.without_features(photographs, counts) if each.name not in named]
+    return failed + [each for each in feature_extraction.without_features(photographs, counts) if each.name not in named]
 
 
 def _matches(prepared: Prepared, work: Work, key: str, console: Console) -> int:
     photographs = prepared.collection.photographs
-    chosen = matching.choose_pairs(work, photographs, prepared.positions, prepared.request.options)
-    there = features.feature_counts(work)
+    chosen = feature_matching.choose_pairs(work, photographs, prepared.positions, prepared.request.options)
+    there = feature_extraction.feature_counts(work)
     chosen = [pair for pair in chosen if all(there.get(name) for name in pair)]
     if work.is_done("matches", key):
         return len(chosen)
     if not work.is_begun("matches", key):
-        matching.forget_matches(work)
+        feature_matching.forget_matches(work)
         work.begin("matches", key)
-    matching.match(work, chosen, prepared.threads, console)
+    feature_matching.match(work, chosen, prepared.threads, console)
     work.finish("matches", key)
     return len(chosen)
 
@@ -186,35 +194,35 @@ def _models(
     prepared: Prepared, work: Work, key: str, count: int, hold_focal: bool, console: Console
 ) -> list[pycolmap.Reconstruction]:
     if work.is_done("model", key):
-        return mapping.read_models(work)
+        return incremental_mapper.read_models(work)
     if not work.is_begun("model", key):
-        mapping.forget_models(work)
+        incremental_mapper.forget_models(work)
         work.begin("model", key)
-    mapping.write_priors(work, prepared.collection.photographs, prepared.positions)
-    models = mapping.find_models(work, count, hold_focal, prepared.positions.usable, prepared.threads, console)
+    incremental_mapper.write_priors(work, prepared.collection.photographs, prepared.positions)
+    models = incremental_mapper.find_models(work, count, hold_focal, prepared.positions.usable, prepared.threads, console)
     work.finish("model", key)
     return models
 
 
 def _place(
     model: pycolmap.Reconstruction, prepared: Prepared, hold_focal: bool
-) -> tuple[aligning.Placed | aligning.Unplaced, tuple[float, float, float] | None, tuple[SurveyFacts, ...]]:
+) -> tuple[georegistration.Placed | georegistration.Unplaced, tuple[float, float, float] | None, tuple[SurveyFacts, ...]]:
     """Bring the model to metres east, north, up, its median point to height 0; the origin that this has on Earth, and
     what it makes of surveyed points."""
     photographs, positions, control = prepared.collection.photographs, prepared.positions, prepared.control
     doubtful = set[str]()
     if control is not None and control.places_the_model:
-        how, doubtful = surveying.bring_to_control(model, control, prepared.origin, hold_focal, prepared.threads)
-        placed: aligning.Placed | aligning.Unplaced = aligning.as_it_lies(model, photographs, positions, how)
+        how, doubtful = gcp_adjustment.bring_to_control(model, control, prepared.origin, hold_focal, prepared.threads)
+        placed: georegistration.Placed | georegistration.Unplaced = georegistration.as_it_lies(model, photographs, positions, how)
     else:
-        placed = aligning.place(model, photographs, positions)
-        if isinstance(placed, aligning.Placed):
-            aligning.move(model, placed.similarity)
-    if isinstance(placed, aligning.Unplaced):
+        placed = georegistration.place(model, photographs, positions)
+        if isinstance(placed, georegistration.Placed):
+            georegistration.move(model, placed.similarity)
+    if isinstance(placed, georegistration.Unplaced):
         return placed, None, ()
-    surveyed = surveying.survey(model, control, prepared.origin, doubtful) if control is not None else ()
-    ground = float(np.median(aligning.points_of(model)[:, 2]))
-    aligning.move(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))
+    surveyed = gcp_adjustment.survey(model, control, prepared.origin, doubtful) if control is not None else ()
+    ground = float(np.median(georegistration.points_of(model)[:, 2]))
+    georegistration.move(model, Similarity(1.0, np.eye(3), np.array([0.0, 0.0, -ground])))
     latitude, longitude, altitude = prepared.origin
     return placed, (latitude, longitude, altitude + ground), surveyed
 
@@ -224,9 +232,9 @@ def _places(prepared: Prepared) -> np.ndarray:
     return prepared.control.enu(prepared.origin) if prepared.control else np.zeros((0, 3))
 
 
-def _lenses(model: pycolmap.Reconstruction, max_size: int) -> dict[int, writing.Straightened]:
+def _lenses(model: pycolmap.Reconstruction, max_size: int) -> dict[int, capture_writer.Straightened]:
     used = sorted({image.camera_id for image in model.images.values() if image.has_pose})
-    return {number: writing.straighten(model.cameras[number], max_size) for number in used}
+    return {number: capture_writer.straighten(model.cameras[number], max_size) for number in used}
 
 
 def _write(
@@ -234,7 +242,7 @@ def _write(
 ) -> None:
     output = prepared.request.output
     if not Work(output).is_begun("capture", key):
-        for name in (*(folder for folder, _ in writing.SIZES), writing.MASKS, "sparse"):
+        for name in (*(folder for folder, _ in capture_writer.SIZES), capture_writer.MASKS, "sparse"):
             shutil.rmtree(output / name, ignore_errors=True)
         for name in (FILE, "georef.json", FIGURE):
             (output / name).unlink(missing_ok=True)
@@ -244,7 +252,7 @@ def _write(
     for image in sorted(model.images.values(), key=lambda image: image.name):
         if image.has_pose:
             names.setdefault(image.camera_id, []).append(image.name)
-    writing.write_images(output, work, names, _lenses(model, prepared.request.options.max_size), threads, console)
+    capture_writer.write_images(output, work, names, _lenses(model, prepared.request.options.max_size), threads, console)
 
 
 def _georef(facts: ReconstructionFacts, origin: tuple[float, float, float]) -> JsonObject:

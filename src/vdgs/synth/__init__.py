@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from vdgs.synth.options import SynthOptions
 
 if TYPE_CHECKING:
-    from vdgs.synth.imbalance import FlightImbalance
+    from vdgs.synth.flight_stats import FlightImbalance
 
 __all__ = ["SynthOptions", "generate"]
 

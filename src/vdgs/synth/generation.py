@@ -13,23 +13,23 @@ import numpy as np
 from PIL import Image
 
 from vdgs import __version__
-from vdgs.cameras import Camera
-from vdgs.captures.outputs import refuse_in_a_capture
+from vdgs.captures.output_guard import refuse_in_a_capture
 from vdgs.captures.splits import TEST_LIST, VALIDATION_LIST
 from vdgs.errors import VdgsError
-from vdgs.storage.files import write_text
-from vdgs.synth.colmap import write_model
-from vdgs.synth.disturbances import disturbed, exposure_gains, with_outliers
-from vdgs.synth.flight import flight_altitude, fly
-from vdgs.synth.held_out import held_out_cameras
-from vdgs.synth.imbalance import FlightImbalance, flight_imbalance, survey
+from vdgs.geometry.camera import Camera
+from vdgs.synth.colmap_writer import write_model
+from vdgs.synth.flight_cameras import flight_altitude, fly
+from vdgs.synth.flight_stats import FlightImbalance, flight_imbalance, survey
+from vdgs.synth.ground_truth_writer import write_cameras, write_flight, write_points, write_views
+from vdgs.synth.image_renderer import photograph
 from vdgs.synth.lighting import SkyMap, sky_map
 from vdgs.synth.options import ResolvedOptions, SynthOptions
-from vdgs.synth.photography import photograph
-from vdgs.synth.sparse import Seeds, SparseCloud, pick_seeds, sparse_cloud
+from vdgs.synth.perturbations import disturbed, exposure_gains, with_outliers
+from vdgs.synth.ray_tracing import Tracer, require_embree
+from vdgs.synth.synthetic_points import Seeds, SparseCloud, pick_seeds, sparse_cloud
+from vdgs.synth.test_cameras import held_out_cameras
 from vdgs.synth.town import Town, build_town
-from vdgs.synth.tracing import Tracer, require_embree
-from vdgs.synth.truth_writing import write_cameras, write_flight, write_points, write_views
+from vdgs.system.atomic_files import write_text
 
 Progress = Callable[[str, int, int], None]
 
@@ -52,7 +52,7 @@ The flight, {imbalance}.
 {options}
 """
 _TRUTH_NOTE = """- `truth/`: depth and true visibility (with occlusion) per pixel, true poses, true places of points.
-  Read it with `vdgs.synth.truth.load_truth`; the module says what is where.
+  Read it with `vdgs.captures.ground_truth.load_truth`; the module says what is where.
 """
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from vdgs.synth.ray_tracing import Tracer
 from vdgs.synth.terrain import Terrain
-from vdgs.synth.tracing import Tracer
 from vdgs.synth.zones import Zone, ZoneMap
 
 SUN = np.array([-0.52, -0.44, 0.78], np.float32)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Literal
 
+from vdgs.config.commands import LARGEST_SIDE_PX
+from vdgs.config.ranges import WORKERS, Range, refuse
 from vdgs.errors import VdgsError
-from vdgs.settings.ranges import WORKERS, Range, refuse
-from vdgs.settings.requests import LARGEST_SIDE_PX
 
 Size = Literal["toy", "village", "town", "district", "city"]
 Flight = Literal["uneven", "even", "distant", "orbits", "corridor"]

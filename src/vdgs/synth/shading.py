@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from vdgs.synth import facades, nature
-from vdgs.synth.ground import ground_albedo
+from vdgs.synth.ground_texture import ground_albedo
 from vdgs.synth.lighting import BOUNCE_COLOUR, SKY_COLOUR, SUN, SUN_COLOUR, SkyMap, sky_colour
 from vdgs.synth.mesh import Material
+from vdgs.synth.ray_tracing import Hits, Tracer
 from vdgs.synth.surface import Surface
 from vdgs.synth.town import Town
-from vdgs.synth.tracing import Hits, Tracer
 
 _SHADERS = {
     Material.PLASTER: facades.plaster,

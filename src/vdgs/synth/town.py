@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from vdgs.synth import centre, props
+from vdgs.synth import props, town_center
 from vdgs.synth.mesh import Mesh, MeshBuilder
 from vdgs.synth.outskirts import build_outskirts, edge_plots, scatter_trees
 from vdgs.synth.periphery import build_periphery
@@ -116,12 +116,12 @@ def _blocks(site: Site, grand: bool) -> np.ndarray:
     away = {cell: max(abs(cell[0] - i0), abs(cell[1] - j0)) for cell in cells}
     site.rng.shuffle(cells)
     cells.sort(key=lambda cell: away[cell])
-    centre.square(site, site.block(i0, j0))
+    town_center.square(site, site.block(i0, j0))
     high = _tower_blocks(cells, (i0, j0)) if grand else []
     for cell in high:
         towers(site, site.block(*cell))
     cells = [cell for cell in cells if cell not in high]
-    special = [centre.shops, centre.park, centre.shops, centre.works, centre.lawn_flats]
+    special = [town_center.shops, town_center.park, town_center.shops, town_center.works, town_center.lawn_flats]
     for k, (i, j) in enumerate(cells):
         block = site.block(i, j)
         near = away[(i, j)] <= max(1, columns // 4)
@@ -129,7 +129,7 @@ def _blocks(site: Site, grand: bool) -> np.ndarray:
         if near and k % 2 == 0:
             special[(k // 2) % len(special)](site, block)
         elif not near and chance < 0.22:
-            (centre.park, centre.works, centre.lawn_flats)[int(chance / 0.22 * 3)](site, block)
+            (town_center.park, town_center.works, town_center.lawn_flats)[int(chance / 0.22 * 3)](site, block)
         else:
             residential_block(site, block)
     return _landmarks(site, [(i0, j0), *high])

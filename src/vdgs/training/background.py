@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vdgs.training.state import Stage, TrainingImages
+from vdgs.training.training_state import Stage, TrainingImages
 
 
 def mean_colour(images: TrainingImages, count: int, downscale: int, at_most: int = 32) -> tuple[float, float, float]:

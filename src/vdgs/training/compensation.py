@@ -21,9 +21,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vdgs.kernels.types import Statistics
-from vdgs.settings.method import CompensationConfig, GrowthConfig
-from vdgs.training.growth import Compensated, Decision
+from vdgs.config.method import CompensationConfig, GrowthConfig
+from vdgs.kernels.kernel_types import Statistics
+from vdgs.training.densification import Compensated, Decision
 
 #: An offset of low visibility is judged only when it was drawn more often than this (choice).
 LEAST_GATE = 2.0

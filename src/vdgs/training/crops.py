@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from vdgs.cameras import Camera
 from vdgs.errors import RunError, VdgsError
+from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.render import paint
-from vdgs.storage.files import read_json, write_json
+from vdgs.model.renderer import paint
+from vdgs.system.atomic_files import read_json, write_json
 
 #: Longest side in pixels at which the parts are looked for.
 LONGEST_SIDE_PX = 320

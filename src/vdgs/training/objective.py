@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vdgs.config.method import TrainConfig
 from vdgs.kernels import choose
 from vdgs.model.decoder import Decoder
 from vdgs.model.exposure import exposed
-from vdgs.settings.method import TrainConfig
-from vdgs.training.step import TrainingView
 from vdgs.training.target import Target
+from vdgs.training.training_step import TrainingView
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

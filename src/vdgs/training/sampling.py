@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from vdgs.cameras import Camera
+from vdgs.config.method import TrainConfig
+from vdgs.geometry.camera import Camera
 from vdgs.model.anchors import Anchors
-from vdgs.model.visibility import votes_of
-from vdgs.settings.method import TrainConfig
+from vdgs.visibility.visibility_counts import votes_of
 
 
 def shares_for(config: TrainConfig, anchors: Anchors, cameras: Sequence[Camera]) -> tuple[float, ...] | None:

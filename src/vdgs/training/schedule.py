@@ -6,8 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from vdgs.settings.method import TrainConfig
-from vdgs.training.state import Stage
+from vdgs.config.method import TrainConfig
+from vdgs.training.training_state import Stage
 
 
 def view_at(iteration: int, count: int, seed: int, shares: tuple[float, ...] | None = None) -> int:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from jaxtyping import UInt8
 from torch import Tensor
 
-from vdgs.cameras import Camera
-from vdgs.kernels.moving import upload
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.transfer import upload
 from vdgs.training.crops import Box, crop_at
-from vdgs.training.state import Stage
+from vdgs.training.training_state import Stage
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

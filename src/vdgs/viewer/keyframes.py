@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 
-from vdgs.cameras import Camera
-from vdgs.films.paths import FPS, interpolate
+from vdgs.geometry.camera import Camera
+from vdgs.rendering.camera_paths import FPS, interpolate
 
 #: A film has even sides, and is at most so wide (choice).
 _WIDEST = 1920

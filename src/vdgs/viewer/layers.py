@@ -12,17 +12,17 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
-from vdgs.cameras import Camera
-from vdgs.captures.heights import camera_height
+from vdgs.captures.camera_height import camera_height
 from vdgs.evaluation.metrics import to_8bit
+from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel
-from vdgs.model.render import decode_view, draw, render, render_values
-from vdgs.viewer.photographs import Comparison, laid_over
-from vdgs.viewer.scene import Scene
-from vdgs.viewer.thinning import Level
+from vdgs.model.renderer import decode_view, draw, render, render_values
+from vdgs.viewer.image_comparison import Comparison, laid_over
+from vdgs.viewer.lod import Level
+from vdgs.viewer.viewer_scene import Scene
 
 if TYPE_CHECKING:
-    from vdgs.films.maps import Scale
+    from vdgs.rendering.scalar_maps import Scale
 
 Layer = Literal["colour", "depth", "visibility", "alpha", "blocks", "error"]
 LAYERS: tuple[Layer, ...] = get_args(Layer)
@@ -67,7 +67,7 @@ class Painter:
     def settle(self, shown: Shown, whole: Camera) -> None:
         """The camera has come to rest: the range of depths becomes that of what it sees."""
         if shown.layer == "depth":
-            from vdgs.films.maps import depth_scale, depth_span
+            from vdgs.rendering.scalar_maps import depth_scale, depth_span
 
             depth = _depth(self._scene.model(self._model(shown)), whole.within(_PREVIEW_PX))
             capture = self._scene.capture
@@ -75,14 +75,14 @@ class Painter:
 
     def scale(self, shown: Shown) -> Scale | None:
         """What the colours mean; None for pictures that need no legend."""
-        from vdgs.films import maps
+        from vdgs.rendering import scalar_maps
 
         if shown.layer == "depth":
             return self._depth
         if shown.layer == "visibility":
-            return maps.seen_scale(self._scene.seen(self._model(shown)).cpu().numpy())
+            return scalar_maps.seen_scale(self._scene.seen(self._model(shown)).cpu().numpy())
         if shown.layer == "alpha":
-            return maps.alpha_scale()
+            return scalar_maps.alpha_scale()
         return error_scale() if shown.layer == "error" else None
 
     def in_view(self, shown: Shown, camera: Camera) -> int:
@@ -183,7 +183,7 @@ def error_scale() -> Scale:
     """From dark, where the model is right, to bright."""
     import matplotlib as mpl
 
-    from vdgs.films.maps import Scale
+    from vdgs.rendering.scalar_maps import Scale
 
     colours = mpl.colormaps["inferno"]
     numbers = (0.0, 0.05, 0.1, 0.15, 0.2, _WORST)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.cameras import Camera
 from vdgs.captures.capture import Capture
 from vdgs.captures.overview import overview
-from vdgs.settings.requests import BYTES_PER_PIXEL, LARGEST_SIDE_PX
+from vdgs.config.commands import BYTES_PER_PIXEL, LARGEST_SIDE_PX
+from vdgs.geometry.camera import Camera
 
 #: Nearer to straight down than this, the direction on the map no longer follows from where one looks.
 _STEEP = 0.995

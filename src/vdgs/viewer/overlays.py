@@ -8,9 +8,9 @@ import numpy as np
 import shapely
 from jaxtyping import Float, UInt8
 
-from vdgs.cameras import Camera
-from vdgs.captures.heights import camera_height
-from vdgs.viewer.scene import Scene, rgb_of
+from vdgs.captures.camera_height import camera_height
+from vdgs.geometry.camera import Camera
+from vdgs.viewer.viewer_scene import Scene, rgb_of
 
 #: Borders follow the ground in steps of this share of the camera height; cameras are drawn so large (choices).
 _STEP, _SIZE = 0.1, 0.06

@@ -7,11 +7,11 @@ import time
 
 import numpy as np
 
-from vdgs.cameras import Camera
-from vdgs.films.paths import SECONDS
-from vdgs.viewer.host import Host
+from vdgs.geometry.camera import Camera
+from vdgs.rendering.camera_paths import SECONDS
 from vdgs.viewer.keyframes import at_time, path_json
 from vdgs.viewer.navigation import Stand
+from vdgs.viewer.session_protocol import Host
 
 #: Pictures a second while a path is played.
 _RATE = 15.0

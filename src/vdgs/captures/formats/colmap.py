@@ -16,7 +16,7 @@ import numpy as np
 from vdgs.captures.formats.colmap_binary import cameras_binary, images_binary, points_binary
 from vdgs.captures.formats.colmap_records import ImageRecord, Points, no_points
 from vdgs.captures.formats.colmap_text import cameras_text, images_text, points_text
-from vdgs.captures.formats.source import (
+from vdgs.captures.formats.source_capture import (
     Intrinsics,
     SourceView,
     duplicates,

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.formats.colmap_records import ImageRecord, Points, add_camera, some_of
-from vdgs.captures.formats.source import CAMERA_MODELS, Intrinsics
+from vdgs.captures.formats.source_capture import CAMERA_MODELS, Intrinsics
 from vdgs.errors import CaptureError
 
 LONGEST_NAME = 4096

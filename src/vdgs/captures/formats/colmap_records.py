@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vdgs.captures.formats.source import Intrinsics, check_intrinsics
+from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics
 from vdgs.errors import CaptureError
 
 #: So many of the points that a photograph shows are remembered: enough to see whether cameras and points agree, and

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.formats.colmap_records import ImageRecord, Points, add_camera, no_points, some_of
-from vdgs.captures.formats.source import MODEL_PARAMETERS, Intrinsics
+from vdgs.captures.formats.source_capture import MODEL_PARAMETERS, Intrinsics
 from vdgs.errors import CaptureError
 
 

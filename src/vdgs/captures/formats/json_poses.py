@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.formats.source import Intrinsics, check_intrinsics
-from vdgs.captures.photographs import read_header
+from vdgs.captures.formats.source_capture import Intrinsics, check_intrinsics
+from vdgs.captures.image_files import read_header
 from vdgs.errors import CaptureError
-from vdgs.storage.documents import JsonObject
+from vdgs.system.documents import JsonObject
 
 #: Camera axes: OpenGL (right, up, back) from OpenCV (right, down, forward); its own inverse.
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])

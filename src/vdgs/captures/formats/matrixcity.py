@@ -16,11 +16,11 @@ import numpy as np
 
 from vdgs.captures.capture import Split
 from vdgs.captures.formats.json_poses import OPENGL_FROM_OPENCV, frames_of, intrinsics_of, matrix_of, read_json
-from vdgs.captures.formats.source import KnownWorld, SourceCapture, SourceView, duplicates, listing, rigid
+from vdgs.captures.formats.source_capture import KnownWorld, SourceCapture, SourceView, duplicates, listing, rigid
 from vdgs.captures.formats.sparse_points import find_sparse_points
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.settings.capture import CaptureOptions
-from vdgs.storage.documents import JsonObject
+from vdgs.system.documents import JsonObject
 
 #: Unit of the pose files in metres.
 POSE_UNIT_M = 100.0

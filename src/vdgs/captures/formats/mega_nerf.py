@@ -14,7 +14,7 @@ import numpy as np
 
 from vdgs.captures.capture import Split
 from vdgs.captures.formats.json_poses import OPENGL_FROM_OPENCV
-from vdgs.captures.formats.source import (
+from vdgs.captures.formats.source_capture import (
     Intrinsics,
     KnownWorld,
     SourceCapture,
@@ -24,11 +24,11 @@ from vdgs.captures.formats.source import (
     rigid,
 )
 from vdgs.captures.formats.sparse_points import find_sparse_points
-from vdgs.captures.names import composed
-from vdgs.captures.photographs import find_images
+from vdgs.captures.image_files import find_images
+from vdgs.captures.name_resolution import composed
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.settings.capture import CaptureOptions
-from vdgs.storage.documents import JsonObject
+from vdgs.system.documents import JsonObject
 
 #: Ground axes (right, forward, up) from DRB axes.
 GROUND_FROM_DRB = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.alignment import fit_similarity_robust, is_collinear
 from vdgs.captures.formats.colmap import count_images, find_models, read_colmap
-from vdgs.captures.formats.ply import read_point_cloud
-from vdgs.captures.names import stem_of
+from vdgs.captures.formats.ply_reader import read_point_cloud
+from vdgs.captures.name_resolution import stem_of
 from vdgs.errors import CaptureError
+from vdgs.geometry.similarity import fit_similarity_robust, is_collinear
 
 #: Names under which a point cloud in the capture's own world is looked for.
 POINT_CLOUDS = ("points3D.ply", "sparse_pc.ply", "point_cloud.ply", "points.ply")

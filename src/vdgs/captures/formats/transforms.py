@@ -21,13 +21,13 @@ from vdgs.captures.formats.json_poses import (
     number,
     read_json,
 )
-from vdgs.captures.formats.ply import read_point_cloud
-from vdgs.captures.formats.source import SourceCapture, SourceView, duplicates, listing, rigid, safe_name
+from vdgs.captures.formats.ply_reader import read_point_cloud
+from vdgs.captures.formats.source_capture import SourceCapture, SourceView, duplicates, listing, rigid, safe_name
 from vdgs.captures.formats.sparse_points import find_sparse_points
-from vdgs.captures.names import Names, on_disk
+from vdgs.captures.name_resolution import Names, on_disk
+from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.settings.capture import CaptureOptions
-from vdgs.storage.documents import JsonObject
+from vdgs.system.documents import JsonObject
 
 FILE = "transforms.json"
 #: Its lists of photographs, and the side that each is of.

@@ -16,10 +16,10 @@ from typing import IO
 import numpy as np
 
 from vdgs.errors import VdgsError
-from vdgs.export.formats.scene import Y_UP, Facts, Scene, bytes_of, colours, opacities, sizes
+from vdgs.export.formats.export_scene import Y_UP, Facts, Scene, bytes_of, colours, opacities, sizes
 from vdgs.model.gaussians import Gaussians
-from vdgs.storage.documents import JsonObject
-from vdgs.storage.files import write_atomically
+from vdgs.system.atomic_files import write_atomically
+from vdgs.system.documents import JsonObject
 
 EXTENSION = "KHR_gaussian_splatting"
 PACKED = "KHR_gaussian_splatting_compression_spz_2"

@@ -23,12 +23,12 @@ from jaxtyping import Float, UInt32
 
 from vdgs.captures.overview import FOV_DEG
 from vdgs.errors import VdgsError
-from vdgs.export.formats.levels import axes_of, thinned
-from vdgs.export.formats.scene import Page, Scene, bytes_of, colours, logits_of, opacities
+from vdgs.export.formats.export_scene import Page, Scene, bytes_of, colours, logits_of, opacities
+from vdgs.export.formats.simplify import axes_of, thinned
 from vdgs.kernels.spherical_harmonics import dc_of_colours
+from vdgs.model.gaussian_transform import covariances
 from vdgs.model.gaussians import Gaussians
-from vdgs.model.similarity import covariances
-from vdgs.storage.files import write_bytes
+from vdgs.system.atomic_files import write_bytes
 
 #: Numbers of 32 bits a Gaussian.
 WORDS = 8

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vdgs.errors import VdgsError
+from vdgs.export.formats.export_scene import Scene, beside, joined
+from vdgs.export.formats.gaussian_ply import ply_pieces, write_ply
 from vdgs.export.formats.gltf import refuse_too_large, write_glb
 from vdgs.export.formats.html import html_pieces, refuse_without_viser, write_html
-from vdgs.export.formats.ply import ply_pieces, write_ply
-from vdgs.export.formats.points import refuse_without_laspy, write_laz, write_points
-from vdgs.export.formats.scene import Scene, beside, joined
+from vdgs.export.formats.point_cloud import refuse_without_laspy, write_laz, write_points
 from vdgs.export.formats.sog import write_sog
 from vdgs.export.formats.splat import splat_pieces, write_splat
 from vdgs.export.formats.spz import REACH, refuse_too_far, spz_pieces, write_spz
-from vdgs.export.formats.tiles import NAME, refuse_other_names, write_tiles
+from vdgs.export.formats.tiles_3d import NAME, refuse_other_names, write_tiles
 from vdgs.model.gaussians import Gaussians
 
 

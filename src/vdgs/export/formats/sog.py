@@ -19,12 +19,12 @@ import torch
 from PIL import Image
 
 from vdgs.export.formats.codebooks import SAMPLE, Palette, codebook, nearest_entries
-from vdgs.export.formats.scene import ROWS, Y_DOWN, Facts, Scene, bytes_of, opacities, write_beside
-from vdgs.export.formats.spool import Spooled, spooled
+from vdgs.export.formats.export_scene import ROWS, Y_DOWN, Facts, Scene, bytes_of, opacities, write_beside
+from vdgs.export.formats.gaussian_store import Spooled, spooled
 from vdgs.kernels import choose
 from vdgs.model.gaussians import Gaussians
-from vdgs.storage.documents import JsonObject
-from vdgs.storage.files import write_atomically
+from vdgs.system.atomic_files import write_atomically
+from vdgs.system.documents import JsonObject
 
 #: Sets of spherical harmonics at most. The format would take 65536; their gain is small and their search long.
 MOST_SETS = 4096

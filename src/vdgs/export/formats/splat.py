@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from vdgs.errors import VdgsError
-from vdgs.export.formats.scene import (
+from vdgs.export.formats.export_scene import (
     ROWS,
     Y_DOWN,
     Scene,
@@ -26,7 +26,7 @@ from vdgs.export.formats.scene import (
 )
 from vdgs.kernels.spherical_harmonics import dc_of_colours
 from vdgs.model.gaussians import Gaussians
-from vdgs.storage.files import write_atomically
+from vdgs.system.atomic_files import write_atomically
 
 LAYOUT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
 

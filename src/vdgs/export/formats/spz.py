@@ -19,12 +19,22 @@ import numpy as np
 import torch
 
 from vdgs.errors import VdgsError
-from vdgs.export.formats.gzipping import gzipped
-from vdgs.export.formats.scene import ROWS, Y_UP, Scene, bytes_of, joined, logits_of, opacities, unturned, write_beside
-from vdgs.export.formats.small_turns import with_small_turns
+from vdgs.export.formats.export_scene import (
+    ROWS,
+    Y_UP,
+    Scene,
+    bytes_of,
+    joined,
+    logits_of,
+    opacities,
+    unturned,
+    write_beside,
+)
+from vdgs.export.formats.parallel_gzip import gzipped
+from vdgs.export.formats.quaternion_canonical import with_small_turns
 from vdgs.kernels.spherical_harmonics import MAX_DEGREE, function_count
 from vdgs.model.gaussians import Gaussians
-from vdgs.storage.files import write_atomically
+from vdgs.system.atomic_files import write_atomically
 
 MAGIC = 0x5053474E
 HEADER = struct.Struct("<IIIBBBB")

@@ -1,6 +1,6 @@
 """Own CUDA kernels: compiled when first used, by NVRTC, for the card at hand (docs/cuda.md).
 
-Not all operations of `vdgs.kernels` are here: `vdgs.kernels.composed` adds what a card needs besides.
+Not all operations of `vdgs.kernels` are here: `vdgs.kernels.gpu` adds what a card needs besides.
 """
 
 from vdgs.kernels.cuda.cull import cull as cull
@@ -8,7 +8,7 @@ from vdgs.kernels.cuda.decode import decode as decode
 from vdgs.kernels.cuda.decode import decode_to_train as decode_to_train
 from vdgs.kernels.cuda.decode_adam import decode_backward_adam as decode_backward_adam
 from vdgs.kernels.cuda.loss import photometric_loss as photometric_loss
-from vdgs.kernels.cuda.rasterise import rasterise as rasterise
-from vdgs.kernels.cuda.rasterise import rasterise_vjp as rasterise_vjp
-from vdgs.kernels.cuda.rasterise import shares as shares
+from vdgs.kernels.cuda.rasterize import rasterise as rasterise
+from vdgs.kernels.cuda.rasterize import rasterise_vjp as rasterise_vjp
+from vdgs.kernels.cuda.rasterize import shares as shares
 from vdgs.kernels.cuda.statistics import add_view_statistics as add_view_statistics

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from vdgs.cameras import Camera
-from vdgs.kernels.cuda.camera import PackedCamera
-from vdgs.kernels.cuda.launching import Program
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.cuda.launch import Program
+from vdgs.kernels.cuda.packed_camera import PackedCamera
 
 #: Threads of a block, and anchors of a word: kThreads and kWarp of the source.
 THREADS, WORD = 256, 32

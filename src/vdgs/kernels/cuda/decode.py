@@ -10,13 +10,11 @@ import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
-from vdgs.cameras import Camera
-from vdgs.kernels.cuda.camera import PackedCamera
-from vdgs.kernels.cuda.launching import Argument, Program
-from vdgs.kernels.cuda.room import Room
-from vdgs.kernels.reference.decode import decode as by_torch
-from vdgs.kernels.runs import ANCHORS_OF_A_RUN, Runs, Shown
-from vdgs.kernels.types import (
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.cuda.launch import Argument, Program
+from vdgs.kernels.cuda.packed_camera import PackedCamera
+from vdgs.kernels.cuda.splat_capacity import Room
+from vdgs.kernels.kernel_types import (
     FEATURE_SIZE,
     HIDDEN_SIZE,
     AnchorSplats,
@@ -25,6 +23,8 @@ from vdgs.kernels.types import (
     Splats,
     TrainingSplats,
 )
+from vdgs.kernels.splat_segments import ANCHORS_OF_A_RUN, Runs, Shown
+from vdgs.kernels.torch_ref.decode import decode as by_torch
 
 #: Warps of a block, each with an anchor: kWarps of the source. A lane an offset.
 ANCHORS_OF_A_BLOCK, MOST_OFFSETS = ANCHORS_OF_A_RUN, 32

@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
-from vdgs.cameras import Camera
-from vdgs.kernels.cuda.camera import PackedCamera
+from vdgs.geometry.camera import Camera
 from vdgs.kernels.cuda.decode import ANCHORS_OF_A_BLOCK, PROGRAM, by_lanes, check_decoder, sources_of
-from vdgs.kernels.cuda.launching import Argument, Program
-from vdgs.kernels.reference.adam import check_updates, tables_on
-from vdgs.kernels.reference.decode_adam import decode_backward_adam as by_torch
-from vdgs.kernels.runs import Shown
-from vdgs.kernels.types import AdamState, DecoderWeights, Finite, HeadWeights, SplatGradients
+from vdgs.kernels.cuda.launch import Argument, Program
+from vdgs.kernels.cuda.packed_camera import PackedCamera
+from vdgs.kernels.kernel_types import AdamState, DecoderWeights, Finite, HeadWeights, SplatGradients
+from vdgs.kernels.splat_segments import Shown
+from vdgs.kernels.torch_ref.adam import check_updates, tables_on
+from vdgs.kernels.torch_ref.decode_adam import decode_backward_adam as by_torch
 
 #: Anchors whose parts of the decoder's gradients are held at once: whole blocks.
 PIECE = 2**14

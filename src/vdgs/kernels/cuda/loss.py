@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vdgs.kernels.cuda.launching import Program
-from vdgs.kernels.reference.loss import check_images
-from vdgs.kernels.types import Photometric
+from vdgs.kernels.cuda.launch import Program
+from vdgs.kernels.kernel_types import Photometric
+from vdgs.kernels.torch_ref.loss import check_images
 
 #: Side of the tile that one block of threads does: kTile of the source.
 TILE_PX = 16

@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 
 from vdgs.kernels.cuda.decode import sources_of
-from vdgs.kernels.cuda.launching import Program
-from vdgs.kernels.reference.statistics import check_inside, check_sources
-from vdgs.kernels.runs import Shown
-from vdgs.kernels.types import Statistics
+from vdgs.kernels.cuda.launch import Program
+from vdgs.kernels.kernel_types import Statistics
+from vdgs.kernels.splat_segments import Shown
+from vdgs.kernels.torch_ref.statistics import check_inside, check_sources
 
 #: Threads of a block: kThreads of the source.
 THREADS = 256

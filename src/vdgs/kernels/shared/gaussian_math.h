@@ -92,7 +92,7 @@ struct Camera {
   bool orthographic;
 };
 
-// From vdgs.cameras.Camera.packed: rotation (9), translation (3), fx, fy, cx, cy, width, height,
+// From vdgs.geometry.camera.Camera.packed: rotation (9), translation (3), fx, fy, cx, cy, width, height,
 // orthographic, near, width and height of the whole picture. A part of a picture has the limits of the whole one:
 // else it would not show what that does.
 VDGS_FN Camera unpack_camera(const float* p) {
@@ -171,7 +171,7 @@ VDGS_FN Reach<T> reach_of(float focal, float centre, float size, float limit, T 
   return {outside * outside, scale * scale * fma(bounded, bounded, constant<T>(1.0f))};
 }
 
-// Where a centre lies beside the image; the bound is explained in src/vdgs/kernels/reference/cull.py.
+// Where a centre lies beside the image; the bound is explained in src/vdgs/kernels/torch_ref/cull.py.
 template <class T>
 struct Sight {
   Reach<T> x, y;

@@ -13,11 +13,11 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from vdgs.cameras import Camera
-from vdgs.partition.assignment.scores import Scores
+from vdgs.config.method import AssignmentConfig
+from vdgs.geometry.camera import Camera
+from vdgs.partition.assignment.score_matrix import Scores
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.strategies.strategy import checked_ground, grid_shape, inhabited
-from vdgs.settings.method import AssignmentConfig
 
 #: The foreground lies between these quantiles of the cameras; beyond it space is contracted (choice: the publication
 #: sets it by hand for each scene).

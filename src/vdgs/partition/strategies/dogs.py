@@ -14,12 +14,12 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from vdgs.cameras import Camera
-from vdgs.partition.assignment.scores import Scores
+from vdgs.config.method import AssignmentConfig
+from vdgs.geometry.camera import Camera
+from vdgs.partition.assignment.score_matrix import Scores
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.partition.plane import principal_plane
+from vdgs.partition.principal_axes import principal_plane
 from vdgs.partition.strategies.strategy import KEPT, checked_ground, grid_shape, inhabited, stretched
-from vdgs.settings.method import AssignmentConfig
 
 #: A cell is trained this many times as large.
 WIDENED = 1.4

@@ -10,11 +10,11 @@ import shapely
 import shapely.affinity
 from jaxtyping import Float
 
-from vdgs.cameras import Camera
+from vdgs.config.method import AssignmentConfig
 from vdgs.errors import VdgsError
-from vdgs.partition.assignment.scores import Scores
+from vdgs.geometry.camera import Camera
+from vdgs.partition.assignment.score_matrix import Scores
 from vdgs.partition.blocks import Block, Blocks
-from vdgs.settings.method import AssignmentConfig
 
 #: Outliers beyond these quantiles of the anchors do not decide how large the scene is.
 KEPT = (0.01, 0.99)

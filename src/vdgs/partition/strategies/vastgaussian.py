@@ -13,11 +13,11 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from vdgs.cameras import Camera
-from vdgs.partition.assignment.scores import Scores
+from vdgs.config.method import AssignmentConfig
+from vdgs.geometry.camera import Camera
+from vdgs.partition.assignment.score_matrix import Scores
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.partition.strategies.strategy import KEPT, checked_ground, grid_shape, inhabited, stretched
-from vdgs.settings.method import AssignmentConfig
 
 #: Cells are widened to this many times their sides for training (section 4.1: by 20 %).
 WIDENED = 1.2

@@ -1,4 +1,4 @@
-// Which anchors a camera may see: vdgs.kernels.reference.cull on a GPU.
+// Which anchors a camera may see: vdgs.kernels.torch_ref.cull on a GPU.
 //
 // A thread an anchor, twice: first a bit for each, 32 of them a word, and how many of a word are set; once these are added
 // up and there is room, the anchor of each set bit goes to its place, so that indices ascend. Scales are read only of

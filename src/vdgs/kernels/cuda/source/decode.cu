@@ -1,4 +1,4 @@
-// Anchors to splats in one step: vdgs.kernels.reference.decode on a GPU, without autograd.
+// Anchors to splats in one step: vdgs.kernels.torch_ref.decode on a GPU, without autograd.
 //
 // A warp an anchor: 32 lanes are the 32 units of a hidden layer, and then up to 32 offsets. Only splats are written: hidden
 // layers, opacities, covariances and Gaussians never leave the registers. Opacity comes first; the other heads are asked

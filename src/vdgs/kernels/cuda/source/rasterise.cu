@@ -1,4 +1,4 @@
-// Splats to a picture and back: vdgs.kernels.reference.rasterise on a GPU.
+// Splats to a picture and back: vdgs.kernels.torch_ref.rasterize on a GPU.
 //
 //   order_splats        which splat comes when among equal depths, where they do not stand in that order
 //   splat_tiles         in how many tiles of 16x16 pixels each splat reaches a pixel

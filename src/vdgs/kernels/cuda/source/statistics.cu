@@ -1,4 +1,4 @@
-// Growth's statistics of one view: vdgs.kernels.reference.statistics on a GPU.
+// Growth's statistics of one view: vdgs.kernels.torch_ref.statistics on a GPU.
 //
 // A thread a splat, and a visible anchor. No source comes twice, and those of an anchor stand together, ascending: each
 // splat has an offset of its own, and the first of an anchor adds the opacities of those behind it, in their order. Nobody

@@ -1,0 +1,40 @@
+"""How high cameras fly: the length that makes settings mean the same in any unit.
+
+Cameras on a tower, a hillside or in a street fly at no height: half of what they see lies above them. How far they
+are from it takes the place of the height then, for the scale of the ground frame as for settings.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from vdgs.captures.capture import Capture
+from vdgs.geometry.similarity import geometric_median
+
+#: Cameras that are no higher above the points than this share of their distance to them fly at no height (choice).
+LEAST_HEIGHT = 0.02
+
+
+class Reach(NamedTuple):
+    """A typical distance from cameras to what they see; whether it is their height above the points."""
+
+    length: float
+    is_height: bool
+
+
+def reach(centres: Float[np.ndarray, "c 3"], points: Float[np.ndarray, "p 3"], up: Float[np.ndarray, "3"]) -> Reach:
+    """Median height of the cameras above the median point along `up`, a unit vector; where there is none to speak of,
+    the median distance of the cameras to the geometric median of the points. 0 if all lies in one place."""
+    height = float(np.median(centres @ up) - np.median(points @ up))
+    distance = float(np.median(np.linalg.norm(centres - geometric_median(points), axis=1)))
+    return Reach(height, True) if height > LEAST_HEIGHT * distance else Reach(distance, False)
+
+
+def camera_height(capture: Capture) -> float:
+    """How high the training cameras fly above the sparse points, or where they do not, how far they are from them
+    (`reach`); above 0 in any case."""
+    centres = np.array([view.camera.position for view in capture.train_views])
+    return max(reach(centres, capture.points, np.array([0.0, 0.0, 1.0])).length, 1e-9)

@@ -1,0 +1,68 @@
+"""What a run remembers of its capture, so that it is never continued or measured on another one unawares."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vdgs.captures.capture import Capture, View
+from vdgs.errors import RunError
+from vdgs.system.documents import CaptureMetadata
+
+
+def capture_facts(capture: Capture) -> CaptureMetadata:
+    """What capture.json and a model say about where they come from."""
+    ground = capture.ground
+    return {
+        "root": str(capture.root), "source": capture.source, "images": capture.images,
+        "training_views": [view.name for view in capture.train_views],
+        "test_views": [view.name for view in capture.test_views],
+        "points": len(capture.points),
+        "ground_frame": {
+            "scale": ground.scale, "rotation": ground.rotation.tolist(), "translation": ground.translation.tolist(),
+            "metric": ground.metric, "how": ground.how, "origin_geo": ground.origin_geo,
+            "axes_geo": ground.axes_geo,
+        },
+        "warnings": list(capture.warnings),
+        "fingerprint": fingerprint(capture),
+    }  # fmt: skip
+
+
+def fingerprint(capture: Capture) -> dict[str, int]:
+    """CRC-32 of each part of a capture that results depend on. Photographs count by name and size in bytes."""
+    return {
+        "choice of training and test photographs": _crc(*(f"{view.name}:{view.split}" for view in capture.views)),
+        "photographs": _crc(*(f"{view.name}:{view.image_path.stat().st_size}" for view in capture.views)),
+        "cameras or ground frame": _crc(*(_camera_bytes(view) for view in capture.views)),
+        "sparse points": _crc(capture.points.tobytes(), capture.point_colours.tobytes()),
+    }
+
+
+def refuse_another_capture(source: Path, before: CaptureMetadata | Mapping[str, Any] | None, capture: Capture) -> None:
+    """Raise RunError, naming what changed, unless `capture` is the one that `before` (capture_facts) describes."""
+    known = (before or {}).get("fingerprint")
+    if not isinstance(known, Mapping):
+        raise RunError(f"{source}: does not say which capture the run belongs to. It is damaged; start a new --output.")
+    changed = [part for part, crc in fingerprint(capture).items() if known.get(part) != crc]
+    if changed:
+        raise RunError(
+            f"{capture.root}: is not the capture that {source} was made from any more; changed: {', '.join(changed)}. "
+            "Restore the capture as it was, or start a new run with another --output."
+        )
+
+
+def _camera_bytes(view: View) -> bytes:
+    camera = view.camera
+    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height]
+    return camera.camera_from_world.tobytes() + np.array(numbers, np.float64).tobytes()
+
+
+def _crc(*parts: str | bytes) -> int:
+    crc = 0
+    for part in parts:
+        crc = zlib.crc32(part.encode() if isinstance(part, str) else part, crc)
+    return crc

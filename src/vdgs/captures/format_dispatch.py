@@ -1,0 +1,120 @@
+"""Which format a folder is of, and the capture in it as the files have it.
+
+A folder may hold a COLMAP model and transforms.json, as nerfstudio leaves them, of the same cameras. The model also
+knows which photograph shows which point, so it is read; but where transforms.json says what the model cannot, lists of
+training and test photographs or masks, that is read (choice). A note says which; `--format` decides otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from vdgs.captures.formats.colmap import count_images, find_models, partial_model, read_colmap
+from vdgs.captures.formats.matrixcity import pose_files, read_matrixcity
+from vdgs.captures.formats.mega_nerf import is_mega_nerf, read_mega_nerf
+from vdgs.captures.formats.source_capture import SourceCapture
+from vdgs.captures.formats.transforms import FILE, only_it_says, read_transforms
+from vdgs.captures.reconstruction import is_reconstruction
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+
+
+def read_source(root: Path, options: CaptureOptions) -> SourceCapture:
+    """The capture in the format asked for, or in whichever the folder is.
+
+    Raises `CaptureError` where there is none, and as the readers do.
+    """
+    here = [name for name, (is_here, _) in FORMATS.items() if is_here(root)]
+    if options.format != "auto":
+        if options.format not in here:
+            found = f"It holds: {', '.join(here)}." if here else "It holds none that is known."
+            raise CaptureError(f"{root}: --format {options.format}, but the folder holds no such capture. {found}")
+        return FORMATS[options.format][1](root, options)
+    if here[:2] == ["colmap", "transforms"]:
+        return _of_both(root, options)
+    if here:
+        return FORMATS[here[0]][1](root, options)
+    if is_reconstruction(root):
+        raise CaptureError(
+            f"{root}: is not finished: vdgs sfm was stopped. The command that began it goes on "
+            f"with it (its photographs, --output {root})."
+        )
+    raise CaptureError(
+        f"{root}: not a capture. {partial_model(root)}Looked for a COLMAP model (sparse/0/cameras.bin and "
+        "images.bin, or .txt), transforms.json (nerfstudio), train/metadata/*.pt (Mega-NeRF) and transforms_train.json "
+        f"(MatrixCity). Photographs alone become one first: vdgs sfm {root} --output CAPTURE"
+    )
+
+
+def _of_both(root: Path, options: CaptureOptions) -> SourceCapture:
+    """One of a COLMAP model and transforms.json, with a note about the other."""
+    model = _biggest(find_models(root)).relative_to(root)
+    theirs = f"the COLMAP model in {model}" if model.parts else "the COLMAP model"
+    says = only_it_says(root / FILE)
+    if not says:
+        note = f"{theirs} is read; {FILE} beside it is not (--format transforms reads that instead)."
+        source = _read_colmap(root, options)
+        return replace(source, warnings=(note, *source.warnings))
+    try:
+        source = read_transforms(root, options)
+    except CaptureError as error:
+        raise CaptureError(f"{error}\nOr read {theirs} instead: --format colmap") from error
+    note = f"{FILE} is read, for its {says}; {theirs} is not (--format colmap reads that instead)."
+    return replace(source, warnings=(note, *source.warnings))
+
+
+def _biggest(models: list[Path]) -> Path:
+    return max(models, key=count_images)
+
+
+def _read_colmap(root: Path, options: CaptureOptions) -> SourceCapture:
+    warnings, models = [], find_models(root)
+    folder = _biggest(models)
+    distinct = [model for model in models if model.resolve() != folder.resolve()]
+    if distinct:
+        sizes = ", ".join(f"{model.relative_to(root)} ({count_images(model)})" for model in models)
+        warnings.append(f"several sparse models: {sizes} images; the biggest is used.")
+    images, image_warnings = image_folder(root, options)
+    model = read_colmap(folder)
+    if not model.views:
+        raise CaptureError(f"{folder}: the model holds no registered images. Run the reconstruction again.")
+    if not len(model.points):
+        raise CaptureError(
+            f"{folder}: the model holds no 3D points, from which the scene starts. Keep points3D.bin beside "
+            "images.bin, or triangulate: colmap point_triangulator."
+        )
+    return SourceCapture(
+        source="colmap", images=images, views=model.views, points=model.points, colours=model.colours,
+        image_folders=(root / images,), warnings=(*warnings, *image_warnings),
+    )  # fmt: skip
+
+
+def image_folder(root: Path, options: CaptureOptions) -> tuple[str, list[str]]:
+    """The image folder relative to `root`: the one asked for, else images, else the largest images_N."""
+    if options.images is not None:
+        if not (root / options.images).is_dir():
+            present = sorted(entry.name for entry in root.iterdir() if entry.is_dir())
+            raise CaptureError(f"{root / options.images}: no such folder. Present: {', '.join(present) or 'none'}.")
+        return Path(options.images).as_posix(), []
+    if (root / "images").is_dir():
+        return "images", []
+    shrunk = {
+        int(entry.name.removeprefix("images_")): entry.name
+        for entry in root.glob("images_*")
+        if entry.is_dir() and entry.name.removeprefix("images_").isdigit()
+    }
+    if not shrunk:
+        raise CaptureError(f"{root}: no images/ folder (nor images_2, images_4, ...). Put the photographs there.")
+    name = shrunk[min(shrunk)]
+    return name, [f"no images/ folder; {name} is used instead (--images chooses)."]
+
+
+#: Of each format, in the order in which they are looked for: whether a folder holds it, and its reader.
+FORMATS: dict[str, tuple[Callable[[Path], object], Callable[[Path, CaptureOptions], SourceCapture]]] = {
+    "mega-nerf": (is_mega_nerf, read_mega_nerf),
+    "matrixcity": (pose_files, read_matrixcity),
+    "colmap": (find_models, _read_colmap),
+    "transforms": (lambda root: (root / FILE).is_file(), read_transforms),
+}

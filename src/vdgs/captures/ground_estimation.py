@@ -1,0 +1,238 @@
+"""The ground frame: the similarity that turns a capture's own world into one with z up.
+
+Where the up axis and the scale come from, in this order:
+
+1. `--up`: the person says so (no georeference, arbitrary scale).
+2. georef.json: the world already is ENU metres; only the origin may move.
+3. GPS of the photographs: robust similarity from camera centres to ENU.
+4. What the format promises about its world (Mega-NeRF, MatrixCity).
+5. Estimate (`up`): drones look down on what is flat, others hold their cameras level.
+
+All arithmetic is float64. Choice: in a frame that is not georeferenced the origin is the median sparse point,
+so z = 0 is the median height of the ground; where metres are unknown the median camera flies at
+`CAMERA_HEIGHT`, or is so far from the points where it is not above them (`heights`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from vdgs.captures.camera_height import reach
+from vdgs.captures.capture import GroundFrame
+from vdgs.captures.formats.source_capture import KnownWorld, SourceCapture
+from vdgs.captures.georeference import match_gps, read_georef, read_gps
+from vdgs.captures.up_axis import estimate_up
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
+from vdgs.geometry.similarity import (
+    Similarity,
+    disagreement,
+    fit_similarity_robust,
+    geometric_median,
+    is_collinear,
+)
+
+#: Median camera height above the ground, in units, where the capture has no metres (choice).
+CAMERA_HEIGHT = 10.0
+#: Georeferenced worlds farther than this from their origin are shifted, so that float32 stays below 0.1 mm.
+FAR_FROM_ORIGIN_M = 1000.0
+#: Cameras farther than this from the origin of an ENU world are not in it: they have turned by half a degree.
+FARTHEST_ENU_M = 50_000.0
+#: A told up axis farther than this from the estimated one is worth a warning.
+SUSPICIOUS_DEG = 30.0
+AXES = {
+    sign + name: factor * np.eye(3)[index]
+    for index, name in enumerate("xyz")
+    for sign, factor in (("", 1.0), ("-", -1.0))
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """What the frame is found from: camera centres, camera_from_world rotations and finite points, source world."""
+
+    names: list[str]
+    centres: np.ndarray
+    rotations: np.ndarray
+    points: np.ndarray
+
+
+def find_ground_frame(source: SourceCapture, root: Path, options: CaptureOptions) -> tuple[GroundFrame, list[str]]:
+    """The ground frame of a capture, and warnings for people.
+
+    Raises `CaptureError` for georeferences that cannot be used.
+    """
+    scene = _scene(source)
+    warnings: list[str] = []
+    if options.up != "auto":
+        if options.georef or options.gps:
+            raise CaptureError("--up contradicts --georef and --gps, which fix the up axis themselves; give one.")
+        if (root / "georef.json").is_file():
+            warnings.append("--up is given, so georef.json is not used: the frame is not metric.")
+        rotation = rotation_to_z(AXES[options.up])
+        return _unscaled(scene, rotation, f"up = {options.up} as given", warnings), warnings
+    if options.georef and options.gps:
+        raise CaptureError("--georef and --gps both say where the world is; give one.")
+    georef = options.georef or (root / "georef.json" if (root / "georef.json").is_file() else None)
+    if georef and options.georef is None and options.gps is not None:
+        georef = None  # what was asked for wins over what lies about
+    if georef:
+        frame = _georeferenced(scene, georef, warnings)
+        _compare_up(scene, frame, warnings)
+        return frame, warnings
+    if options.gps:
+        frame_or_none = _from_gps(scene, options.gps, warnings)
+        if frame_or_none is not None:
+            return frame_or_none, warnings
+    if source.world is not None:
+        frame = _promised(scene, source.world, warnings)
+        _compare_up(scene, frame, warnings)
+        return frame, warnings
+    up, how = estimate_up(scene.centres, scene.rotations, scene.points, warnings)
+    return _unscaled(scene, rotation_to_z(up), how, warnings), warnings
+
+
+def _scene(source: SourceCapture) -> _Scene:
+    poses = np.stack([view.camera_from_world for view in source.views])
+    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    points = source.points[np.isfinite(source.points).all(axis=1)]
+    return _Scene([view.name for view in source.views], centres, poses[:, :3, :3], points)
+
+
+# ----------------------------------------------------------------------------------------- georeference
+
+
+def _georeferenced(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame:
+    """Identity rotation in metres; the origin moves (by whole metres) only where float32 needs it."""
+    origin, how = read_georef(file), f"world is ENU metres ({file.name})"
+    middle = np.median(scene.centres, axis=0)
+    shift = np.where(np.abs(middle) > FAR_FROM_ORIGIN_M, -np.round(middle), 0.0)
+    if shift.any():
+        how = f"{how}, origin moved by {np.abs(shift).max():.0f} m"
+    frame = GroundFrame(scale=1.0, rotation=np.eye(3), translation=np.zeros(3), metric=True, how=how, origin_geo=origin)
+    if np.linalg.norm(middle) > FARTHEST_ENU_M:
+        warnings.append(
+            f"{file.name}: the cameras are {np.linalg.norm(middle) / 1000:,.0f} km away from the origin, where its "
+            "east, north and up do not hold. Are these projected coordinates (UTM) instead of ENU? Metres and up "
+            "are kept, latitude and longitude are not known."
+        )
+        return replace(frame, translation=shift, origin_geo=None)
+    return _shifted(frame, shift, how) if shift.any() else frame
+
+
+def _shifted(frame: GroundFrame, shift: np.ndarray, how: str) -> GroundFrame:
+    """The frame with its origin moved; the axes stay those of the first origin."""
+    assert frame.origin_geo is not None
+    moved = geodetic_from_enu(-shift[None], frame.origin_geo, frame.level_at)[0]
+    origin = (float(moved[0]), float(moved[1]), float(moved[2]))
+    return replace(frame, translation=frame.translation + shift, how=how, origin_geo=origin, axes_geo=frame.level_at)
+
+
+def _from_gps(scene: _Scene, file: Path, warnings: list[str]) -> GroundFrame | None:
+    """Similarity from camera centres to ENU, or None (with a warning) where the flight does not fix one."""
+    indices, geodetic = match_gps(scene.names, read_gps(file), file)
+    median = np.median(geodetic, axis=0)
+    origin = (float(median[0]), float(median[1]), float(median[2]))
+    enu = enu_from_geodetic(geodetic, origin)
+    centres = scene.centres[indices]
+    similarity, inliers = Similarity(1.0, np.eye(3), np.zeros(3)), np.ones(len(centres), bool)
+    fixed = not is_collinear(centres)
+    if fixed:
+        similarity, inliers = fit_similarity_robust(centres, enu)
+        fixed = not is_collinear(enu[inliers])
+    if not fixed:
+        warnings.append(
+            f"{file.name}: {len(indices)} photographs with GPS, all along one line (or fewer than three), "
+            "fix no up axis; the frame is estimated from the cameras instead and is not metric."
+        )
+        return None
+    residuals = similarity.apply(centres) - enu
+    how_far = disagreement(residuals, enu, inliers)
+    if how_far:
+        warnings.append(
+            f"{file.name}: GPS and camera positions disagree ({how_far}); it is ignored and the frame is estimated."
+        )
+        return None
+    if not inliers.all():
+        names = ", ".join(scene.names[i] for i in indices[~inliers][:5])
+        warnings.append(f"{file.name}: {(~inliers).sum()} GPS positions left out as outliers ({names}).")
+    rms = float(np.sqrt((residuals[inliers] ** 2).sum(axis=1).mean()))
+    how = f"GPS of {inliers.sum()} photographs, RMS {rms:.2f} m"
+    frame = GroundFrame(
+        scale=similarity.scale, rotation=similarity.rotation, translation=similarity.translation, metric=True, how=how,
+        origin_geo=origin,
+    )  # fmt: skip
+    frame = _shifted(frame, -_middle(frame.to_ground(scene.points)), how)
+    _compare_up(scene, frame, warnings)
+    return frame
+
+
+def _compare_up(scene: _Scene, frame: GroundFrame, warnings: list[str]) -> None:
+    """Warn where the up axis that was told and the one that the cameras suggest contradict each other."""
+    doubts: list[str] = []
+    up, _ = estimate_up(scene.centres, scene.rotations, scene.points, doubts)
+    angle = float(np.degrees(np.arccos(np.clip(frame.rotation[2] @ up, -1, 1))))
+    if angle > SUSPICIOUS_DEG and not doubts:
+        warnings.append(
+            f"up is {angle:.0f} degrees away from what cameras and points suggest (used: {frame.how}). "
+            "If the scene looks tilted, give --up."
+        )
+
+
+# ------------------------------------------------------------------------------------------------ frames
+
+
+def rotation_to_z(up: np.ndarray) -> np.ndarray:
+    """The smallest rotation [3, 3] that takes the unit vector `up` to z (half a turn about x for -z)."""
+    x, y, z = up / np.linalg.norm(up)
+    across = x * x + y * y
+    if z < 0 and across < 1e-300:
+        return np.diag([1.0, -1.0, -1.0])
+    # 1 / (1 + z) without its cancellation near -z.
+    a = 1 / (1 + z) if z >= 0 else (1 - z) / across
+    return np.array([[1 - a * x * x, -a * x * y, -x], [-a * x * y, 1 - a * y * y, -y], [x, y, z]])
+
+
+def _unscaled(scene: _Scene, rotation: np.ndarray, how: str, warnings: list[str]) -> GroundFrame:
+    """A frame without metres: the median camera flies at `CAMERA_HEIGHT` above the median point."""
+    length, is_height = reach(scene.centres, scene.points, rotation[2])
+    if not is_height:
+        warnings.append(
+            "the cameras are not above the points; the scale is set by their distance instead. "
+            "If the scene is upside down, give --up."
+        )
+    if not length > 0:
+        raise CaptureError("all cameras and points lie in one place; this is no scene. Check the sparse model.")
+    return _centred(scene, rotation, CAMERA_HEIGHT / length, False, f"{how}; median camera height = 10 units")
+
+
+def _promised(scene: _Scene, world: KnownWorld, warnings: list[str]) -> GroundFrame:
+    """The frame that a format promises; its scale is chosen where the format knows no metres."""
+    if world.metric:
+        return _centred(scene, world.rotation, world.scale, True, world.how)
+    return _unscaled(scene, world.rotation, world.how, warnings)
+
+
+def _centred(scene: _Scene, rotation: np.ndarray, scale: float, metric: bool, how: str) -> GroundFrame:
+    middle = _middle(scale * scene.points @ rotation.T)
+    return GroundFrame(scale=scale, rotation=rotation, translation=-middle, metric=metric, how=how)
+
+
+def _middle(points: np.ndarray) -> np.ndarray:
+    """The place [3] that becomes the origin: geometric median across, plain median in height."""
+    return np.array([*geometric_median(points)[:2], np.median(points[:, 2])])
+
+
+def transform_pose(camera_from_world: np.ndarray, frame: GroundFrame) -> np.ndarray:
+    """The pose [4, 4] of the same camera in the ground frame: rotation re-orthonormalised, centre scaled."""
+    rotation, translation = camera_from_world[:3, :3], camera_from_world[:3, 3]
+    left, _, right = np.linalg.svd(rotation @ frame.rotation.T)
+    centre = frame.to_ground((-rotation.T @ translation)[None])[0]
+    pose = np.eye(4)
+    pose[:3, :3] = left @ right
+    pose[:3, 3] = -pose[:3, :3] @ centre
+    return pose

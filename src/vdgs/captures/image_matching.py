@@ -1,0 +1,128 @@
+"""Every view with its photograph and its mask, and the camera brought to the size that the photograph has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vdgs.captures.formats.source_capture import SINGLE_FOCAL, Intrinsics, SourceCapture, SourceView, listing
+from vdgs.captures.image_files import find_images, read_header, same_shape
+from vdgs.captures.mask_matching import check_mask, find_masks
+from vdgs.captures.name_resolution import Names
+from vdgs.captures.undistortion import ImageFile
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+
+#: Photographs whose size differs from that of most by more than this share are mentioned; rounding differs by less.
+OTHER_FACTOR = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class FoundView:
+    """A view whose image was found."""
+
+    view: SourceView
+    file: ImageFile
+
+
+def find_photographs(
+    root: Path, source: SourceCapture, options: CaptureOptions, warnings: list[str]
+) -> list[FoundView]:
+    """Every view with its image file; images without a camera become a warning, the reverse an error."""
+    folder = root / source.images
+    available = Names(find_images(folder)) if folder.is_dir() else Names({})
+    paths: list[Path] = []
+    missing: list[str] = []
+    for view in source.views:
+        path = view.image_path or folder / (available.find(view.name) or view.name)
+        paths.append(path)
+        if not path.is_file():
+            missing.append(str(path))
+    if missing:
+        raise CaptureError(
+            f"{folder}: {len(missing)} of {len(source.views)} images that have a camera are missing. Copy "
+            f"them there, or choose another folder with --images.{listing(missing)}"
+        )
+    named = set(paths)
+    others = {
+        name: path
+        for spare_folder in source.image_folders
+        for name, path in find_images(spare_folder).items()
+        if path not in named
+    }
+    used = {path.resolve() for path in paths} if others else set()  # asked of the disk only where names differ
+    spare = [name for name, path in others.items() if path.resolve() not in used]
+    if spare:
+        shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
+        warnings.append(f"{len(spare)} images have no camera and are not used ({shown}).")
+    return _fitted(root, source, paths, options, warnings)
+
+
+def _fitted(
+    root: Path, source: SourceCapture, paths: list[Path], options: CaptureOptions, warnings: list[str]
+) -> list[FoundView]:
+    """The views with their images, masks and intrinsics at the images' sizes; collects what does not fit."""
+    photographs, problems = list[FoundView](), list[str]()
+    masks = find_masks(root, source.views, options, warnings)
+    for view, path in zip(source.views, paths, strict=True):
+        mask = masks[view.name]
+        try:
+            intrinsics = fit_to_image(view, path)
+            if mask is not None:
+                check_mask(mask, path)
+            photographs.append(FoundView(view, ImageFile(view.name, path, mask, intrinsics)))
+        except CaptureError as error:
+            problems.append(str(error))
+    if len(problems) > 1:
+        raise CaptureError(f"{root / source.images}: {len(problems)} images cannot be used.{listing(problems)}")
+    if problems:
+        raise CaptureError(problems[0])
+    warnings += _shrunk_otherwise(photographs)
+    return photographs
+
+
+def _shrunk_otherwise(photographs: list[FoundView]) -> list[str]:
+    """A warning where some photographs are shrunk by another factor than most: thumbnails among the photographs."""
+    factors = np.array([photo.file.intrinsics.width / photo.view.intrinsics.width for photo in photographs])
+    usual = float(np.median(factors))
+    others = np.flatnonzero(np.abs(factors / usual - 1) > OTHER_FACTOR)
+    if not len(others):
+        return []
+    names = ", ".join(photographs[index].view.name for index in others[:5]) + (", ..." if len(others) > 5 else "")
+    low, high = factors[others].min(), factors[others].max()
+    return [
+        f"{len(others)} of {len(factors)} photographs are not shrunk as the rest, to {low:.3g} to {high:.3g} of the "
+        f"size of their cameras instead of {usual:.3g} ({names}). Thumbnails?"
+    ]
+
+
+def fit_to_image(view: SourceView, path: Path) -> Intrinsics:
+    """The view's intrinsics at the actual size of its image.
+
+    Shrunk folders hold sizes rounded up or down by at most one pixel; anything else contradicts the model.
+    """
+    header, intrinsics = read_header(path), view.intrinsics
+    if (header.width, header.height) == (intrinsics.width, intrinsics.height):
+        return intrinsics
+    if not same_shape((header.width, header.height), (intrinsics.width, intrinsics.height)):
+        turned = (header.width > header.height) != (intrinsics.width > intrinsics.height)
+        hint = "The image is turned by a quarter (EXIF orientation applied?). " if turned else ""
+        raise CaptureError(
+            f"{path}: is {header.width}x{header.height}, but its camera is "
+            f"{intrinsics.width}x{intrinsics.height}: another shape, so the two do not belong together. "
+            f"{hint}Use the images that the model was made from, or shrink them evenly."
+        )
+    return scaled(intrinsics, header.width, header.height)
+
+
+def scaled(intrinsics: Intrinsics, width: int, height: int) -> Intrinsics:
+    """Intrinsics for the same picture at another size; lens distortion parameters do not depend on it."""
+    sx, sy = width / intrinsics.width, height / intrinsics.height
+    (fx, fy), (cx, cy) = intrinsics.focal, intrinsics.principal_point
+    if not intrinsics.distorted:
+        return Intrinsics("PINHOLE", (fx * sx, fy * sy, cx * sx, cy * sy), width, height)
+    head = (fx * (sx + sy) / 2,) if intrinsics.model in SINGLE_FOCAL else (fx * sx, fy * sy)
+    tail = intrinsics.params[len(head) + 2 :]
+    return Intrinsics(intrinsics.model, (*head, cx * sx, cy * sy, *tail), width, height)

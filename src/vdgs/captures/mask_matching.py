@@ -1,0 +1,73 @@
+"""Masks: which of them belong to which photographs, and whether they can."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from vdgs.captures.formats.source_capture import SourceView
+from vdgs.captures.image_files import find_images, find_mask, read_header, same_shape
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.errors import CaptureError
+
+
+def find_masks(
+    root: Path, views: Sequence[SourceView], options: CaptureOptions, warnings: list[str]
+) -> dict[str, Path | None]:
+    """The mask of every photograph by its name, None where it has none; says which masks and photographs have no
+    partner.
+
+    Raises `CaptureError` for a folder of masks that was asked for and is not there, and where masks are there but none
+    of them is of a photograph.
+    """
+    folder = root / options.masks
+    asked_for = options.masks != CaptureOptions.masks
+    if asked_for and not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder, though --masks asks for it.")
+    masks = {view.name: view.mask_path or find_mask(folder, view.name) for view in views}
+    with_mask = [name for name, mask in masks.items() if mask is not None]
+    if folder.is_dir() and not any(view.mask_path for view in views):
+        _compare(folder, masks, asked_for, warnings)
+    if 0 < len(with_mask) < len(masks):
+        without = next(name for name, mask in masks.items() if mask is None)
+        warnings.append(
+            f"{len(with_mask)} of {len(masks)} photographs have a mask; the others count whole. If that is not meant, "
+            f"put the missing masks there, such as {folder / mask_name(without)}."
+        )
+    return masks
+
+
+def _compare(folder: Path, masks: dict[str, Path | None], asked_for: bool, warnings: list[str]) -> None:
+    """Hold the files of a folder of masks against the masks that were found."""
+    used = {mask for mask in masks.values() if mask is not None}
+    spare = [name for name, path in find_images(folder).items() if path not in used]
+    example = mask_name(next(iter(masks)))
+    if not used and spare:
+        raise CaptureError(
+            f"{folder}: holds {len(spare)} masks, none of them of a photograph. Name them like the photographs "
+            f"({example}; {spare[0]} is there), or choose another folder with --masks."
+        )
+    if not used and asked_for:
+        raise CaptureError(f"{folder}: holds no masks, though --masks asks for them. Put them there as {example}.")
+    if not used:
+        warnings.append(f"{folder} holds no masks; all photographs count whole.")
+    elif spare:
+        shown = ", ".join(spare[:5]) + (", ..." if len(spare) > 5 else "")
+        warnings.append(f"{folder}: {len(spare)} masks belong to no photograph and are not used ({shown}).")
+
+
+def mask_name(name: str) -> str:
+    """What the mask of a photograph is called."""
+    return Path(name).with_suffix(".png").as_posix()
+
+
+def check_mask(mask: Path, photograph: Path) -> None:
+    """Raise `CaptureError` unless a mask is there and has the shape of its photograph, at that size or another."""
+    if not mask.is_file():
+        raise CaptureError(f"{mask}: no such mask, though {photograph.name} is said to have it. Copy it there.")
+    header, wanted = read_header(mask), read_header(photograph)
+    if not same_shape((header.width, header.height), (wanted.width, wanted.height)):
+        raise CaptureError(
+            f"{mask}: is {header.width}x{header.height}, but its photograph is {wanted.width}x{wanted.height}: another "
+            "shape, so the two do not belong together. Make the mask from this photograph."
+        )

@@ -1,0 +1,111 @@
+"""The up axis of a world that nobody has told: from cameras and sparse points alone.
+
+Flights look down on what is flat: up is the axis of least variance, against the view. That fails where cameras look
+level. At a wall the flat thing is the wall; in a street the cameras are below the median point. But whoever holds a
+camera level has horizontal right vectors and image-ups that agree, and these say what up is. A wall taken from
+straight in front by parallel views cannot be told from a flight of one heading that looks straight down (the two are
+congruent): it is taken for the flight, with a warning.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vdgs.geometry.similarity import geometric_median
+
+#: Below this cosine between up and the mean view the sign of up is taken from the heights instead.
+LEVEL_VIEW = 0.1
+#: The length of the mean image-up from which photographs have the same side up: views within 25 degrees of level, or
+#: of one heading (choice).
+SAME_SIDE_UP = 0.9
+#: From this cosine between up and the mean image-up that says which way up is, where the view says it less (choice).
+UPRIGHT = 0.5
+#: Nobody rolls cameras by so much (squared sine, mean): an axis that asks for it is not up (choice). Right vectors that
+#: spread by less are parallel; they fit a hillside too, so that only an axis along them is ruled out.
+ROLLED, ALONG_RIGHTS = float(np.sin(np.radians(10.0))) ** 2, 0.5
+#: An axis is clearly the better up if it asks for less than this share of the other's roll (choice).
+CLEARLY_LESS = 0.25
+#: Roll for which right vectors count as much as the mean image-up does: where they spread by less, that decides.
+PRIOR = 0.002
+HINT = "--up x|y|z|-x|-y|-z says it outright."
+
+
+def estimate_up(
+    centres: np.ndarray, rotations: np.ndarray, points: np.ndarray, warnings: list[str]
+) -> tuple[np.ndarray, str]:
+    """Unit up vector [3] in the source world, and how it was found; what is doubtful goes to `warnings`.
+
+    `centres` [n, 3], `rotations` [n, 3, 3] (rows: right, down and forward of a camera) and `points` [m, 3] in the
+    source world. All of it turns with the world (no per-axis medians).
+    """
+    rights, image_up, forward = rotations[:, 0], -rotations[:, 1].mean(axis=0), rotations[:, 2].mean(axis=0)
+    same_side = float(np.linalg.norm(image_up)) >= SAME_SIDE_UP
+    parallel = bool(np.linalg.eigvalsh(rights.T @ rights / len(rights))[1] < ROLLED)
+    up, uncertain = _least_variance(centres, points)
+    how = "least variance of cameras and points"
+    neither = abs(forward @ up) < LEVEL_VIEW and abs(image_up @ up) < UPRIGHT
+    rolled = _roll(rights, up) > (ALONG_RIGHTS if parallel else ROLLED)
+    if same_side and (neither or rolled or (uncertain and not parallel)):
+        up, how = _level(rights, image_up), "level cameras"
+        if parallel:
+            warnings.append(
+                "the photographs look one way or its opposite: up is taken from their upper sides, and is off by as "
+                f"much as they look up or down on average. {HINT}"
+            )
+    elif uncertain:
+        warnings.append(
+            "the up axis is uncertain: cameras and points spread about as far up as sideways. "
+            f"Look at the figures of `vdgs inspect`; {HINT}"
+        )
+    own, looking = float(image_up @ up), float(forward @ up)
+    if abs(own) >= max(UPRIGHT, abs(looking)):
+        return (-up if own < 0 else up), f"{how}, upper sides of the photographs up"
+    if abs(looking) >= LEVEL_VIEW:
+        if same_side and parallel and 2 * abs(own) < abs(looking) and not _turn_about(up, rights, image_up):
+            warnings.append(
+                "all photographs look the same way with the same side up: straight down on ground, or level at a "
+                f"wall. Taken for down; if it is a wall, {HINT}"
+            )
+        return (-up if looking > 0 else up), f"{how}, against the view"
+    above = float(np.median(centres @ up) - np.median(points @ up))
+    warnings.append("the cameras look level on average; up is taken to be the side of the cameras. --up overrides.")
+    return (-up if above < 0 else up), f"{how}, cameras above"
+
+
+def _least_variance(centres: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, bool]:
+    """The axis [3], of either sign, of least variance of camera centres and points, and whether it is uncertain.
+
+    Both covariances are divided by their trace, so that each counts alike, and added; points beyond the 95 % quantile
+    of distance to the median are left out.
+    """
+    values, vectors = np.linalg.eigh(_shape(centres) + _shape(points))
+    return vectors[:, 0], bool(values[0] > 0.5 * values[1])
+
+
+def _shape(points: np.ndarray) -> np.ndarray:
+    """Covariance divided by its trace, [3, 3]; zero for a single place."""
+    offset = points - geometric_median(points)
+    distance = np.linalg.norm(offset, axis=1)
+    core = points[distance <= np.quantile(distance, 0.95)]
+    covariance = np.cov(core, rowvar=False, bias=True) if len(core) > 1 else np.zeros((3, 3))
+    trace = np.trace(covariance)
+    return covariance / trace if trace > 0 else np.zeros((3, 3))
+
+
+def _roll(rights: np.ndarray, up: np.ndarray) -> float:
+    """Mean squared sine of the angle by which cameras with these right vectors [n, 3] are rolled if `up` is up."""
+    return float(((rights @ up) ** 2).mean())
+
+
+def _turn_about(axis: np.ndarray, rights: np.ndarray, image_up: np.ndarray) -> bool:
+    """Whether right vectors [n, 3] turn about an axis clearly more than they leave the plane across it: the yaw of
+    flights that look along it."""
+    return _roll(rights, axis) < CLEARLY_LESS * _roll(rights, image_up / np.linalg.norm(image_up))
+
+
+def _level(rights: np.ndarray, image_up: np.ndarray) -> np.ndarray:
+    """Up of cameras that are held level, of either sign: most orthogonal to their right vectors [n, 3], and near their
+    mean image-up where those are too parallel to tell."""
+    mean = image_up / np.linalg.norm(image_up)
+    moment = rights.T @ rights / len(rights) + PRIOR * (np.eye(3) - np.outer(mean, mean))
+    return np.asarray(np.linalg.eigh(moment)[1][:, 0])

@@ -1,0 +1,184 @@
+"""Whether a capture can become a scene at all: what cannot work, and what is doubtful, found before any work.
+
+Cameras and sparse points must belong together. Where the capture says in which photographs it found its points
+(COLMAP's tracks) they are projected and held against that; elsewhere all that can be asked is whether they lie in front
+of and inside the cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from vdgs.captures.capture import Capture, View
+from vdgs.errors import CaptureError
+from vdgs.geometry.row_sampling import sample_points
+from vdgs.geometry.similarity import geometric_median
+from vdgs.visibility.visibility_counts import visibility_of
+
+#: Sparse points looked at when there are more.
+MOST_POINTS = 20_000
+#: Choices. Shares of the points that no training camera sees: nothing could be trained; much is missing.
+UNSEEN_REFUSED, UNSEEN_DOUBTFUL = 0.95, 0.5
+#: Median reprojection errors in pixels: fine detail is lost; not what any adjustment leaves (structure-from-motion
+#: drops what is off by more than 4 pixels of the full size), where it also is this share of the longer side.
+REPROJECTION_DOUBTFUL_PX, REPROJECTION_REFUSED_PX, REPROJECTION_REFUSED = 1.5, 3.0, 0.005
+#: How far the cameras' places move the scene in their pictures, in pixels: no depth; as a share of the longer side:
+#: poor depth.
+PARALLAX_REFUSED_PX, PARALLAX_DOUBTFUL = 1.0, 0.02
+#: Fewer distinct points than this span no surface; fewer than the second are hardly a model of a place.
+FEW_REFUSED, FEW_DOUBTFUL = 4, 50
+NAMES_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class Soundness:
+    """What was found; `problems` make training pointless, `warnings` may be meant."""
+
+    #: Median reprojection error in pixels of the photographs as used, where the capture has tracks; infinite where most
+    #: of their points lie behind the cameras.
+    reprojection_px: float | None
+    #: Points in photographs that it was measured on.
+    sightings: int
+    #: Share of the sparse points that at least one training camera holds in its frustum.
+    share_seen: float
+    problems: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def judge(capture: Capture) -> Soundness:
+    """Look at cameras and sparse points of a capture. O(points x cameras) on at most 20 000 points; pixels are not
+    decoded."""
+    points = sample_points(capture.points, MOST_POINTS)
+    findings = _Findings([], [])
+    cameras = [view.camera for view in capture.train_views]
+    seen = visibility_of(torch.from_numpy(np.ascontiguousarray(points)), cameras).numpy() > 0
+    errors = {view.name: _errors(view) for view in capture.views if view.sightings is not None}
+    pooled = np.concatenate(list(errors.values())) if errors else np.zeros(0)
+    _judge_points(capture, findings)
+    _judge_places(capture, points, findings)
+    _judge_seen(capture, points, float(seen.mean()), findings)
+    if len(pooled):
+        _judge_reprojection(capture, errors, float(np.median(pooled)), findings)
+    return Soundness(
+        reprojection_px=float(np.median(pooled)) if len(pooled) else None, sightings=len(pooled),
+        share_seen=float(seen.mean()), problems=tuple(findings.problems), warnings=tuple(findings.warnings),
+    )  # fmt: skip
+
+
+def refuse_unsound(capture: Capture, soundness: Soundness | None = None) -> Soundness:
+    """What `judge` says of a capture. Raises `CaptureError` where it cannot become a scene."""
+    soundness = soundness or judge(capture)
+    if soundness.problems:
+        raise CaptureError(f"{capture.root}: cannot become a scene.\n  " + "\n  ".join(soundness.problems))
+    return soundness
+
+
+@dataclass(frozen=True)
+class _Findings:
+    problems: list[str]
+    warnings: list[str]
+
+
+def _errors(view: View) -> np.ndarray:
+    assert view.sightings is not None
+    return view.sightings.errors_px(view.camera)
+
+
+def _judge_points(capture: Capture, findings: _Findings) -> None:
+    distinct = len(np.unique(capture.points, axis=0))
+    if distinct < FEW_REFUSED:
+        findings.problems.append(
+            f"The model holds {distinct} distinct sparse point(s), from which no surface can start. Run the "
+            "structure-from-motion again."
+        )
+    elif distinct < FEW_DOUBTFUL:
+        findings.warnings.append(
+            f"there are only {distinct} distinct sparse points; the scene starts from them. Was the model cut down?"
+        )
+
+
+def _judge_places(capture: Capture, points: np.ndarray, findings: _Findings) -> None:
+    """Depth is seen from different places only."""
+    views = capture.train_views
+    if len(views) < 2:
+        findings.problems.append("There is 1 training photograph; a scene needs at least 2, from different places.")
+        return
+    centres = np.array([view.camera.position for view in views])
+    distance = float(np.median(np.linalg.norm(centres - geometric_median(points), axis=1)))
+    spread = 2 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    parallax = float(np.median([view.camera.fx for view in views])) * spread / max(distance, 1e-12)
+    unit = capture.ground.unit
+    if parallax < PARALLAX_REFUSED_PX:
+        findings.problems.append(
+            f"All {len(views)} training cameras are at one place (within {spread:.2g} {unit}, {distance:.3g} {unit} "
+            "from the points): photographs that only turn about one place show no depth. Check the poses."
+        )
+    elif parallax < PARALLAX_DOUBTFUL * _longest_side(views):
+        findings.warnings.append(
+            f"all training cameras are within {spread:.2g} {unit}, {distance:.3g} {unit} from the points: the scene "
+            f"moves by {parallax:.1f} px at most between the photographs, and depth will be poor."
+        )
+
+
+def _judge_seen(capture: Capture, points: np.ndarray, share_seen: float, findings: _Findings) -> None:
+    cameras = [view.camera for view in capture.train_views]
+    unseen = 1 - share_seen
+    if unseen >= UNSEEN_REFUSED:
+        behind = float(np.mean([(camera.project(points)[1] <= 0).mean() for camera in cameras]))
+        findings.problems.append(
+            f"No training camera sees {unseen:.0%} of the sparse points (V = 0); {behind:.0%} of the points lie behind "
+            "a camera, on average. Cameras and points are not of one world, or the cameras look away from it: poses "
+            "of another convention (OpenGL's axes instead of OpenCV's, world-from-camera instead of "
+            "camera-from-world)? Export the model again."
+        )
+        return
+    if unseen >= UNSEEN_DOUBTFUL:
+        findings.warnings.append(
+            f"no training camera sees {unseen:.0%} of the sparse points (V = 0). Points of other photographs, or a "
+            "model whose cameras and points do not belong together?"
+        )
+    places = torch.from_numpy(np.ascontiguousarray(points))
+    blind = [view.name for view in capture.views if not bool(visibility_of(places, [view.camera]).any())]
+    if blind:
+        findings.warnings.append(
+            f"{len(blind)} of {len(capture.views)} photographs show none of the sparse points ({_some(blind)})."
+        )
+
+
+def _judge_reprojection(capture: Capture, errors: dict[str, np.ndarray], median: float, findings: _Findings) -> None:
+    refused = max(REPROJECTION_REFUSED_PX, REPROJECTION_REFUSED * _longest_side(capture.views))
+    if median > refused:
+        findings.problems.append(
+            f"The sparse points do not fall where the photographs show them: the median reprojection error is "
+            f"{reprojection_words(median)}. Points or poses were changed (mirrored, moved, scaled) or are of another "
+            "reconstruction; export the model again."
+        )
+        return
+    if median > REPROJECTION_DOUBTFUL_PX:
+        findings.warnings.append(
+            f"the median reprojection error is {median:.1f} px; the scene will be blurred. Were poses or points "
+            "rounded, or the model not adjusted after it was changed?"
+        )
+    wrong = [name for name, found in errors.items() if np.median(found) > refused]
+    if wrong:
+        findings.warnings.append(
+            f"the poses of {len(wrong)} of {len(capture.views)} photographs are wrong: their sparse points do not fall "
+            f"where the model says that they show them ({_some(wrong)}). Remove them from the model."
+        )
+
+
+def reprojection_words(median_px: float) -> str:
+    """A median reprojection error for people."""
+    return f"{median_px:.2f} px" if np.isfinite(median_px) else "infinite: most points lie behind the cameras"
+
+
+def _longest_side(views: Sequence[View]) -> float:
+    return float(np.median([max(view.camera.width, view.camera.height) for view in views]))
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:NAMES_SHOWN]) + (", ..." if len(names) > NAMES_SHOWN else "")

@@ -1,0 +1,66 @@
+"""The report of `vdgs doctor`, as a table or as JSON.
+
+Nothing outside the standard library is imported at the top, so that the report also appears where a
+dependency is broken: that is when it is needed.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+
+from vdgs.cli.doctor.check import Check
+from vdgs.cli.doctor.system_checks import LOOKS
+
+
+def report() -> list[Check]:
+    """Look at the machine; takes a few seconds (torch is imported), changes nothing and never raises."""
+    checks: list[Check] = []
+    for look in LOOKS:
+        try:
+            checks += look()
+        except Exception as error:  # the report must stand on a machine where anything may be broken
+            name = getattr(look, "__name__", "check").strip("_")
+            checks.append(Check(name, "broken", f"{type(error).__name__}: {error}", "Reinstall vdgs.", True))
+    return checks
+
+
+def healthy(checks: list[Check]) -> bool:
+    """Whether everything essential works."""
+    return all(check.works for check in checks)
+
+
+def print_report(as_json: bool = False, checks: list[Check] | None = None) -> int:
+    """Print the report as a table, or as JSON; returns the exit code, 0 if everything essential works."""
+    checks = report() if checks is None else checks
+    if as_json:
+        print(json.dumps({"healthy": healthy(checks), "checks": [asdict(check) for check in checks]}, indent=2))
+    else:
+        _print_table(checks)
+    return 0 if healthy(checks) else 1
+
+
+def _print_table(checks: list[Check]) -> None:
+    try:
+        from rich import box
+        from rich.console import Console
+        from rich.table import Table
+        from rich.text import Text
+    except ImportError:
+        for check in checks:
+            print(f"{check.state:8} {check.name:22} {check.value}  {check.remedy}")
+        return
+    signs = {"ok": ("✓", "green"), "note": ("•", "cyan"), "missing": ("–", "yellow"), "broken": ("✗", "red")}
+    table = Table(box=box.SIMPLE_HEAD)
+    for column in ("", "", "found", "what to do"):
+        table.add_column(column, overflow="fold")
+    for check in checks:
+        sign, colour = signs[check.state] if check.works else ("✗", "bold red")
+        table.add_row(Text(sign, colour), Text(check.name), Text(check.value), Text(check.remedy))
+    console = Console()
+    console.print(table)
+    broken = [check.name for check in checks if not check.works]
+    if broken:
+        console.print(Text(f"Not usable yet: {', '.join(broken)}. See the last column.", "bold red"))
+    else:
+        console.print(Text("Everything essential works.", "green"))

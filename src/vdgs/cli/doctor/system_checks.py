@@ -1,0 +1,266 @@
+"""What `vdgs doctor` looks at.
+
+Nothing outside the standard library is imported at the top, so that the report also appears where a
+dependency is broken: that is when it is needed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import os
+import platform
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from vdgs.cli.doctor.check import Check
+from vdgs.system.memory.cgroups import group_limits
+from vdgs.system.units import data_size
+
+#: What each extra adds, for people; an extra that is not listed is reported without a sentence.
+EXTRAS = {
+    "synth": "the generated city, ray-traced (vdgs synth)",
+    "lpips": "the linear heads of LPIPS",
+    "tensorboard": "curves of the training in TensorBoard",
+    "geo": "maps as GeoTIFFs, any EPSG system (vdgs map)",
+    "viewer": "a scene in a browser (vdgs view)",
+    "ray": "blocks on many machines (--executor ray)",
+    "gsplat": "another rasteriser on an NVIDIA GPU, to compare with",
+    "test": "the test suite",
+}
+#: Imported for real, since these are the ones whose binary parts break.
+BINARY_MODULES = ("torch", "numpy", "scipy", "cv2", "PIL", "pycolmap", "safetensors", "matplotlib")
+LITTLE_DISK_BYTES = 5 * 10**9
+
+
+def _versions() -> list[Check]:
+    python = platform.python_version()
+    new_enough = sys.version_info >= (3, 11)
+    remedy = "" if new_enough else "Install Python 3.11 or newer."
+    return [
+        Check("vdgs", "ok", _version("vdgs") or "not installed, run from a checkout"),
+        Check("python", "ok" if new_enough else "broken", f"{python} on {platform.platform()}", remedy, True),
+    ]
+
+
+def _dependencies() -> list[Check]:
+    """The packages that vdgs requires are installed, and the binary ones can be imported."""
+    absent = [name for name in _required().get("", []) if _version(name) is None]
+    broken = [f"{name} ({error})" for name in BINARY_MODULES if (error := _import_error(name))]
+    if absent or broken:
+        packages = " ".join(absent) or "--force-reinstall vdgs"
+        found = ", ".join([*(f"{name} is not installed" for name in absent), *broken])
+        return [Check("dependencies", "broken", found, f"pip install {packages}", True)]
+    return [Check("dependencies", "ok", "all installed, all can be imported", essential=True)]
+
+
+def _processor() -> list[Check]:
+    return [Check("processor", "ok", f"{_processor_name()}, {_usable_cores()} of {os.cpu_count()} cores usable")]
+
+
+def _processor_name() -> str:
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        names = re.findall(r"^model name\s*:\s*(.+)$", info.read_text(), re.MULTILINE)
+        if names:
+            return str(names[0])
+    return platform.processor() or platform.machine()
+
+
+def _usable_cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _kernels() -> list[Check]:
+    """The C++ kernels: which builds load here, which one is in use."""
+    module = _native_module()
+    built, refused = [], []
+    for name in module.INSTRUCTION_SETS:
+        try:
+            module.load(name)
+            built.append(name)
+        except Exception as error:
+            refused.append((name, error))
+    if not built:
+        return [Check("native kernels", "missing", "not built", str(refused[-1][1]), True)]
+    supported = module.supported()
+    unbuilt = [name for name, _ in refused if name in supported]
+    value = f"{module.isa()} in use; available: {', '.join(built)}"
+    if unbuilt:
+        faster = f"The processor also runs {', '.join(unbuilt)}, which this installation lacks: reinstall vdgs."
+        return [Check("native kernels", "note", value, faster, True)]
+    return [Check("native kernels", "ok", value, essential=True)]
+
+
+def _native_module() -> ModuleType:
+    return importlib.import_module("vdgs.kernels.cpu.extension")
+
+
+def _threads() -> list[Check]:
+    import torch
+
+    native = _attempt(lambda: str(_native_module().threads())) or "none"
+    policy = os.environ.get("OMP_WAIT_POLICY", "")
+    checks = [Check("threads", "ok", f"kernels {native} (VDGS_THREADS), torch {torch.get_num_threads()}")]
+    if policy.upper() == "PASSIVE":
+        return [*checks, Check("OMP_WAIT_POLICY", "ok", "PASSIVE")]
+    advice = "export OMP_WAIT_POLICY=PASSIVE: torch's spinning threads slow everything on a busy machine."
+    return [*checks, Check("OMP_WAIT_POLICY", "note", policy or "not set", advice)]
+
+
+def _memory() -> list[Check]:
+    import psutil
+
+    groups, memory = group_limits(), psutil.virtual_memory()
+    total = min([memory.total, *(group.limit for group in groups)])
+    free = min([memory.available, *(group.free for group in groups)])
+    if total < memory.total:
+        by = "by a control group (container, SLURM job, systemd unit)"
+        return [Check("memory", "ok", f"{data_size(free)} free, limited to {data_size(total)} {by}")]
+    return [Check("memory", "ok", f"{data_size(free)} free of {data_size(total)}")]
+
+
+def _torch() -> list[Check]:
+    import torch
+
+    checks = [Check("torch", "ok", f"{torch.__version__}, built for CUDA {torch.version.cuda or '–'}", essential=True)]
+    if torch.cuda.is_available():
+        for index in range(torch.cuda.device_count()):
+            device = torch.cuda.get_device_properties(index)
+            checks.append(Check(f"GPU {index}", "ok", f"{device.name}, {data_size(device.total_memory)}"))
+    elif shutil.which("nvidia-smi"):
+        advice = "pip install --force-reinstall torch (the default build has CUDA); nvidia-smi tests the driver."
+        checks.append(Check("GPU", "note", "there is an NVIDIA driver, but this torch cannot use it", advice))
+    else:
+        checks.append(Check("GPU", "note", "none: everything runs on the processor"))
+    return checks
+
+
+def _cuda() -> list[Check]:
+    checks: list[Check] = importlib.import_module("vdgs.cli.doctor.cuda_checks").looks()
+    return checks
+
+
+def _extras() -> list[Check]:
+    """Each optional group of packages: present, or what it would add and how to get it."""
+    checks = []
+    for extra, packages in _required().items():
+        if not extra:
+            continue
+        found = {name: _version(name) for name in packages}
+        absent = [name for name, version in found.items() if version is None]
+        adds = EXTRAS.get(extra, "")
+        if absent:
+            value = f"lacks {', '.join(absent)}" + (f": {adds}" if adds else "")
+            checks.append(Check(f"extra {extra}", "missing", value, f"pip install 'vdgs[{extra}]'"))
+        else:
+            listed = ", ".join(f"{name} {version}" for name, version in list(found.items())[:3])
+            listed += f" and {len(found) - 3} more" if len(found) > 3 else ""
+            checks.append(Check(f"extra {extra}", "ok", listed + (f": {adds}" if adds else "")))
+    return checks
+
+
+def _lpips() -> list[Check]:
+    """Both files of LPIPS, without reading half a gigabyte."""
+    lpips = importlib.import_module("vdgs.evaluation.lpips")
+    heads, weights = lpips.find_heads(), lpips.cached_weights()
+    if heads and weights.is_file():
+        return [Check("LPIPS", "ok", f"VGG16 weights in {weights.parent}")]
+    if heads:
+        advice = f"Download {lpips.VGG16_URL} to {weights}, or give --lpips-weights PATH."
+        return [Check("LPIPS", "missing", "no VGG16 weights; LPIPS will be null", advice)]
+    return [Check("LPIPS", "missing", "no linear heads; LPIPS will be null", "pip install 'vdgs[lpips]'")]
+
+
+def _film() -> list[Check]:
+    """Encode a few frames for real."""
+    import tempfile
+
+    import numpy as np
+
+    video = importlib.import_module("vdgs.rendering.video")
+    encoder = video.best_encoder()
+    try:
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            video.VideoWriter(Path(folder) / "test.mp4", 30.0) as film,
+        ):
+            for level in (0, 128, 255):
+                film.write(np.full((64, 96, 3), level, np.uint8))
+    except Exception as error:
+        return [Check("film", "missing", f"{encoder}: {error}", "pip install imageio-ffmpeg")]
+    if encoder == "mpeg4":
+        return [Check("film", "ok", "MPEG-4", "pip install imageio-ffmpeg for H.264, which browsers play too.")]
+    return [Check("film", "ok", "H.264")]
+
+
+def _disk() -> list[Check]:
+    usage = shutil.disk_usage(Path.cwd())
+    value = f"{data_size(usage.free)} free of {data_size(usage.total)} in {Path.cwd()}"
+    if usage.free < LITTLE_DISK_BYTES:
+        return [Check("disk", "note", value, "Free some space: a run with its blocks may take several GB.")]
+    return [Check("disk", "ok", value)]
+
+
+def _required() -> dict[str, list[str]]:
+    """Packages by extra ("" holds what vdgs always requires), from the installed metadata, else from
+    the checkout's pyproject.toml. The other extras of vdgs
+    that an extra includes are left out: they have lines of their own."""
+    try:
+        stated = importlib.metadata.requires("vdgs") or []
+    except importlib.metadata.PackageNotFoundError:
+        stated = _checkout_requirements()
+    groups: dict[str, list[str]] = {"": []}
+    for requirement in stated:
+        marker = re.search(r"""extra\s*==\s*['"]([^'"]+)['"]""", requirement)
+        name = re.match(r"[A-Za-z0-9._-]+", requirement)
+        if name and name.group() != "vdgs":
+            groups.setdefault(marker.group(1) if marker else "", []).append(name.group())
+    return groups
+
+
+def _checkout_requirements() -> list[str]:
+    import tomllib
+
+    file = Path(__file__).parents[3] / "pyproject.toml"
+    if not file.is_file():
+        return []
+    project: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
+    stated = list(project["dependencies"])
+    for extra, packages in project.get("optional-dependencies", {}).items():
+        stated += [f"{package}; extra == '{extra}'" for package in packages]
+    return stated
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _import_error(module: str) -> str:
+    try:
+        importlib.import_module(module)
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+def _attempt(look: Callable[[], str]) -> str | None:
+    try:
+        return look()
+    except Exception:  # a missing figure is shown as missing
+        return None
+
+
+LOOKS: tuple[Callable[[], list[Check]], ...] = (
+    _versions, _dependencies, _processor, _kernels, _threads, _memory, _torch, _cuda, _extras, _lpips, _film, _disk,
+)  # fmt: skip

@@ -1,0 +1,49 @@
+"""The verb that writes a scene for other programs: `export`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from vdgs.cli.common import open_console, parse, use_device
+from vdgs.config.commands import ExportRequest
+from vdgs.config.executor_options import ExecutorOptions
+from vdgs.config.ranges import WORKERS
+from vdgs.kernels import configure_threads
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportArguments(ExportRequest):
+    """Write the scene of a run as standard files of Gaussians or points, and say what is lost by it."""
+
+    run: Positional[Path]
+    """Run folder."""
+    to: Annotated[tuple[Path, ...], UseAppendAction] = ()
+    """A file to write, by its ending: .ply (3DGS), .spz, .splat, .sog, .glb (glTF), FOLDER/tileset.json (3D Tiles),
+    .points.ply, .laz, .las (point clouds), .html (a page that shows the scene offline). Give --to again for more: the
+    scene is baked once (docs/export.md)."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
+    jobs: Annotated[int, WORKERS] = 0
+    """Shards of the baking done at once, each in a process of its own; 0: on this machine one process bakes all, a
+    cluster as many as it has room for."""
+    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+
+
+def export(arguments: list[str]) -> None:
+    asked = parse(ExportArguments, arguments, "vdgs export")
+    device, console = use_device(asked.device), open_console(asked.quiet)
+    configure_threads(asked.threads)
+    from vdgs.distributed.sharded_job import Wish
+    from vdgs.export.export_run import export_run
+
+    asked.where.check()
+    export_run(replace(asked, device=device), console, Wish(asked.where, asked.jobs, device=device))
+    from vdgs.report.write_report import write_report
+    from vdgs.runs.run_folder import REPORT, RunFolder
+
+    if any(path.suffix.lower() == ".html" for path in asked.to) and (asked.run / REPORT).exists():
+        write_report(RunFolder(asked.run))  # it leads to the page

@@ -1,0 +1,89 @@
+"""The command line: one verb per stage. No logic here; heavy imports wait until a verb runs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+HELP = """\
+usage: vdgs VERB [options]
+
+vdgs turns a folder of drone photographs into one 3D Gaussian splatting scene.
+
+  inspect CAPTURE --output FOLDER   what a capture holds and how well it covers the place
+  run CAPTURE --output RUN          everything: model, blocks, merge, metrics, report; the same command continues.
+                                    CAPTURE may be a folder of photographs alone: `sfm` then comes first
+  status RUN                        how far a run is, stage by stage, and what to type next
+
+its stages, one by one:
+  sfm PHOTOGRAPHS --output CAPTURE  photographs to a capture: poses, points, metres and north; the same command goes on
+  coarse CAPTURE --output RUN       train the global model; the same command continues it
+  visibility RUN                    how many cameras see each part of the scene
+  partition RUN                     cut the scene into blocks and give each its cameras
+  train RUN [--block N]             train the blocks, or one of them; the same command continues
+  merge RUN                         the blocks become one scene
+  eval RUN                          metrics and pictures of the test views
+  report RUN                        one HTML file with figures, metrics, pictures and settings
+
+more:
+  view RUN                          move through the scene in a browser: layers, places, camera paths
+  render RUN                        views or a camera path, as PNG or video
+  map RUN                           orthophoto, surface model and visibility as GeoTIFFs
+  export RUN --to FILE              the scene for other programs: PLY, SPZ, SOG, glTF, 3D Tiles, LAZ
+  synth OUTPUT                      generate a small aerial town with known truth
+  bench TABLE --output FOLDER       methods x scenes x seeds: the paper's tables and a verdict; needs a checkout
+  doctor                            what this machine can use, and what to install for the rest
+
+vdgs VERB --help explains the options of a verb. A capture is a folder with images/ and sparse/0 (COLMAP),
+transforms.json (nerfstudio), train/ and val/ (Mega-NeRF) or the layout of MatrixCity; `sfm` makes one of photographs.
+"""
+
+VERBS = (
+    "inspect", "run", "sfm", "status", "coarse", "visibility", "partition", "train", "merge", "eval", "report",
+    "view", "render", "map", "export", "synth", "bench", "doctor",
+)  # fmt: skip
+#: Verbs that take up what they left when they were interrupted.
+CONTINUES = ("run", "sfm", "coarse", "train", "bench")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of `vdgs`. Exit codes: 0 done, 1 an error that the message explains, 2 usage, 130 stopped; 3 from
+    `vdgs status`, of a run that is not whole."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(HELP, end="")
+        sys.exit(0 if arguments else 2)
+    if arguments[0] == "--version":
+        from vdgs import __version__
+
+        print(f"vdgs {__version__}")
+        return
+    if arguments[0] not in VERBS:
+        print(f"{HELP}\nvdgs: there is no verb {arguments[0]!r}{_like(arguments[0])}", file=sys.stderr)
+        sys.exit(2)
+    sys.exit(_run(arguments[0], arguments[1:]))
+
+
+def _like(word: str) -> str:
+    """A question about the verb that may be meant."""
+    import difflib
+
+    like = difflib.get_close_matches(word.lower().lstrip("-"), [*VERBS, "help"], n=1)
+    return f"; did you mean {like[0]!r}?" if like else ""
+
+
+def _run(verb: str, arguments: list[str]) -> int:
+    from vdgs.kernels import configure_threads
+
+    configure_threads()  # before anything imports torch
+    from vdgs import cli
+    from vdgs.system.exit_codes import exit_code_of
+
+    action: Callable[[list[str]], Any] = getattr(cli, verb)
+    again = "continues: what is finished is kept" if verb in CONTINUES else "begins it anew"
+    return exit_code_of(f"vdgs {verb}", lambda: action(arguments), f"The same command {again}.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""The verb that makes maps of a run: `map`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from vdgs.cli.common import open_console, parse, use_device
+from vdgs.config.commands import MapRequest
+from vdgs.config.executor_options import ExecutorOptions
+from vdgs.config.ranges import WORKERS
+from vdgs.kernels import configure_threads
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapArguments(MapRequest):
+    """Make maps of a run: orthophoto, surface model and visibility as GeoTIFFs, hillshade and preview as PNG.
+
+    Needs rasterio and pyproj: pip install 'vdgs[geo]'.
+    """
+
+    run: Positional[Path]
+    """Run folder."""
+    jobs: Annotated[int, WORKERS] = 0
+    """Shards of the tiles drawn at once, each in a process of its own; 0: on this machine one process draws all, a
+    cluster as many as it has room for."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
+    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+
+
+def map(arguments: list[str]) -> None:
+    asked = parse(MapArguments, arguments, "vdgs map")
+    device = use_device(asked.device)
+    configure_threads(asked.threads)
+    from vdgs.distributed.sharded_job import Wish
+    from vdgs.rendering.ortho.render_ortho import map_run
+    from vdgs.runs.run_context import RunContext
+
+    asked.where.check()
+    wish = Wish(asked.where, asked.jobs, device=device)
+    map_run(RunContext.from_path(asked.run), replace(asked, device=device), open_console(asked.quiet), wish)

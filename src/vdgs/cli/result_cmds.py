@@ -1,0 +1,128 @@
+"""Verbs that show what a run came to: `status`, `eval`, `report`, `render`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from vdgs.cli.common import open_console, parse, use_device
+from vdgs.config.commands import BINS, ModelName, RenderRequest
+from vdgs.config.executor_options import ExecutorOptions
+from vdgs.config.ranges import WORKERS
+from vdgs.kernels import configure_threads
+
+
+@dataclass(frozen=True)
+class StatusArguments:
+    """Say how far a run is, stage by stage and block by block, and what to type next.
+
+    Stages are done, running, queued, stopped (they continue), failed (with the reason), missing, stale (made with other
+    settings, for another cut or from another model) or unknown (no record says it). Exit code 0: all is done and in
+    date; 3: not so.
+    """
+
+    run: Positional[Path]
+    """Run folder."""
+    json: bool = False
+    """Print JSON instead of lines."""
+
+
+def status(arguments: list[str]) -> int:
+    asked = parse(StatusArguments, arguments, "vdgs status")
+    from vdgs.report.status_cli import NOT_WHOLE, print_status, status_facts
+    from vdgs.runs.run_folder import RunFolder
+
+    if not asked.json:
+        return print_status(RunFolder(asked.run), open_console())
+    import json
+
+    facts = status_facts(RunFolder(asked.run))
+    print(json.dumps(facts, indent=1, ensure_ascii=False))
+    return 0 if facts["whole"] else NOT_WHOLE
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalArguments:
+    """Render the test views of a run, or its training views, and measure them: metrics.json, per_view.json, pictures, a
+    table."""
+
+    run: Positional[Path]
+    """Run folder."""
+    model: ModelName = "best"
+    """Which model; `best` is the merged one where there is one."""
+    views: Literal["test", "training"] = "test"
+    """Which views. `training` goes into evaluation_training: a model that is much better there than on test views
+    overfits. Blocks and seams are measured on test views only."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
+    lpips_weights: Path | None = None
+    """VGG16 weights for LPIPS (torchvision's vgg16 state dict, .pth or .safetensors). Nothing is downloaded."""
+    bins: Annotated[int, BINS] = 4
+    """Number of visibility quantiles by which metrics are reported."""
+    jobs: Annotated[int, WORKERS] = 0
+    """Shards of the views measured at once, each in a process of its own; 0: on this machine one process measures all,
+    a cluster as many as it has room for."""
+    threads: Annotated[int, WORKERS] = 0
+    """Threads of the kernels; 0 for all cores."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
+    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+
+
+def eval(arguments: list[str]) -> None:
+    asked = parse(EvalArguments, arguments, "vdgs eval")
+    from vdgs.distributed.sharded_job import Wish
+    from vdgs.pipeline.evaluate_stage import Measuring, evaluate_stage
+    from vdgs.runs.run_context import RunContext
+
+    device, console = use_device(asked.device), open_console(asked.quiet)
+    measuring = Measuring(
+        path=asked.run, which=asked.model, lpips_weights=asked.lpips_weights, bins=asked.bins, views=asked.views,
+        device=device,
+    )  # fmt: skip
+    configure_threads(asked.threads)
+    context = RunContext.from_path(asked.run, asked.capture)
+    asked.where.check()
+    evaluate_stage(context, measuring, console, Wish(asked.where, asked.jobs, device=device))
+
+
+@dataclass(frozen=True)
+class ReportArguments:
+    """Write RUN/report.html: one file with the figures, metrics, pictures and settings of a run."""
+
+    run: Positional[Path]
+    """Run folder."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
+
+
+def report(arguments: list[str]) -> None:
+    asked = parse(ReportArguments, arguments, "vdgs report")
+    from vdgs.report import write_report
+    from vdgs.runs.run_folder import RunFolder
+
+    open_console(asked.quiet).print(f"report: {write_report(RunFolder(asked.run))}", highlight=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderArguments(RenderRequest):
+    """Render a run: its test views, its training views, or a camera path; as PNG files or a video."""
+
+    run: Positional[Path]
+    """Run folder."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
+
+
+def render(arguments: list[str]) -> None:
+    asked = parse(RenderArguments, arguments, "vdgs render")
+    from vdgs.rendering.render_run import render_run
+
+    device = use_device(asked.device)
+    configure_threads(asked.threads)
+    render_run(replace(asked, device=device), open_console(asked.quiet))

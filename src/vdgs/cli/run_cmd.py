@@ -1,0 +1,106 @@
+"""Verbs that start a run from a capture: its first stage (`coarse`), all of them (`run`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, arg
+
+from vdgs.cli.common import (
+    as_typed,
+    open_console,
+    parse,
+    preset_defaults,
+    use_device,
+)
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.commands import RunRequest
+from vdgs.config.executor_options import ExecutorOptions
+from vdgs.config.method import PartitionConfig, TrainConfig
+from vdgs.config.presets import PresetName
+from vdgs.config.ranges import WORKERS
+from vdgs.kernels import configure_threads
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoarseArguments:
+    """Train the global anchor model of a capture. The same command continues a run that was stopped."""
+
+    capture: Positional[Path]
+    """Folder of the capture."""
+    output: Path
+    """Run folder; new, or the run to continue."""
+    preset: PresetName = "paper"
+    """`laptop`: a good result in minutes on a CPU. `paper`: the paper's 100 000 iterations, and our choices where it is
+    silent: gaps filled, outliers left out, a background of the mean colour, of random colours in training, bounded
+    sizes, only visible anchors moved. `literal`: none of those choices."""
+    threads: Annotated[int, WORKERS] = 0
+    """Threads of the kernels; 0 for all cores. The result does not depend on it."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
+    options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
+    training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
+    watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+
+
+def coarse(arguments: list[str]) -> None:
+    preset, settings = preset_defaults(arguments)
+    default = CoarseArguments(capture=tyro.MISSING, output=tyro.MISSING, preset=preset, training=settings.training)
+    asked = parse(CoarseArguments, arguments, "vdgs coarse", default)
+    from vdgs.pipeline.train_coarse import train_coarse
+    from vdgs.runs.create_or_resume import begin_run
+
+    device = use_device(asked.device)
+    configure_threads(asked.threads)
+    method = replace(settings, training=asked.training)
+    command = as_typed("coarse", arguments, (asked.capture, asked.output))
+    context = begin_run(asked.capture, asked.output, asked.options, method, command=command)
+    train_coarse(context, asked.watching, open_console(asked.quiet), device)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunArguments(RunRequest):
+    """Do everything: coarse model, visibility, blocks, cameras, block training, merge, metrics, report.
+
+    The same command continues a run that was stopped; finished stages are skipped.
+    """
+
+    capture: Positional[Path]
+    """Folder of the capture, or of photographs alone: they become one in RUN/capture first (`vdgs sfm`)."""
+    photographs: Positional[tuple[Path, ...]] = ()
+    """More folders of photographs, where the first is one of photographs alone."""
+    dry_run: bool = False
+    """Only say what it would take: blocks, memory, time, by estimate and a few steps that are timed. Writes nothing."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
+    options: Annotated[CaptureOptions, arg(name="")] = field(default_factory=CaptureOptions)
+    training: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
+    partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
+    watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+
+
+def run(arguments: list[str]) -> None:
+    preset, settings = preset_defaults(arguments)
+    default = RunArguments(
+        capture=tyro.MISSING, output=tyro.MISSING, preset=preset, training=settings.training,
+        partition=settings.partition, assignment=settings.assignment, block=settings.block, merge=settings.merge,
+    )  # fmt: skip
+    asked = parse(RunArguments, arguments, "vdgs run", default)
+    device = use_device(asked.device)
+    configure_threads(asked.threads)
+    if asked.dry_run:
+        from vdgs.pipeline.dry_run import plan_run
+
+        plan_run(replace(asked, device=device), open_console())
+        return
+    from vdgs.pipeline.run_pipeline import run_all
+
+    command = as_typed("run", arguments, (asked.capture, *asked.photographs, asked.output))
+    run_all(replace(asked, device=device), open_console(asked.quiet), command)

@@ -1,0 +1,59 @@
+"""The verb that makes a capture of photographs (`sfm`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from vdgs.cli.common import open_console, parse
+from vdgs.config.ranges import WORKERS, Named
+from vdgs.config.sfm_options import SfmOptions, SfmRequest
+
+
+@dataclass(frozen=True, kw_only=True)
+class SfmArguments:
+    """Photographs to a capture: features, matches, poses and points, metres and north from their positions, photographs
+    without lens distortion in three sizes. The same command goes on where it was stopped. Photographs are only read."""
+
+    photographs: Positional[tuple[Path, ...]]
+    """Folders of photographs, those below them included. A folder masks/ beside photographs has their masks (white =
+    keep), named like them: name.png or name.jpg.png."""
+    output: Path
+    """Folder of the capture; new, or the one to go on with."""
+    gps: Path | None = None
+    """CSV with the header name,lat,lon,alt: positions to use instead of those in the photographs. Names
+    need no folder and no extension where they are told apart without."""
+    dry_run: bool = False
+    """Only look: what the photographs say, what would be done and how long it takes. Writes nothing."""
+    threads: Annotated[int, WORKERS] = 0
+    """Threads to use; 0 for all cores."""
+    keep_work: bool = False
+    """Keep COLMAP's database and models in OUTPUT/work once all is done."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
+    options: Annotated[SfmOptions, arg(name=""), Named("")] = field(default_factory=SfmOptions)
+
+
+def sfm(arguments: list[str]) -> None:
+    asked = parse(SfmArguments, arguments, "vdgs sfm")
+    from vdgs.errors import VdgsError
+    from vdgs.sfm.reconstruction_plan import prepare, tell
+
+    if not asked.photographs:
+        raise VdgsError("name the folder of the photographs: vdgs sfm PHOTOGRAPHS --output CAPTURE")
+    request = SfmRequest(
+        photographs=asked.photographs, output=asked.output, gps=asked.gps, threads=asked.threads,
+        keep_work=asked.keep_work, options=asked.options,
+    )  # fmt: skip
+    console = open_console(asked.quiet)
+    if asked.dry_run:
+        tell(prepare(request), console)
+        console.print("Nothing was written.", highlight=False)
+        return
+    from vdgs.sfm.reconstruct import reconstruct
+
+    reconstruct(request, console)
+    console.print(f"capture: {asked.output}\nnext: vdgs run {asked.output} --output RUN", highlight=False)

@@ -1,0 +1,165 @@
+"""Verbs that take a run one stage further: `visibility`, `partition`, `train`, `merge`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional, arg
+
+from vdgs.cli.common import (
+    change_settings,
+    open_console,
+    parse,
+    parse_for_run,
+    use_device,
+)
+from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.executor_options import ExecutorOptions
+from vdgs.config.method import AssignmentConfig, BlockConfig, MergeConfig, MethodConfig, PartitionConfig
+from vdgs.config.ranges import WORKERS, Range
+from vdgs.kernels import configure_threads
+
+
+@dataclass(frozen=True)
+class VisibilityArguments:
+    """Count how many training cameras see each part of a run's scene; writes a map and the distribution."""
+
+    run: Positional[Path]
+    """Run folder with a coarse model."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
+
+
+def visibility(arguments: list[str]) -> None:
+    asked = parse(VisibilityArguments, arguments, "vdgs visibility")
+    from vdgs.pipeline.count_visibility import measure_visibility
+    from vdgs.runs.run_context import RunContext
+
+    measure_visibility(RunContext.from_path(asked.run, asked.capture), open_console(asked.quiet))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartitionArguments:
+    """Cut a run's scene into blocks by place and visibility, and give each block its cameras."""
+
+    run: Positional[Path]
+    """Run folder with a coarse model."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
+    redo: bool = False
+    """Allow another cut to discard blocks that are trained."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
+    why: str | None = None
+    """Name of a training photograph: also say how well it shows each block and why it was assigned or not."""
+    jobs: Annotated[int, WORKERS] = 0
+    """Shards of the cameras scored at once, each in a process of its own; 0: on this machine one process scores all, a
+    cluster as many as it has room for."""
+    threads: Annotated[int, WORKERS] = 0
+    """Threads of the kernels; 0 for all cores. The result does not depend on it."""
+    device: str = "auto"
+    """Where to draw what cameras see: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on
+    it."""
+    partition: Annotated[PartitionConfig, arg(name="")] = field(default_factory=PartitionConfig)
+    assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
+    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+
+
+def partition(arguments: list[str]) -> None:
+    def defaults(method: MethodConfig) -> PartitionArguments:
+        return PartitionArguments(run=tyro.MISSING, partition=method.partition, assignment=method.assignment)
+
+    asked, run, method = parse_for_run(PartitionArguments, arguments, "vdgs partition", defaults)
+    from vdgs.distributed.sharded_job import Wish
+    from vdgs.pipeline.partition_stage import explain_view, partition_run
+    from vdgs.runs.run_context import RunContext
+
+    device = use_device(asked.device)
+    configure_threads(asked.threads)
+    asked.where.check()
+    context = RunContext.from_path(asked.run, asked.capture)
+    change_settings(
+        run, replace(method, partition=asked.partition, assignment=asked.assignment), asked.redo, asked.quiet
+    )
+    partition_run(context, open_console(asked.quiet), device, Wish(asked.where, asked.jobs, device=device))
+    if asked.why is not None:
+        explain_view(run, asked.why, open_console(asked.quiet))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainArguments:
+    """Train the blocks of a run. The same command continues; blocks may also be trained on several machines."""
+
+    run: Positional[Path]
+    """Run folder that is cut into blocks."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
+    block: Annotated[int | None, Range(0, 10_000)] = None
+    """Only this block, in this process; without it all of them, several at once."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
+    jobs: Annotated[int, WORKERS] = 0
+    """Blocks trained at once; 0 takes what cores and memory allow."""
+    redo: bool = False
+    """Allow other settings to discard blocks that are trained with the old ones."""
+    threads: Annotated[int, WORKERS] = 0
+    """Threads of the kernels for --block; 0 for all cores. The result does not depend on it."""
+    device: str = "auto"
+    """Where to compute: auto, cpu, cuda or cuda:0. `auto` takes a GPU only if every operation runs on it."""
+    settings: Annotated[BlockConfig, arg(name="block")] = field(default_factory=BlockConfig)
+    watching: Annotated[WatchOptions, arg(name="")] = field(default_factory=WatchOptions)
+    where: Annotated[ExecutorOptions, arg(name="")] = field(default_factory=ExecutorOptions)
+
+
+def train(arguments: list[str]) -> None:
+    def defaults(method: MethodConfig) -> TrainArguments:
+        return TrainArguments(run=tyro.MISSING, settings=method.block)
+
+    asked, run, method = parse_for_run(TrainArguments, arguments, "vdgs train", defaults)
+    device = use_device(asked.device)
+    from vdgs.runs.run_context import RunContext
+
+    context = RunContext.from_path(asked.run, asked.capture)
+    change_settings(run, replace(method, block=asked.settings), asked.redo, asked.quiet)
+    if asked.block is not None:
+        from vdgs.pipeline.train_block import train_block
+
+        configure_threads(asked.threads)
+        train_block(context, asked.block, asked.watching, open_console(asked.quiet), device)
+    else:
+        from vdgs.pipeline.train_blocks import train_blocks
+
+        train_blocks(context, asked.watching, asked.jobs, open_console(asked.quiet), device, asked.where)
+
+
+@dataclass(frozen=True)
+class MergeArguments:
+    """Merge the trained blocks of a run into one scene."""
+
+    run: Positional[Path]
+    """Run folder whose blocks are trained."""
+    quiet: bool = False
+    """Print nothing but notes, warnings and errors."""
+    capture: Path | None = None
+    """Where the capture lies now, if it was moved; the run remembers it."""
+    incomplete: bool = False
+    """Let the coarse model stand in for blocks that are missing or failed."""
+    merge: Annotated[MergeConfig, arg(name="")] = field(default_factory=MergeConfig)
+
+
+def merge(arguments: list[str]) -> None:
+    def defaults(method: MethodConfig) -> MergeArguments:
+        return MergeArguments(tyro.MISSING, merge=method.merge)
+
+    asked, run, method = parse_for_run(MergeArguments, arguments, "vdgs merge", defaults)
+    from vdgs.pipeline.merge_blocks import merge_run
+    from vdgs.runs.run_context import RunContext
+
+    context = RunContext.from_path(asked.run, asked.capture)
+    change_settings(run, replace(method, merge=asked.merge), redo=False, quiet=asked.quiet)
+    merge_run(context, asked.incomplete, open_console(asked.quiet))

@@ -1,0 +1,53 @@
+"""What a person may say about how a capture is read. Imports nothing heavy: the command line shows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from vdgs.config.ranges import MANY, Range
+
+UpAxis = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
+SplitMode = Literal["auto", "explicit", "every"]
+Format = Literal["auto", "colmap", "transforms", "mega-nerf", "matrixcity"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureOptions:
+    """How to read a folder of photographs with cameras."""
+
+    format: Format = "auto"
+    """What to read where a folder holds captures of several formats. auto: of a COLMAP model and transforms.json the
+    model, unless transforms.json lists training and test photographs or names masks."""
+    images: str | None = None
+    """Image folder to use, such as images_4. Default: images, or where absent the largest images_N."""
+    downscale: Annotated[float, Range(1, 1000)] = 1.0
+    """Extra shrink applied when images are loaded (2 = half the width and height)."""
+    test_every: Annotated[int, Range(2, MANY)] = 8
+    """Every n-th photograph in name order is kept for testing (0, n, 2n, ...), as in 3DGS (llffhold)."""
+    test_list: Path | None = None
+    """Text file with the names of the test photographs, one a line. Default: test.txt in the capture folder, if any."""
+    split: SplitMode = "auto"
+    """auto: the capture's own split or test list where there is one, else every n-th (where transforms.json lists
+    training and test photographs, those in neither list are left out); explicit: insist on it;
+    every: always every n-th."""
+    validation: bool = False
+    """Leave the test photographs out altogether and test on those named in validation.txt of the capture folder
+    instead, or where there is none on every n-th training photograph: for choosing settings without looking at the
+    test set. Photographs named in validation.txt never train."""
+    up: UpAxis = "auto"
+    """Which axis of the capture's own world points up. auto: georeference, GPS, or estimated."""
+    gps: Path | None = None
+    """CSV with the header name,lat,lon,alt (further columns allowed): photographs' GPS positions. Names need no
+    folder and no extension where they are told apart without."""
+    georef: Path | None = None
+    """georef.json saying that the world already is ENU metres. Default: the one in the capture folder."""
+    max_images: Annotated[int | None, Range(2, MANY)] = None
+    """Use only this many photographs: those nearest to the middle of the flight."""
+    undistort: bool = False
+    """Undistort photographs whose camera model has lens distortion (written once, then reused)."""
+    undistorted_folder: Path | None = None
+    """Where undistorted photographs are kept. Default: undistorted/ inside the capture folder."""
+    masks: str = "masks"
+    """Folder of masks (white = keep), named like the photographs: name.png or name.jpg.png."""

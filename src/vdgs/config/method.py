@@ -1,0 +1,364 @@
+"""Every setting of training, with its meaning, its default and where that comes from.
+
+Only the standard library is imported here, so that the command line can show the settings at once.
+The defaults are the preset `paper`: the paper's numbers, and our choices where it is silent and one was needed.
+`presets.py` holds the others, and says which of those choices are left out in `literal`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Literal
+
+from vdgs.config.ranges import LARGE, MANY, SHARE, Named, Range
+
+PartitionStrategy = Literal["visibility", "vastgaussian", "citygaussian", "dogs"]
+#: From which share of the iterations on images are shrunk by which factor.
+Resolutions = tuple[tuple[Annotated[float, SHARE], Annotated[int, Range(1, 1024)]], ...]
+
+RATE = Range(0, 100, above=True)
+FACTOR = Range(0, 1000, above=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnchorConfig:
+    """The anchor model (Scaffold-GS, section III-B of the paper)."""
+
+    offsets: Annotated[int, Range(1, 32)] = 10
+    """Gaussians per anchor (k)."""
+    voxel: Annotated[float, Range(0, LARGE)] = 0.0
+    """Edge of the initial voxel grid in units of the ground frame; 0 takes the median nearest-neighbour distance of the
+    sparse points."""
+    outlier_distance: Annotated[float, Range(2, LARGE, or_zero=True)] = 30.0
+    """Sparse points start no anchor where their fourth neighbour is this many times farther than the median one's; 0
+    keeps all (choice: a few points deep below the ground become a backdrop that every camera sees through it)."""
+    fill_gaps: bool = True
+    """Also start anchors on ground that cameras see but that holds no sparse points: woods, water, fields (choice)."""
+    stereo: bool = False
+    """Also start anchors where pairs of photographs agree how far the ground is (semi-global matching, before
+    training): where few photographs look, sparse points are few, and what starts at a wrong height stays there
+    (choice)."""
+    bound_sizes: bool = True
+    """No Gaussian may be longer than a quarter of the pictures that train it: none can hang as a veil before a whole
+    view. The unit of an anchor's offsets is bounded with them: its Gaussians stay about it (choice)."""
+    distance: bool = False
+    """Feed the distance between camera and anchor to the decoder too."""
+    appearance: Annotated[int, Range(0, 1024)] = 0
+    """Size of the appearance embedding of each training image (colour only); 0 for none."""
+    colour_start: bool = False
+    """Start the features from the colours of the sparse points instead of zeros."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RateConfig:
+    """Learning rates of Adam; pairs decay exponentially from the first to the second value."""
+
+    offsets: Annotated[tuple[float, float], RATE] = (0.01, 1e-4)
+    """Offsets, in units of the anchor's own scale (choice: not multiplied by the size of the scene)."""
+    features: Annotated[tuple[float, float], RATE] = (0.0075, 0.0075)
+    """Anchor features."""
+    log_scales: Annotated[tuple[float, float], RATE] = (0.007, 0.007)
+    """Logarithms of the anchor scales."""
+    opacity: Annotated[tuple[float, float], RATE] = (0.002, 2e-5)
+    """Opacity decoder."""
+    covariance: Annotated[tuple[float, float], RATE] = (0.004, 0.004)
+    """Covariance decoder."""
+    colour: Annotated[tuple[float, float], RATE] = (0.008, 5e-5)
+    """Colour decoder."""
+    appearance: Annotated[tuple[float, float], RATE] = (0.05, 5e-4)
+    """Appearance embedding."""
+    exposure: Annotated[tuple[float, float], RATE] = (0.001, 1e-4)
+    """Exposure of the photographs, where one is fitted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GrowthConfig:
+    """Where anchors are added and removed (Scaffold-GS, section 4.2 there)."""
+
+    interval: Annotated[int, Range(1, MANY)] = 100
+    """Iterations between two growth decisions."""
+    statistics_from: Annotated[int, Range(0, MANY)] = 500
+    """Iteration from which gradients and opacities are counted."""
+    start: Annotated[int, Range(0, MANY)] = 1500
+    """Iteration from which anchors grow and are pruned."""
+    until: Annotated[float, SHARE] = 0.5
+    """Share of the iterations after which growth and pruning end."""
+    threshold: Annotated[float, Range(0, MANY)] = 2e-4
+    """Mean norm of dL/d(mean) in NDC units above which an offset asks for a new anchor."""
+    levels: Annotated[int, Range(0, 16)] = 3
+    """Number of cell sizes tried; level i has threshold 2^i times and cells 4^i times finer."""
+    coarsest_cell: Annotated[float, Range(0, LARGE, above=True)] = 16.0
+    """Edge of the coarsest cell, in voxels."""
+    gate: Annotated[float, Range(0, MANY)] = 0.4
+    """An offset is judged once it was rendered more often than this share of the interval."""
+    prune_opacity: Annotated[float, Range(0, LARGE)] = 0.005
+    """An anchor goes when the opacity of its Gaussians, summed over them, averaged over the views, is below this."""
+    prune_views: Annotated[float, Range(0, MANY)] = 0.8
+    """... and it was seen more often than this share of the interval."""
+    max_anchors: Annotated[int, Range(0, MANY)] = 0
+    """No growth beyond this many anchors; 0 for no limit. Nothing is removed to keep to it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompensationConfig:
+    """Compensated anchor growth: gradients of places that few cameras see are remembered and added (eqs. 8-10)."""
+
+    enabled: bool = True
+    """Off: plain growth (the paper's "w/o Anchor Generation")."""
+    t_low: Annotated[float, SHARE] = 0.20
+    """T_low: an anchor is of low visibility (the set L) when fewer than this share of the cameras of a growth cycle
+    hold it in their frustum."""
+    t_low_quantile: Annotated[float, Range(0, 1, below=True)] = 0.0
+    """Above 0: T_low is instead this quantile of the shares of the anchors that a camera of the cycle sees (choice: on
+    a large scene nearly every anchor is below a fixed share). Anchors that tie there are in L all or none, whichever
+    comes nearer to the quantile."""
+    beta_g: Annotated[float, Range(0, LARGE)] = 2.0
+    """beta_g: weight of a cycle's mean gradient in the cache g. With the paper's 2, g is a sum that grows to twenty
+    times the gradients it is made of; with 1 - gamma (the preset `laptop`) it is a mean over cycles."""
+    gamma: Annotated[float, SHARE] = 0.9
+    """gamma: decay of the cache g from cycle to cycle."""
+    added_to: Literal["mean", "sum"] = "mean"
+    """What g is added to when anchors grow; the paper says "the raw gradient statistics". `mean`: to the mean gradient,
+    after the division by how often the offset was drawn. `sum`: to the sum before it, so that g is divided too: an
+    offset that was drawn eight times gets an eighth of it."""
+    gate: Literal["scaled", "literal"] = "scaled"
+    """Above how many draws an offset of low visibility is judged: `scaled` takes T_low times the gate of the others, at
+    least 2 (choice: within one cycle it can never pass theirs); `literal` the same as the others."""
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """What training minimises."""
+
+    ssim_weight: Annotated[float, SHARE] = 0.2
+    """Loss = (1 - w) L1 + w (1 - SSIM) + volume."""
+    volume_weight: Annotated[float, Range(0, LARGE)] = 0.01
+    """Weight of the mean product of the three scales of the Gaussians that are drawn."""
+    background: Literal["mean", "black"] = "mean"
+    """Colour behind the scene: the mean of the training photographs (choice: what no photograph shows is then drawn
+    in a colour of the place), or black."""
+    background_noise: Annotated[float, SHARE] = 1.0
+    """So much of the background's colour is drawn anew for every step of training, from the whole RGB cube: ground that
+    were left transparent could not borrow a colour from it (choice; the paper is silent on its background)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Training of the coarse stage."""
+
+    iterations: Annotated[int, Range(0, MANY)] = 100_000
+    """Number of steps, one photograph each; 0 takes sixty for each training photograph, but at least 3000 and at
+    most 30 000 (choice: with few photographs a model soon overfits, many need their time)."""
+    sampling: Literal["even", "shares", "roots"] = "even"
+    """How often each photograph is used. `even`: all alike (the paper). `shares`: every anchor has one vote, divided
+    among the cameras that see it, and a photograph is used in proportion to its votes: most where few others look.
+    `roots`: in proportion to the square root of its votes, which keeps more photographs in use (choice)."""
+    resolutions: Resolutions = ((0.0, 1),)
+    """Resolution schedule: from this share of the iterations on, images are shrunk by this factor."""
+    average: Annotated[float, Range(0, 1, below=True)] = 0.0
+    """The stage ends with the mean of the models of this last share of its iterations, after growth and at full size; 0
+    for the very last model (choice)."""
+    adam: Literal["visible", "dense"] = "visible"
+    """Which anchors a step moves, here and in blocks. `visible`: those that its photograph shows; the others keep
+    parameters and moments (choice). `dense`: all of them, as in Scaffold-GS and 3DGS: what is not shown goes on along
+    its moments, and the bias correction counts the steps of the stage."""
+    seed: Annotated[int, Range(0, 2**32 - 1)] = 0
+    """Everything random follows from it: on the CPU the same seed gives the same bits."""
+    anchors: AnchorConfig = field(default_factory=AnchorConfig)
+    """The anchor model."""
+    rates: RateConfig = field(default_factory=RateConfig)
+    """Learning rates."""
+    early: Annotated[float, Range(1, 1000)] = 1.0
+    """Up to how many times faster an anchor moves while it has had few updates: after u of them, by the least of this
+    and 1 / sqrt(1 - 0.999^u), which is 3 after 118 updates and 1.3 after 900 (choice: in short trainings an anchor is
+    seen a few hundred times; 1 is Adam as it is)."""
+    growth: GrowthConfig = field(default_factory=GrowthConfig)
+    """Growth and pruning of anchors."""
+    loss: LossConfig = field(default_factory=LossConfig)
+    """The loss."""
+    exposure: bool = False
+    """Fit a small colour model to each photograph: an affine map whose mean over all photographs is neutral. The scene
+    is drawn in neutral colours, and compared with a test photograph in the exposure that the training photographs
+    taken before and after it and what its camera meters foretell (no pixel of it is used). Blocks take it over as the
+    coarse stage leaves it (choice)."""
+    exposure_spread: Annotated[float, Range(0, 1)] = 0.0
+    """Fit exposures only where photographs of the same places differ in brightness by at least this share of it, by the
+    colours of the sparse points that several show: where photographs have one exposure, fitting some gains nothing and
+    may cost (choice). At 0, and in a capture that does not say which photograph shows which point, they are always
+    fitted."""
+    compensation: CompensationConfig = field(default_factory=lambda: CompensationConfig(enabled=False))
+    """Compensated growth already in this stage (choice: only blocks have it; the ablation without blocks needs it)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartitionConfig:
+    """How the scene is cut into blocks (eq. 5 and what follows it)."""
+
+    strategy: PartitionStrategy = "visibility"
+    """`visibility`: by place and visibility (the paper). The others are the partitions of published methods, to compare
+    with; each cuts and chooses cameras in its own way, whatever the settings of the assignment say."""
+    blocks: Annotated[int | Literal["auto"], Range(1, 10_000)] = 8
+    """K, the number of blocks; 1 is the whole scene (the paper's "w/o Blocking"); `auto` takes as few as
+    --block-memory-gb allows: give more to train them at once on several machines."""
+    lambda_vis: Annotated[float, Range(0, 1000)] = 1.0
+    """lambda_vis: weight of visibility beside place in the clustering (paper: 0.7 to 1.3); 0 is purely spatial."""
+    balanced: bool = False
+    """Blocks of about equally many anchors (choice; plain k-means leaves them several times apart)."""
+    expansion: Annotated[float, Range(0, 1000)] = 0.4
+    """A block is widened by this share of the radius of a disc of its area. While ring and context are frozen (the
+    default) that decides what is drawn when cameras are assigned and nothing else: no anchor beyond the core is
+    trained, however wide the ring is."""
+    block_memory_gb: Annotated[float, Range(0, LARGE, above=True)] = 4.0
+    """Memory that an average block may take in training, by estimate and beside the photographs that are kept; only
+    `--blocks auto` looks at it. Larger blocks take more, and so do all where more blocks would have too few photographs
+    (fifty) each."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssignmentConfig:
+    """Which cameras train which block (eqs. 6-7)."""
+
+    mode: Literal["coverage", "literal", "leave_one_out", "frustum"] = "coverage"
+    """`coverage`: share of the drawn pixels that the block alone draws alike (choice). `literal`: eq. 7 as printed,
+    where pixels empty in both renders count too. `leave_one_out`: 1 - SSIM of the scene without the block.
+    `frustum`: share of the block's anchors that the camera holds (needs no renders)."""
+    tau: Annotated[float, Range(0, 1, above=True)] = 0.05
+    """tau: pixels differ when the mean absolute difference of their channels is above this (choice; not in the
+    paper)."""
+    threshold: Annotated[float, SHARE] = 0.45
+    """Share of pixels (or, for `frustum`, of anchors) above which a camera is assigned."""
+    threshold_leave_one_out: Annotated[float, SHARE] = 0.05
+    """The same for `leave_one_out` (peers: 0.05 to 0.12)."""
+    best_block: bool = True
+    """Every camera also joins its best block (choice: else one that is above the threshold nowhere trains nothing)."""
+    min_cameras: Annotated[int, Range(0, MANY)] = 100
+    """Each block is topped up with the cameras that show it best to at least this many, as far as any show it (choice);
+    0 leaves it as it is."""
+    longest_side_px: Annotated[int, Range(16, 16_384)] = 320
+    """Size at which the renders are compared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlockConfig:
+    """Training of each block from the coarse anchors of its place. Loss and seed are those of the coarse stage."""
+
+    iterations: Annotated[int, Range(0, MANY)] = 50_000
+    """Steps for each block; 0 takes fifteen for each of its photographs, at least 500 and at most 15 000 (choice)."""
+    scale_iterations: Annotated[float, Range(0, 1000, above=True)] = 1.0
+    """Factor on the steps and on the start of statistics and growth, for scenes smaller than the paper's."""
+    sampling: Literal["even", "shares", "roots"] = "even"
+    """As in the coarse stage, by the votes of the anchors that the block moves: photographs that show little of the
+    block are used little."""
+    resolutions: Resolutions = ((0.0, 1),)
+    """Resolution schedule, as in the coarse stage."""
+    average: Annotated[float, Range(0, 1, below=True)] = 0.0
+    """As in the coarse stage."""
+    crop: Literal["off", "steps", "pixels"] = "off"
+    """Draw only the part of each photograph in which the block has a share, and all of it in every fourth step.
+    `steps`: each step costs less; `pixels`: as many pixels are drawn as without, in up to four times more steps, so
+    that each place of the scene is drawn more often: `iterations` then counts photographs, whatever their size
+    (choice)."""
+    offset_rate: Annotated[float, FACTOR] = 1.0
+    """The rates of the coarse stage start again, those of offsets times this (the paper prints no rates for blocks;
+    CityGaussian fine-tunes with 0.4)."""
+    scale_rate: Annotated[float, FACTOR] = 1.0
+    """... and those of log-scales times this (CityGaussian: 0.8)."""
+    feature_rate: Annotated[float, FACTOR] = 1.0
+    """... and those of features times this."""
+    early: Annotated[float, Range(1, 1000)] = 1.0
+    """As `early` of the coarse stage, for the block's own updates: its anchors begin trained."""
+    background_noise: Annotated[float, SHARE] = 1.0
+    """As in the loss of the coarse stage: without, blocks make ground transparent that was opaque (choice)."""
+    decoder: Literal["frozen", "own"] = "frozen"
+    """`frozen`: as the coarse stage left it (the paper). `own`: each block trains its copy, which its anchors keep in
+    the merged scene (choice: with a frozen decoder blocks overfit sooner where few cameras see them)."""
+    ring: Literal["frozen", "ramp", "free"] = "frozen"
+    """Anchors between core and widened boundary: `frozen` are drawn and never move (choice for "gradients at the
+    boundary are suppressed"); `ramp`: their learning rate falls linearly to zero at the widened boundary; `free`
+    move as those of the core."""
+    context: bool = True
+    """Draw the anchors outside the block too, frozen (choice). Off: what the block's cameras see there is empty."""
+    growth: GrowthConfig = field(default_factory=GrowthConfig)
+    """Growth and pruning of anchors, by default as in the coarse stage: the paper says nothing else."""
+    max_anchors_total: Annotated[int, Range(0, MANY)] = 0
+    """No growth beyond this many anchors of all blocks together; 0 for no limit. Each block has a share in proportion
+    to the coarse anchors it owns. A block that starts with more grows none, and none of its anchors is removed for
+    it: the merged scene has at most this many, or as many as the coarse model."""
+    compensation: CompensationConfig = field(default_factory=CompensationConfig)
+    """Compensated growth (eqs. 8-10)."""
+
+
+@dataclass(frozen=True)
+class MergeConfig:
+    """How trained blocks become one scene."""
+
+    rule: Literal["owner", "best_seen"] = "owner"
+    """Whose anchors stay at a place: `owner`: those of the block whose core it is, or is nearest. `best_seen`: those of
+    the block whose cameras see it most, among the blocks that reach it (needs --block.ring ramp or free)."""
+
+
+@dataclass(frozen=True)
+class MethodConfig:
+    """Everything that the result of a run depends on, but for the capture."""
+
+    training: Annotated[TrainConfig, Named("")] = field(default_factory=TrainConfig)
+    """The coarse stage."""
+    partition: Annotated[PartitionConfig, Named("")] = field(default_factory=PartitionConfig)
+    """The cut into blocks."""
+    assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
+    """Cameras of each block."""
+    block: BlockConfig = field(default_factory=BlockConfig)
+    """Block training."""
+    merge: MergeConfig = field(default_factory=MergeConfig)
+    """The merge."""
+
+
+#: How `iterations = 0` follows from the number of training photographs: steps for each, least, most.
+COARSE_STEPS, BLOCK_STEPS = (60, 3_000, 30_000), (15, 500, 15_000)
+
+
+def with_iterations(config: TrainConfig, training_views: int) -> TrainConfig:
+    """The settings with `iterations = 0` replaced by what the number of training photographs asks for."""
+    return replace(config, iterations=config.iterations or _steps(training_views, *COARSE_STEPS))
+
+
+def block_limit(config: BlockConfig, anchors: int, of: int) -> int:
+    """Up to how many anchors a block may grow that owns so many of all (`of`) coarse anchors; 0 for no limit.
+
+    Shares are rounded down, so that together they are never more than the total. At least 1: no anchor of its own and
+    no limit are different things.
+    """
+    share = max(1, config.max_anchors_total * anchors // of) if config.max_anchors_total else 0
+    limits = [limit for limit in (config.growth.max_anchors, share) if limit]
+    return min(limits, default=0)
+
+
+def block_training(config: MethodConfig, views: int) -> TrainConfig:
+    """The settings of the training loop for one block with so many photographs."""
+    block, scale = config.block, config.block.scale_iterations
+    rates = config.training.rates
+    return replace(
+        config.training,
+        iterations=max(1, round(scale * (block.iterations or _steps(views, *BLOCK_STEPS)))),
+        sampling=block.sampling,
+        average=block.average,
+        early=block.early,
+        resolutions=block.resolutions,
+        rates=replace(
+            rates,
+            offsets=(block.offset_rate * rates.offsets[0], block.offset_rate * rates.offsets[1]),
+            log_scales=(block.scale_rate * rates.log_scales[0], block.scale_rate * rates.log_scales[1]),
+            features=(block.feature_rate * rates.features[0], block.feature_rate * rates.features[1]),
+        ),
+        growth=replace(
+            block.growth,
+            statistics_from=round(scale * block.growth.statistics_from),
+            start=round(scale * block.growth.start),
+        ),
+        loss=replace(config.training.loss, background_noise=block.background_noise),
+        compensation=block.compensation,
+    )
+
+
+def _steps(views: int, per_view: int, least: int, most: int) -> int:
+    return min(max(per_view * views, least), most)

@@ -1,0 +1,75 @@
+"""Settings by name.
+
+`paper`     the paper's numbers. Where it is silent, or a reading of it leaves a scene that cannot be used, our choices
+            stay: gaps are filled and outliers start no anchor; the background is the mean colour, and in training
+            random ones, so that ground becomes opaque; Gaussians are bounded in size and stay about their anchors;
+            cameras are assigned by `coverage`, join their best block, and blocks are topped up; what lies around a
+            block is drawn; the gate of compensated growth is lower where few cameras look, and g is added to means;
+            only anchors that a photograph shows are moved.
+`literal`   none of those. What remains ours has no reading without a choice: the threshold tau, the number of clusters'
+            starts, the width of a ring, who owns a place, how volumes are weighted in scenes of another scale.
+`laptop`    a good result in minutes on a CPU; reports/choices.md says what each of its departures brings. Growth in
+            blocks is plain: compensated growth (`--block.compensation.enabled`) lost where few cameras look, and places
+            start by stereo there instead.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from vdgs.config.method import (
+    AnchorConfig,
+    AssignmentConfig,
+    BlockConfig,
+    CompensationConfig,
+    GrowthConfig,
+    LossConfig,
+    MethodConfig,
+    PartitionConfig,
+    RateConfig,
+    TrainConfig,
+)
+
+PresetName = Literal["paper", "literal", "laptop"]
+
+PRESETS: dict[str, MethodConfig] = {
+    "paper": MethodConfig(),
+    "literal": MethodConfig(
+        training=TrainConfig(
+            adam="dense",
+            anchors=AnchorConfig(outlier_distance=0.0, fill_gaps=False, bound_sizes=False),
+            loss=LossConfig(background="black", background_noise=0.0),
+        ),
+        assignment=AssignmentConfig(mode="literal", best_block=False, min_cameras=0),
+        block=BlockConfig(
+            background_noise=0.0, context=False, compensation=CompensationConfig(gate="literal", added_to="sum")
+        ),
+    ),
+    "laptop": MethodConfig(
+        training=TrainConfig(
+            iterations=0,
+            anchors=AnchorConfig(stereo=True),
+            exposure=True,
+            exposure_spread=0.015,
+            resolutions=((0.0, 4), (0.1, 2), (0.4, 1)),
+            rates=RateConfig(offsets=(0.02, 2e-4), features=(0.015, 0.015), log_scales=(0.014, 0.014)),
+            early=3.0,
+            growth=GrowthConfig(statistics_from=300, start=500, until=0.6, threshold=1e-4),
+        ),
+        partition=PartitionConfig(blocks="auto"),
+        assignment=AssignmentConfig(threshold=0.1),
+        block=BlockConfig(
+            iterations=0,
+            sampling="roots",
+            resolutions=((0.0, 1),),
+            average=0.5,
+            crop="pixels",
+            offset_rate=2.0,
+            scale_rate=2.0,
+            feature_rate=2.0,
+            decoder="own",
+            growth=GrowthConfig(statistics_from=0, start=100, threshold=1e-4),
+            compensation=CompensationConfig(enabled=False, t_low_quantile=0.25, beta_g=0.1),
+        ),
+    ),
+}

@@ -1,0 +1,45 @@
+"""What may be wrong with settings, said before any work starts. Only the standard library is imported."""
+
+from __future__ import annotations
+
+from vdgs.config.method import GrowthConfig, MethodConfig, Resolutions
+from vdgs.config.ranges import problems
+
+
+def validate(config: MethodConfig) -> list[str]:
+    """What is wrong with the settings, one sentence each; empty if nothing is."""
+    found = problems(config)
+    training, block = config.training, config.block
+    found += _validate_schedule(training.average, training.growth, training.resolutions)
+    found += [f"block.{each}" for each in _validate_schedule(block.average, block.growth, block.resolutions)]
+    if block.ring == "ramp" and block.decoder == "own":
+        found.append(
+            "block.ring ramp needs --block.decoder frozen: a decoder that moves changes anchors that should stay"
+        )
+    if config.merge.rule == "best_seen" and block.ring == "frozen":
+        found.append("merge.rule best_seen needs --block.ring ramp or free: a frozen ring has nothing to offer")
+    return found
+
+
+def _validate_schedule(average: float, growth: GrowthConfig, resolutions: Resolutions) -> list[str]:
+    """What does not fit together in the course of a training."""
+    return _validate_resolutions(resolutions) + _validate_average(average, growth, resolutions)
+
+
+def _validate_resolutions(resolutions: Resolutions) -> list[str]:
+    found = []
+    if not resolutions or resolutions[0][0] != 0.0:
+        found.append("resolutions must begin at share 0.0")
+    if [share for share, _ in resolutions] != sorted({share for share, _ in resolutions}):
+        found.append("resolutions: shares must ascend")
+    return found
+
+
+def _validate_average(average: float, growth: GrowthConfig, resolutions: Resolutions) -> list[str]:
+    if not 0 < average < 1:
+        return []
+    if growth.until >= 1:
+        return ["average needs growth and pruning to end: growth.until must be below 1"]
+    if resolutions and resolutions[-1][0] > max(1 - average, growth.until):
+        return ["average would mix models of several image sizes: let the last of resolutions begin before it"]
+    return []

@@ -1,0 +1,102 @@
+"""What runs on a Ray node in the place of a driver: it keeps one command and tells how that ends.
+
+It is a detached actor, known by name, so that a driver that was started again finds it. Its command ends with it
+(`parent`). When nobody comes for the end, it goes: the command can be repeated.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from vdgs.distributed.engine import Begun, End
+from vdgs.distributed.node_check import examine
+from vdgs.distributed.task_process import Process, out_of_memory_kills
+from vdgs.system.documents import FitnessQuestion
+
+#: Seconds that the end of a command waits for a driver.
+COLLECT_SECONDS = 300.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """What a keeper is to run, in plain values."""
+
+    command: tuple[str, ...]
+    output: str
+    environment: Mapping[str, str]
+    attempt: int
+    python: str
+    """The driver's interpreter; a node takes its own instead."""
+    question: FitnessQuestion
+    """What the node must see (`fitness`): nodes join late."""
+
+
+@dataclass(frozen=True)
+class Unfit:
+    """The node cannot work on the run."""
+
+    node: str
+    identity: str
+    """What Ray calls the node."""
+    why: str
+
+
+class Keeper:
+    """Runs one command. Its methods are called from several threads of the actor."""
+
+    def __init__(self, order: Order, collect_seconds: float = COLLECT_SECONDS):
+        self._order, self._collect_seconds = order, collect_seconds
+        self._process: Process | None = None
+        self._asked = False
+        self._lock = threading.Lock()
+        self._memory_kills = out_of_memory_kills()
+
+    def begin(self) -> Begun | Unfit:
+        """Start the command, unless it was started; where it runs. Raises OSError as `Process`."""
+        with self._lock:
+            answer = examine(self._order.question)
+            if answer["problems"]:
+                return Unfit(answer["node"], _identity(), answer["problems"][0])
+            if self._process is None:
+                order = self._order
+                command = [sys.executable if order.command[0] == order.python else order.command[0], *order.command[1:]]
+                self._process = Process(command, Path(order.output), order.environment, order.attempt)
+            return Begun(self._process.output_from, answer["node"])
+
+    def end(self) -> End | None:
+        """Wait for the end of the command; None if it was never started."""
+        with self._lock:
+            process = self._process
+        if process is None:
+            return None
+        code = process.wait()
+        threading.Thread(target=self._go_unless_collected, daemon=True).start()
+        killed = code == -signal.SIGKILL and out_of_memory_kills() > self._memory_kills
+        return End(code, out_of_memory=killed)
+
+    def stop(self) -> None:
+        """Ask the command to save and end, once."""
+        if self._process is not None and not self._asked:
+            self._asked = True
+            self._process.terminate()
+
+    def kill(self) -> None:
+        """End the command at once."""
+        if self._process is not None:
+            self._process.kill()
+
+    def _go_unless_collected(self) -> None:
+        threading.Event().wait(self._collect_seconds)
+        os._exit(0)
+
+
+def _identity() -> str:
+    import ray
+
+    return str(ray.get_runtime_context().get_node_id())

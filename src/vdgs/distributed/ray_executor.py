@@ -1,0 +1,361 @@
+"""Tasks on a Ray cluster: Ray finds each a node with room for what it needs, a keeper there runs it (`keeper`).
+
+Only paths travel: state is in files that all nodes see. What Ray loses is begun again by the crew, not by Ray, so that
+attempts are counted and worded as everywhere.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import secrets
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from vdgs.distributed.engine import STOPPED, Attempt, Begun, End
+from vdgs.distributed.executor import Listener, Outcome, Task
+from vdgs.distributed.node_check import Question
+from vdgs.distributed.parent import PARENT
+from vdgs.distributed.ray_actor import Keeper, Order, Unfit
+from vdgs.distributed.scheduler import Policy, run_crew
+from vdgs.errors import VdgsError
+from vdgs.system.documents import FitnessAnswer, FitnessQuestion
+
+NAMESPACE = "vdgs"
+#: Memory for Ray's own objects, of which there are none: the least that it takes.
+OBJECT_BYTES = 80 << 20
+#: Seconds that a node gets to answer before anything starts.
+ANSWER_SECONDS = 300.0
+#: How often a node that does not answer any more is asked again, where Ray says that it may come back.
+UNAVAILABLE = 20
+
+
+@dataclass(frozen=True)
+class Node:
+    """What a node of a cluster has."""
+
+    identity: str
+    name: str
+    processors: int
+    memory_bytes: int
+    gpus: float
+
+
+@contextmanager
+def connected(address: str | None) -> Iterator[None]:
+    """Be a driver of a cluster: of the one at `address`, else that of RAY_ADDRESS, else a Ray of this machine alone.
+
+    Raises VdgsError where there is no Ray, or none that answers.
+    """
+    where = _place(address)
+    variables, own = {"RAY_USAGE_STATS_ENABLED": "0"}, dict[str, Any]()
+    if where == "local":
+        own = {"include_dashboard": False, "object_store_memory": OBJECT_BYTES}
+        variables["RAY_worker_niceness"] = "0"  # as tasks have it that are processes of this machine
+        # Ray listens on all addresses: let in who has the token, which is nobody else.
+        variables |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": _token()}
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        with _driver(where, own):
+            yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@cache
+def _token() -> str:
+    """What opens the Rays of this process: the same for all, for Ray reads it once in the life of a process."""
+    return secrets.token_hex(32)
+
+
+def refuse_unreachable(address: str | None) -> None:
+    """Raises VdgsError where there is no Ray, or none that answers at that address. None is started for it."""
+    if _place(address) == "local":
+        _refuse_without_ray()
+    else:
+        with connected(address):
+            pass
+
+
+def _place(address: str | None) -> str:
+    return address or os.environ.get("RAY_ADDRESS") or "local"
+
+
+def _refuse_without_ray() -> None:
+    if importlib.util.find_spec("ray") is None:
+        raise VdgsError('Ray is not installed: pip install "vdgs[ray]"')
+
+
+@contextmanager
+def _driver(where: str, own: Mapping[str, Any]) -> Iterator[None]:
+    _refuse_without_ray()
+    import ray
+
+    with _handlers_kept():
+        try:
+            ray.init(address=where, namespace=NAMESPACE, log_to_driver=False, logging_level="error", **own)
+        except (ConnectionError, RuntimeError, ValueError, OSError, ray.exceptions.RayError) as error:
+            said = str(error).strip().splitlines() or [type(error).__name__]
+            raise VdgsError(
+                f"{where}: no Ray cluster that can be used ({said[0]}). See `ray status` there; --address auto on one "
+                "of its machines, the same versions of Ray and Python on all."
+            ) from error
+    try:
+        yield
+    finally:
+        with _handlers_kept():
+            ray.shutdown()
+
+
+@contextmanager
+def _handlers_kept() -> Iterator[None]:
+    """Ray sets handlers of signals; ours are put back."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def nodes() -> list[Node]:
+    """The nodes that are there now and have processors."""
+    import ray
+
+    found = []
+    for each in ray.nodes():
+        has = each["Resources"]
+        if each["Alive"] and has.get("CPU", 0) >= 1:
+            found.append(
+                Node(
+                    each["NodeID"], each["NodeManagerHostname"], int(has["CPU"]), int(has.get("memory", 0)),
+                    float(has.get("GPU", 0)),
+                )
+            )  # fmt: skip
+    return found
+
+
+def ask_nodes(question: Question, there: Sequence[Node]) -> list[FitnessAnswer]:
+    """Every node's answer (`fitness.examine`), but for nodes that are gone meanwhile.
+
+    Raises VdgsError, naming nodes and what is wrong, if one is unfit.
+    """
+    import ray
+
+    with question.asked() as plain:
+        asked = {node: _visit(node.identity, plain) for node in there}
+        answers, problems = list[FitnessAnswer](), list[str]()
+        for node, answer in asked.items():
+            try:
+                answers.append(ray.get(answer, timeout=ANSWER_SECONDS))
+            except ray.exceptions.RayError as error:
+                if node.identity in {each.identity for each in nodes()}:
+                    problems.append(f"node {node.name}: does not answer ({_last_line(error)})")
+                continue
+            problems += [f"node {answers[-1]['node']}: {each}" for each in answers[-1]["problems"]]
+    if problems:
+        raise VdgsError("These nodes cannot work on the run:\n  " + "\n  ".join(dict.fromkeys(problems)) + ".")
+    return answers
+
+
+def _visit(node: str, question: FitnessQuestion) -> Any:
+    """Ask one node. The function travels whole, for a node may have no vdgs."""
+    import ray
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    def look() -> FitnessAnswer:
+        import socket
+
+        try:
+            from vdgs.distributed.node_check import examine
+        except ImportError as error:
+            return {"node": socket.gethostname(), "processor": "", "problems": [f"vdgs is not installed ({error})"]}
+        return examine(question)
+
+    there = NodeAffinitySchedulingStrategy(node, soft=False)
+    return ray.remote(look).options(num_cpus=0, max_retries=0, scheduling_strategy=there).remote()
+
+
+@dataclass(frozen=True)
+class RayExecutor(Policy):
+    """Runs tasks on the cluster that this process is connected to."""
+
+    question: Question | None = None
+    """What a node must see; asked again where each task starts, for nodes may join late."""
+
+    def run(self, tasks: Sequence[Task], listener: Listener) -> list[Outcome]:
+        """As `Executor.run`."""
+        assert self.question is not None
+        return run_crew(tasks, _Cluster(self.question), self, listener)
+
+
+class _Cluster:
+    """The engine."""
+
+    def __init__(self, question: Question):
+        self._question = question.plain()
+        self._run = hashlib.sha256(str(question.folder).encode()).hexdigest()[:12]
+        #: Nodes that were found to be unfit.
+        self.unfit = set[str]()
+        self._keepers = _keepers()
+
+    @property
+    def most_memory(self) -> int:
+        return max((node.memory_bytes for node in nodes()), default=0)
+
+    def start(self, tasks: Sequence[tuple[Task, int]]) -> list[Attempt | OSError]:
+        return [self._start(task, attempt) for task, attempt in tasks]
+
+    def _start(self, task: Task, attempt: int) -> Attempt:
+        import ray
+
+        order = Order(
+            command=tuple(task.command), output=str(task.output), environment=_environment() | dict(task.environment),
+            attempt=attempt, python=sys.executable, question=self._question,
+        )  # fmt: skip
+        needs = task.needs
+        options: dict[str, Any] = {"num_cpus": needs.processors, "num_gpus": needs.gpus}
+        if needs.memory_bytes:
+            options["memory"] = needs.memory_bytes
+        if self.unfit and any(node.identity not in self.unfit for node in nodes()):
+            options["label_selector"] = {"ray.io/node-id": f"!in({','.join(sorted(self.unfit))})"}
+        actor = ray.remote(Keeper).options(
+            name=self._name(task, attempt), namespace=NAMESPACE, lifetime="detached", max_restarts=0, max_concurrency=8,
+            **options,
+        )  # fmt: skip
+        return _RayAttempt(actor.remote(order), self)
+
+    def find(self, task: Task) -> Attempt | None:
+        import ray
+
+        mine = [name for name in self._keepers if name.startswith(self._name(task, ""))]
+        with suppress(ValueError, IndexError):  # it may go just now
+            return _RayAttempt(ray.get_actor(mine[-1], NAMESPACE), self)
+        return None
+
+    def refresh(self) -> None:
+        """`look` asks Ray itself."""
+
+    def _name(self, task: Task, attempt: int | str) -> str:
+        """Of a keeper; another for each attempt, for the name of a dead one is free only after a while."""
+        unique = f"{attempt}-{secrets.token_hex(4)}" if attempt else ""
+        return f"{self._run}/{task.name}/{unique}"
+
+
+class _RayAttempt:
+    def __init__(self, keeper: Any, cluster: _Cluster):
+        self._keeper, self._cluster = keeper, cluster
+        self._begin = keeper.begin.remote()
+        self._end: Any = None
+        self._over: End | None = None
+        self._unavailable = 0
+        self.begun: Begun | None = None
+
+    def look(self) -> End | None:
+        import ray
+
+        if self._over is None:
+            try:
+                if self._end is None and _is_there(self._begin):
+                    self._began(ray.get(self._begin))
+                if self._end is not None and _is_there(self._end):
+                    self._over = ray.get(self._end)
+            except ray.exceptions.ActorUnavailableError as error:
+                self._ask_again(error)
+            except ray.exceptions.RayTaskError as error:  # there is no such command there, or no space
+                self._over = End(None, f"an error before its first line: {_last_line(error.cause or error)}")
+            except ray.exceptions.RayError as error:
+                self._over = End(None, self._how(error), out_of_memory=_out_of_memory(error))
+            if self._over is not None:
+                self._dismiss()
+        return self._over
+
+    def ask_to_stop(self) -> None:
+        if self.look() is None and self.begun is None and not _is_there(self._begin):
+            self._over = End(STOPPED)
+            self._dismiss()
+        elif self._over is None:
+            self._keeper.stop.remote()
+
+    def kill(self) -> None:
+        if self._over is None:
+            self._keeper.kill.remote()
+
+    def _began(self, answer: Begun | Unfit) -> None:
+        if isinstance(answer, Unfit):
+            self._cluster.unfit.add(answer.identity)
+            self._over = End(None, f"a node that cannot work on the run, {answer.node}: {answer.why}")
+            return
+        self.begun, self._end = answer, self._keeper.end.remote()
+
+    def _ask_again(self, error: Exception) -> None:
+        """The network to the keeper's node failed, and may work again."""
+        self._unavailable += 1
+        if self._unavailable > UNAVAILABLE:
+            self._over = End(None, self._how(error))
+        elif self._end is None:
+            self._begin = self._keeper.begin.remote()
+        else:
+            self._end = self._keeper.end.remote()
+
+    def _how(self, error: Exception) -> str:
+        text = str(error)
+        where = f" {self.begun.where}" if self.begun is not None else ""
+        if _out_of_memory(error):
+            return f"Ray, to free memory on its node{where}"
+        if "node has died" in text or "node was terminated" in text or "node died" in text:
+            return f"the loss of its node{where}"
+        if self.begun is None:
+            return f"an error before its first line: {_last_line(error)}"
+        return f"the loss of its worker on node{where}"
+
+    def _dismiss(self) -> None:
+        import ray
+
+        with suppress(ray.exceptions.RayError, ValueError):
+            ray.kill(self._keeper)
+
+
+def _keepers() -> list[str]:
+    """Names of all keepers on the cluster that live."""
+    import ray
+
+    named = ray.util.list_named_actors(all_namespaces=True)
+    return sorted(each["name"] for each in named if each["namespace"] == NAMESPACE)
+
+
+def _environment() -> dict[str, str]:
+    """Variables of this process that decide how vdgs computes."""
+    return {name: value for name, value in os.environ.items() if name.startswith("VDGS_") and name != PARENT}
+
+
+def _is_there(answer: Any) -> bool:
+    import ray
+
+    return bool(ray.wait([answer], timeout=0)[0])
+
+
+def _out_of_memory(error: Exception) -> bool:
+    import ray
+
+    return isinstance(error, ray.exceptions.OutOfMemoryError) or "running low on memory" in str(error)
+
+
+def _last_line(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1] if lines else type(error).__name__

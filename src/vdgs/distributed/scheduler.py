@@ -1,0 +1,303 @@
+"""The tasks of one call, whatever engine begins them: which wait, which run, which are tried again, how each ended.
+
+All that a person sees of a failure is worded here, so that every engine says it in the same words.
+"""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import time
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from vdgs.distributed.engine import DONE, EXPLAINED, STOPPED, Attempt, End, Engine
+from vdgs.distributed.executor import EndState, Listener, Outcome, Task
+from vdgs.distributed.output import explanation, last_lines
+from vdgs.errors import VdgsError
+from vdgs.runs.stage_folder import StageFolder
+from vdgs.system.stop_signals import stop_requests
+from vdgs.system.units import data_size
+
+#: Seconds that tasks get to save when this process fails itself, and between two looks at them meanwhile.
+GRACE_SECONDS, GRACE_POLL_SECONDS = 120.0, 0.05
+#: Free bytes below which a silent failure is put down to a full disk.
+FULL_BYTES = 1 << 20
+#: What a task asks for after it was ended for want of memory, times what it asked for before (choice).
+MORE_MEMORY = 1.5
+
+
+@dataclass(frozen=True)
+class Policy:
+    """How many tasks run side by side, how often one that crashes is started again, and how often all are looked at."""
+
+    at_once: int
+    retries: int = 2
+    poll_seconds: float = 0.5
+    patience_seconds: float = 60.0
+    """How long to wait for a process that still holds a task's folder, such as one whose driver was killed and that
+    saves."""
+
+    def __post_init__(self) -> None:
+        if self.at_once < 1 or self.retries < 0:
+            raise ValueError(f"at_once is {self.at_once} and retries is {self.retries}: at least 1 and 0 are needed")
+
+
+def run_crew(tasks: Sequence[Task], engine: Engine, policy: Policy, listener: Listener) -> list[Outcome]:
+    """As `Executor.run`, with the attempts of an engine. A second Ctrl-C kills those that still run."""
+    with stop_requests(hangup=True) as asked:
+        crew = _Crew([_Work(task) for task in tasks], engine, policy, listener)
+        try:
+            while not crew.step(asked):
+                time.sleep(policy.poll_seconds)
+        finally:
+            crew.abandon()
+    return [work.outcome for work in crew.works if work.outcome is not None]
+
+
+class _Work:
+    """A task and the attempt that is made at it."""
+
+    def __init__(self, task: Task):
+        self.task = task
+        self.attempt: Attempt | None = None
+        self.outcome: Outcome | None = None
+        self.attempts = 0
+        self.asked_to_stop = False
+        #: Whether it was told that this attempt began, when it did, and where its output begins.
+        self.told, self.began, self.output_from = False, 0.0, 0
+        #: Whether an earlier driver began it.
+        self.found = False
+        #: Since when another process is seen to work on it.
+        self.held_since: float | None = None
+        #: How far it was when its time was last up.
+        self.progress = -1
+
+    def ask_to_stop(self) -> None:
+        if self.attempt is not None and not self.asked_to_stop:
+            self.asked_to_stop = True
+            self.attempt.ask_to_stop()
+
+
+class _Crew:
+    """The tasks of one call."""
+
+    def __init__(self, works: list[_Work], engine: Engine, policy: Policy, listener: Listener):
+        self.works, self._engine, self._listener = works, engine, listener
+        self._at_once, self._retries, self._patience = policy.at_once, policy.retries, policy.patience_seconds
+        self._by_name = {work.task.name: work for work in works}
+        self._waiting = deque(works)
+        self._stopping = False
+        for work in works:
+            self._take_over(work)
+
+    @property
+    def _running(self) -> list[_Work]:
+        return [work for work in self.works if work.attempt is not None]
+
+    def step(self, asked: Sequence[int]) -> bool:
+        """Judge what ended, pass on what was `asked` (signals), start what there is room for. True when all ended."""
+        if self._running:
+            self._engine.refresh()
+        for work in self._running:
+            self._look(work)
+        if asked:
+            self._stop(kill=signal.SIGINT in asked[1:])
+        self._start_ready()
+        self._listener.tick()
+        return not self._waiting and not self._running
+
+    def abandon(self) -> None:
+        """Leave no process behind when this one fails itself."""
+        for work in self._running:
+            work.ask_to_stop()
+        end = time.monotonic() + GRACE_SECONDS
+        left = self._running
+        while left and time.monotonic() < end:
+            self._engine.refresh()
+            left = [work for work in left if work.attempt is not None and work.attempt.look() is None]
+            time.sleep(GRACE_POLL_SECONDS if left else 0)
+        for work in left:
+            assert work.attempt is not None
+            work.attempt.kill()
+
+    def _take_over(self, work: _Work) -> None:
+        """Watch what an earlier driver began, if it still goes on."""
+        attempt = self._engine.find(work.task)
+        if attempt is not None:
+            self._waiting.remove(work)
+            work.attempt, work.found, work.attempts = attempt, True, 1
+
+    def _look(self, work: _Work) -> None:
+        assert work.attempt is not None
+        end = work.attempt.look()
+        self._tell_begun(work)
+        if end is not None:
+            work.attempt = None
+            self._judge(work, end)
+
+    def _tell_begun(self, work: _Work) -> None:
+        """Pass on that an attempt has found a place, or lost it again."""
+        assert work.attempt is not None
+        begun = work.attempt.begun
+        if begun is not None and not work.told:
+            work.told, work.began, work.output_from = True, time.monotonic(), begun.output_from
+            if begun.where:
+                self._listener.placed(work.task, begun.where, work.found)
+            self._listener.started(work.task, work.attempts)
+        elif begun is None and work.told:
+            work.told = False
+            self._listener.paused(work.task, "")
+
+    def _start_ready(self) -> None:
+        ready = list[_Work]()
+        for work in list(self._waiting):
+            before = self._by_name.get(work.task.after) if work.task.after is not None else None
+            end = before.outcome if before is not None else None
+            room = len(self._running) + len(ready) < self._at_once
+            if end is not None and end.state != "done":
+                self._waiting.remove(work)
+                self._start(ready)
+                self._end(work, end.state, f"{end.name} {end.state}: {end.why}")
+            elif room and (before is None or end is not None) and not self._held(work):
+                self._waiting.remove(work)
+                ready.append(work)
+        self._start(ready)
+
+    def _start(self, ready: list[_Work]) -> None:
+        """Begin an attempt at each; the list is empty then."""
+        works = list(ready)
+        ready.clear()
+        for work in works:
+            work.attempts += 1
+            work.told = work.found = work.asked_to_stop = False
+        attempts = self._engine.start([(work.task, work.attempts) for work in works]) if works else ()
+        for work, attempt in zip(works, attempts, strict=True):
+            if isinstance(attempt, OSError):
+                self._end(work, "failed", _refused(work.task, attempt))
+            else:
+                work.attempt = attempt
+                self._tell_begun(work)
+
+    def _held(self, work: _Work) -> bool:
+        """Another process still works on the task, and patience is not at an end (then the task says so itself)."""
+        if work.task.folder is None or not StageFolder(work.task.folder).is_held():
+            return False
+        if work.held_since is None:
+            work.held_since = time.monotonic()
+            self._listener.waits(work.task)
+        return time.monotonic() - work.held_since < self._patience
+
+    def _stop(self, kill: bool) -> None:
+        if not self._stopping:
+            self._stopping = True
+            while self._waiting:
+                self._end(self._waiting.popleft(), "stopped", "not started")
+            if begun := [work.task for work in self._running if work.told]:
+                self._listener.stopping(begun)
+        for work in self._running:
+            work.ask_to_stop()
+            if kill and work.attempt is not None:
+                work.attempt.kill()
+
+    def _judge(self, work: _Work, end: End) -> None:
+        code, why = end.code, explanation(work.task.output, work.output_from) if work.told else ""
+        if code == DONE:
+            self._end(work, "done")
+        elif self._stopping and not work.told:
+            work.attempts -= 1
+            self._end(work, "stopped", "not started")
+        elif end.out_of_time and not self._stopping:
+            self._out_of_time(work, why)
+        elif code == STOPPED:
+            self._end(work, "stopped", why if work.asked_to_stop else f"stopped by someone else. {why}".strip())
+        elif code in EXPLAINED:
+            self._end(work, "failed", why or _without_words(work.task, _name(end)))
+        elif self._stopping:
+            self._end(work, "stopped", f"ended by {_name(end)}; continues from its last checkpoint")
+        else:
+            self._crashed(work, end, why)
+
+    def _out_of_time(self, work: _Work, why: str) -> None:
+        """It saved and goes on in its next turn; no attempt is lost as long as it gets further from turn to turn."""
+        progress = progress_of(work.task.folder)
+        if progress > work.progress:
+            work.progress, work.attempts = progress, work.attempts - 1
+            self._listener.paused(work.task, why)
+            self._waiting.append(work)
+        else:
+            self._crashed(work, End(None, "its time limit, before it got any further"), why)
+
+    def _crashed(self, work: _Work, end: End, why: str) -> None:
+        how = _name(end)
+        if end.out_of_memory:
+            how += f" (out of memory; {self._after_memory_kill(work)})"
+        work.held_since = None
+        if work.attempts > self._retries:
+            times = f"crashed {work.attempts} times, at last by {how}" if self._retries else f"crashed by {how}"
+            self._end(work, "failed", f"{times}. {why}".strip())
+            return
+        self._listener.crashed(work.task, how, self._retries + 1 - work.attempts)
+        self._waiting.append(work)
+
+    def _after_memory_kill(self, work: _Work) -> str:
+        """Ask for more memory, where places are found by needs, else run fewer at once; what to say of it."""
+        most = self._engine.most_memory
+        if most is None:
+            self._at_once = max(1, self._at_once - 1)
+            return f"from now on at most {self._at_once} at once"
+        needs = work.task.needs
+        more = min(round(MORE_MEMORY * needs.memory_bytes), max(most, needs.memory_bytes))
+        if more <= needs.memory_bytes:
+            return f"no node has more than the {data_size(needs.memory_bytes)} that it asked for"
+        work.task = replace(work.task, needs=replace(needs, memory_bytes=more))
+        return f"it asks for {data_size(more)} now"
+
+    def _end(self, work: _Work, state: EndState, why: str = "") -> None:
+        seconds = time.monotonic() - work.began if work.attempts and work.began else 0.0
+        lines = tuple(last_lines(work.task.output, work.output_from)) if state == "failed" and work.told else ()
+        work.outcome = Outcome(
+            name=work.task.name, state=state, attempts=work.attempts, seconds=seconds, why=why, last_lines=lines
+        )
+        self._listener.ended(work.task, work.outcome)
+
+
+def progress_of(folder: Path | None) -> int:
+    """How many iterations the stage in a folder has told; 0 where it tells nothing."""
+    if folder is None:
+        return 0
+    try:
+        return StageFolder(folder).status().iteration or 0
+    except (VdgsError, OSError):
+        return 0
+
+
+def _name(end: End) -> str:
+    code = end.code
+    if code is None:
+        return end.how
+    if code >= 0:
+        return f"exit code {code}"
+    try:
+        return signal.Signals(-code).name
+    except ValueError:
+        return f"signal {-code}"
+
+
+def _refused(task: Task, error: OSError) -> str:
+    return (
+        f"{error.filename or task.output}: {error.strerror or error}. Free some space or mend the folder, "
+        "then run the same command again."
+    )
+
+
+def _without_words(task: Task, end: str) -> str:
+    """What to say of a task that failed and printed nothing."""
+    folder = task.output.parent
+    with suppress(OSError):
+        if shutil.disk_usage(folder).free < FULL_BYTES:
+            return f"{folder}: the disk is full. Free some space, then run the same command again."
+    return f"{end}, without a message"

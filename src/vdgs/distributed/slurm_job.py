@@ -1,0 +1,128 @@
+"""What a job of SLURM runs: one task of those that a driver submitted together, watched in the driver's place.
+
+    python -m vdgs.distributed.slurm_job FOLDER     (with SLURM's variables of the element)
+
+FOLDER/tasks.json says what element n is to do; FOLDER/n.json says how that went. SIGUSR1, which SLURM sends some time
+before the limit, lets the task save; the job is then put back into the queue, so that it goes on without a driver.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from vdgs.distributed.engine import EXPLAINED, STOPPED
+from vdgs.distributed.node_check import examine
+from vdgs.distributed.slurm_commands import Element, requeue
+from vdgs.distributed.task_process import Process, out_of_memory_kills
+from vdgs.system.atomic_files import read_json, write_json
+from vdgs.system.documents import JsonObject
+
+
+@dataclass(frozen=True, kw_only=True)
+class Record:
+    """How far an element is, in FOLDER/n.json."""
+
+    node: str
+    output_from: int
+    turn: int = 0
+    """How often it was put back into the queue before."""
+    code: int | None = None
+    """The exit code of the command; None while it runs."""
+    out_of_memory: bool = False
+    out_of_time: bool = False
+    """Asked to save before the time limit, and did."""
+    unfit: str = ""
+    """Why the node cannot work on the run."""
+    progress: int | None = None
+    """How far the task was when its time was up: see `requeue`."""
+
+
+def record_file(folder: Path, index: int) -> Path:
+    return folder / f"{index}.json"
+
+
+def read(folder: Path, index: int) -> Record | None:
+    """What an element says of itself; None before it began, or while it is written."""
+    try:
+        return Record(**read_json(record_file(folder, index)))
+    except Exception:  # no such file, or not a whole one yet: asked again soon
+        return None
+
+
+def main(arguments: list[str]) -> int:
+    """Do the task; its exit code."""
+    folder, variables = Path(arguments[0]), os.environ
+    element = Element(variables["SLURM_ARRAY_JOB_ID"], int(variables["SLURM_ARRAY_TASK_ID"]))
+    turn = int(variables.get("SLURM_RESTART_COUNT", 0))
+    written = read_json(folder / "tasks.json")
+    task, before = written["tasks"][str(element.index)], read(folder, element.index)
+    answer = examine(written["question"])
+    tell = _teller(
+        record_file(folder, element.index),
+        Record(node=socket.gethostname(), output_from=_size(task["output"]), turn=turn),
+    )
+    if answer["problems"]:
+        tell(code=EXPLAINED[0], unfit=answer["problems"][0])
+        return EXPLAINED[0]
+    kills = out_of_memory_kills()
+    process = Process(task["command"], Path(task["output"]), task["environment"], task["attempt"] + turn)
+    asked = _pass_on(process)
+    tell(output_from=process.output_from)
+    code = process.wait()
+    if code != STOPPED or asked != [signal.SIGUSR1]:
+        tell(code=code, out_of_memory=code == -signal.SIGKILL and out_of_memory_kills() > kills)
+        return code if code >= 0 else 128 - code
+    progress = _progress(task)
+    tell(code=code, out_of_time=True, progress=progress)
+    if before is None or before.progress is None or progress > before.progress:
+        requeue(element)  # ends this process if it works; else the driver submits it again
+    return code
+
+
+def _pass_on(process: Process) -> list[int]:
+    """Ask the process to save when this one is asked to; the signals that came, each once."""
+    asked = list[int]()
+
+    def ask(number: int, _frame: object) -> None:
+        if number not in asked:
+            asked.append(number)
+        process.terminate()
+
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1):
+        signal.signal(number, ask)
+    return asked
+
+
+def _teller(file: Path, record: Record) -> Callable[..., None]:
+    """A function that adds to the record of this element."""
+    known: JsonObject = asdict(record)
+
+    def tell(**facts: Any) -> None:
+        known.update(facts)
+        write_json(file, known)
+
+    return tell
+
+
+def _progress(task: Mapping[str, Any]) -> int:
+    from vdgs.distributed.scheduler import progress_of
+
+    return progress_of(None if task["folder"] is None else Path(task["folder"]))
+
+
+def _size(output: str) -> int:
+    try:
+        return Path(output).stat().st_size
+    except OSError:
+        return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,271 @@
+"""Evaluate what the cut into blocks gained and what its seams cost, with pictures of the worst places to look.
+
+OUTPUT/by_block.json    PSNR of each block: coarse, trained alone, merged; errors at borders against elsewhere
+OUTPUT/seams/NAME.png   coarse | merged | merged with the borders of blocks | error, where borders show most
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int16, UInt8
+from PIL import Image, ImageDraw
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+from torch import Tensor
+
+from vdgs.captures.capture import View
+from vdgs.errors import RunError
+from vdgs.evaluation import comparison_images, image_io
+from vdgs.evaluation.by_block import (
+    BORDER_PX,
+    BlockMetrics,
+    SeamMetrics,
+    blocks_shown,
+    border_lines,
+    border_pixels,
+    label_map,
+)
+from vdgs.evaluation.metric_tables import shown
+from vdgs.evaluation.metrics import masked_mean, psnr_of, squared_error, to_8bit
+from vdgs.evaluation.reference_views import ReferenceViews
+from vdgs.evaluation.view_exposures import as_photographed
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import Raster
+from vdgs.partition.blocks import Blocks
+from vdgs.system.atomic_files import jsonable, write_json
+from vdgs.system.documents import BlockMetricsDocument, JsonObject
+from vdgs.system.stop_signals import stop_if_asked
+
+#: Renders that are measured by block: without blocks, the block as it was trained, all blocks together.
+RENDERS = ("coarse", "alone", "merged")
+#: Pictures drawn at most: the views with the most border pixels.
+SEAM_VIEWS = 6
+#: Borders of blocks and their numbers: bright on a dark rim, so that they show on any ground.
+LINE_COLOUR, RIM_COLOUR = (255, 236, 64), (20, 20, 20)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SeamView:
+    """What the picture of a view shows: renders and photograph in 8 bits, the label of each pixel."""
+
+    name: str
+    stem: str
+    coarse: UInt8[np.ndarray, "h w 3"]
+    merged: UInt8[np.ndarray, "h w 3"]
+    reference: UInt8[np.ndarray, "h w 3"]
+    mask: Bool[np.ndarray, "h w"] | None
+    labels: Int16[np.ndarray, "h w"]
+    #: Pixels near a border, those that the mask drops left out.
+    border: Bool[np.ndarray, "h w"]
+
+    @property
+    def border_pixels(self) -> int:
+        return int(np.count_nonzero(self.border))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BlockInputs:
+    """Where the images of a view come from. `render_merged` draws depth; the labels follow from the median one.
+    `render_block(index, camera)` is the image of a block as it was trained, among its frozen surroundings; None where
+    it was not trained. All are measured in the exposure of the view, as in `MeasuredModel`."""
+
+    photographs: ReferenceViews
+    render_coarse: Callable[[Camera], Raster]
+    render_merged: Callable[[Camera], Raster]
+    render_block: Callable[[int, Camera], Raster | None]
+    blocks: Blocks
+    exposure: Callable[[View], Float[Tensor, "3 4"]] | None = None
+
+    def picture(self, rendered: Raster, view: View) -> UInt8[np.ndarray, "h w 3"]:
+        """What is measured of a render."""
+        pixels = rendered.image.detach().cpu().numpy()
+        return to_8bit(pixels if self.exposure is None else as_photographed(pixels, self.exposure(view)))
+
+
+@dataclass(frozen=True, eq=False)
+class BlockFigures:
+    """What one view says of the blocks."""
+
+    row: JsonObject
+    by_block: BlockMetrics
+    seams: SeamMetrics
+
+
+def evaluate_blocks(inputs: BlockInputs, output: Path) -> BlockMetricsDocument:
+    """Measure every test view, write `output`, and return what `by_block.json` holds. One view is in memory at a time,
+    and those that are drawn.
+
+    The figure of a block that was not trained is null. Raises RunError without views.
+    """
+    views = inputs.photographs.views
+    if not views:
+        raise RunError(f"{output}: there are no test views. Hold some out when the capture is read.")
+    measured, seen = list[BlockFigures](), list[SeamView]()
+    for view, stem in zip(views, image_io.file_stems([view.name for view in views]), strict=True):
+        stop_if_asked()
+        figures, picture = measure_view(view, stem, inputs)
+        measured.append(figures)
+        seen.append(picture)
+        seen = [seen[place] for place in worth_seeing([each.border_pixels for each in seen])]
+    for each in seen:
+        save_picture(output / "seams" / f"{each.stem}.png", each)
+    return conclude(measured, len(inputs.blocks), output)
+
+
+def worth_seeing(border_pixels: Sequence[int]) -> list[int]:
+    """Which of the views are drawn, by the number of border pixels of each: those with most, the first of equals."""
+    best = sorted(range(len(border_pixels)), key=lambda place: -border_pixels[place])[:SEAM_VIEWS]
+    return [place for place in best if border_pixels[place]]
+
+
+def save_picture(path: Path, view: SeamView) -> None:
+    image_io.write_png(path, np.asarray(seam_picture(view)))
+
+
+def conclude(measured: Iterable[BlockFigures], blocks: int, output: Path) -> BlockMetricsDocument:
+    """Gather views, in their order, into what `by_block.json` holds, and write it: once its pictures are complete."""
+    by_block, seams, rows = BlockMetrics(blocks, RENDERS), SeamMetrics(), list[JsonObject]()
+    for figures in measured:
+        by_block.merge(figures.by_block)
+        seams.merge(figures.seams)
+        rows.append(figures.row)
+    result: BlockMetricsDocument = jsonable(
+        {
+            "blocks": by_block.rows(),
+            "all": by_block.everywhere(),
+            "seams": {"border_px": BORDER_PX, **seams.figures()},
+            "views": rows,
+        }
+    )
+    write_json(output / "by_block.json", result)
+    return result
+
+
+def measure_view(view: View, stem: str, inputs: BlockInputs) -> tuple[BlockFigures, SeamView]:
+    """Measure a view; what it comes to, and what a picture of it shows."""
+    by_block, seams = BlockMetrics(len(inputs.blocks), RENDERS), SeamMetrics()
+    reference, mask = inputs.photographs.load_image(view), inputs.photographs.load_mask(view)
+    drawn = inputs.render_merged(view.camera)
+    labels = label_map(drawn, view.camera, inputs.blocks)
+    coarse, merged = inputs.picture(inputs.render_coarse(view.camera), view), inputs.picture(drawn, view)
+    squared = {"coarse": squared_error(coarse, reference), "merged": squared_error(merged, reference)}
+    alone = _alone(view, labels, reference, inputs)
+    by_block.add(labels, squared | {"alone": alone}, mask)
+    errors = {f"mse_{name}": values for name, values in squared.items()}
+    errors["mae_coarse"] = comparison_images.absolute_error(coarse, reference)
+    errors["mae_merged"] = comparison_images.absolute_error(merged, reference)
+    seams.add(labels, errors, mask)
+    kept = border_pixels(labels) if mask is None else border_pixels(labels) & mask
+    seen = SeamView(
+        name=view.name, stem=stem, coarse=coarse, merged=merged, reference=reference, mask=mask, labels=labels,
+        border=kept,
+    )  # fmt: skip
+    row = {
+        "name": view.name,
+        "border_pixels": seen.border_pixels,
+        **{f"psnr_{name}": psnr_of(masked_mean(values, mask)) for name, values in squared.items()},
+        **{f"psnr_{name}_border": _psnr_within(values, kept) for name, values in squared.items()},
+    }
+    return BlockFigures(row, by_block, seams), seen
+
+
+def _psnr_within(values: Float[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"]) -> float | None:
+    return psnr_of(float(values[where].mean())) if where.any() else None
+
+
+def _alone(
+    view: View, labels: Int16[np.ndarray, "h w"], reference: UInt8[np.ndarray, "h w 3"], inputs: BlockInputs
+) -> Float[np.ndarray, "h w"]:
+    """Squared error of each block's own render where the block is shown, NaN where there is none."""
+    errors = np.full(labels.shape, np.nan)
+    for index in blocks_shown(labels, len(inputs.blocks)):
+        rendered = inputs.render_block(index, view.camera)
+        if rendered is not None:
+            own = labels == index
+            errors[own] = squared_error(inputs.picture(rendered, view), reference)[own]
+    return errors
+
+
+def seam_picture(view: SeamView) -> Image.Image:
+    """Coarse | merged | merged with the borders of blocks | error of the merged render, labelled."""
+    height, width = view.labels.shape
+    size = comparison_images.panel_size(width, height, comparison_images.PANEL_MIN_PX, comparison_images.PANEL_MAX_PX)
+    error = comparison_images.absolute_error(view.merged, view.reference)
+    if view.mask is not None:
+        error = np.where(view.mask, error, np.nan)
+    panels = [
+        comparison_images.Panel(comparison_images.resize(view.coarse, size), "coarse", _caption(view.coarse, view)),
+        comparison_images.Panel(comparison_images.resize(view.merged, size), "merged", _caption(view.merged, view)),
+        comparison_images.Panel(with_borders(view.merged, view.labels, size), "borders of blocks"),
+        comparison_images.Panel(
+            comparison_images.resize(comparison_images.colourise(error, comparison_images.ERROR_LIMIT), size), f"merged: {comparison_images.ERROR_LABEL}"
+        ),
+    ]
+    return comparison_images.row_of_panels(panels, view.name, comparison_images.ERROR_LIMIT)
+
+
+def _caption(image: UInt8[np.ndarray, "h w 3"], view: SeamView) -> str:
+    errors = squared_error(image, view.reference)
+    near = _psnr_within(errors, view.border)
+    return f"{psnr_of(masked_mean(errors, view.mask)):.2f} dB, near borders {shown(near, '{:.2f}')}"
+
+
+def with_borders(
+    image: UInt8[np.ndarray, "h w 3"], labels: Int16[np.ndarray, "h w"], size: tuple[int, int]
+) -> Image.Image:
+    """The picture at `size` (width, height) with thin lines between blocks and the number of each block."""
+    shown_labels = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST)
+    lines = border_lines(shown_labels)
+    rim = cv2.dilate(lines.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    pixels = np.asarray(comparison_images.resize(image, size)).copy()
+    pixels[rim], pixels[lines] = RIM_COLOUR, LINE_COLOUR
+    picture = Image.fromarray(pixels)
+    draw, face = ImageDraw.Draw(picture), comparison_images.font(max(12, size[0] // 34), bold=True)
+    for index in blocks_shown(shown_labels, int(shown_labels.max(initial=-1)) + 1):
+        place = _roomiest_place(shown_labels == index)
+        draw.text(place, str(index), LINE_COLOUR, face, anchor="mm", stroke_width=2, stroke_fill=RIM_COLOUR)
+    return picture
+
+
+def _roomiest_place(region: Bool[np.ndarray, "h w"]) -> tuple[int, int]:
+    """x, y of the pixel farthest from the region's edge and from the edge of the picture."""
+    padded = np.pad(region.astype(np.uint8), 1)
+    distance = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    row, column = divmod(int(distance.argmax()), region.shape[1])
+    return column, row
+
+
+def block_table(result: Mapping[str, Any]) -> RenderableType:
+    """What `by_block.json` holds, for the console."""
+    table = Table(box=box.SIMPLE_HEAD, title="PSNR (dB) by block, over test pixels", title_justify="left")
+    for column in ("block", "pixels", *RENDERS, "merged − coarse"):
+        table.add_column(column, justify="right")
+    for row in result["blocks"]:
+        table.add_row(str(row["block"]), *_cells(row))
+    table.add_section()
+    table.add_row("all", *_cells(result["all"]))
+    return Group(table, Text(_seam_line(result["seams"]), style="dim"))
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    coarse, alone, merged = (row[f"psnr_{name}"] for name in RENDERS)
+    gain = None if coarse is None or merged is None else merged - coarse
+    return [f"{row['pixels']:,}", *(shown(each, "{:.2f}") for each in (coarse, alone, merged)), shown(gain, "{:+.2f}")]
+
+
+def _seam_line(seams: Mapping[str, Any]) -> str:
+    if not seams["border_pixels"]:
+        return "no border between blocks is in sight"
+    coarse, merged = (shown(seams[f"mae_{name}"]["ratio"], "{:.3f}") for name in SeamMetrics.NAMES)
+    return (
+        f"error within {seams['border_px']:.0f} px of a border over error elsewhere: merged {merged}, coarse {coarse} "
+        f"(which has no seams); merged over coarse {shown(seams['seam_mae'], '{:.3f}')}"
+    )

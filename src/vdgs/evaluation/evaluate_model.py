@@ -1,0 +1,171 @@
+"""Evaluate a model on views, mostly its test views: every figure that papers report, raw and colour-corrected, and by
+visibility; whether it is opaque where photographs show ground; the pictures behind that. One view is in memory at a
+time.
+
+    OUTPUT/
+      metrics.json        means over the views, bins by visibility, size and speed of the model
+      per_view.json       the same figures for each view
+      renders/NAME.png    what the model shows, in the exposure of the view if it says so, 8 bits: what is measured
+      alpha/NAME.png      how opaque it is: black nothing, white opaque; none if the renderer does not say
+      comparisons/        photograph | render | error
+      contact_sheet.png   all views (or an even choice of them) at a glance
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from vdgs.captures.capture import View
+from vdgs.errors import RunError
+from vdgs.evaluation import comparison_images, image_io
+from vdgs.evaluation.by_visibility import VisibilityHistogram, mean_or_none, view_bins
+from vdgs.evaluation.depth_errors import DepthErrors, figures_of
+from vdgs.evaluation.lpips import Lpips
+from vdgs.evaluation.metric_tables import metrics_table
+from vdgs.evaluation.opacity_coverage import largest_splats_of_all, solidity_of_all
+from vdgs.evaluation.reference_views import ReferenceViews
+from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ModelFacts
+from vdgs.evaluation.view_metrics import AFFINE, CORRECTED, NEUTRAL, RAW, ViewFigures, ViewInputs, measure_view
+from vdgs.system.atomic_files import jsonable, write_json
+from vdgs.system.documents import EvaluationMetrics, JsonObject
+from vdgs.system.stop_signals import stop_if_asked
+
+
+@dataclass(eq=False)
+class _Gathered:
+    """What accumulates over the views."""
+
+    rows: list[JsonObject] = field(default_factory=list)
+    cells: list[comparison_images.Thumbnail] = field(default_factory=list)
+    histogram: VisibilityHistogram | None = None
+    depth_errors: dict[str, DepthErrors] = field(default_factory=dict)
+
+    def add(self, figures: ViewFigures) -> None:
+        self.rows.append(figures.row)
+        if figures.cell is not None:
+            self.cells.append(figures.cell)
+        if figures.by_visibility is not None:
+            self.histogram = self.histogram or VisibilityHistogram(figures.by_visibility.names)
+            self.histogram.merge(figures.by_visibility)
+        for kind, errors in figures.depth_errors.items():
+            self.depth_errors.setdefault(kind, DepthErrors()).merge(errors)
+
+
+def evaluate(
+    photographs: ReferenceViews,
+    model: MeasuredModel,
+    output: Path,
+    *,
+    lpips: Lpips | None = None,
+    lpips_note: str = "",
+    settings: EvaluationSettings | None = None,
+    console: Console | None = None,
+) -> EvaluationMetrics:
+    """Render and measure every view, write `output`, and return what `metrics.json` holds.
+
+    `lpips_note` says why LPIPS is null. A table is printed to `console` if there is one. fps is one over the median
+    time of `model.render`, which on a GPU includes waiting for it; None unless `model.timed`.
+
+    Raises RunError without views, CaptureError where a photograph or mask does not fit its camera,
+    TrainingDiverged where a render is not finite.
+    """
+    refuse_without_views(photographs.views, output)
+    inputs = ViewInputs(photographs, model, lpips, settings or EvaluationSettings(), output)
+    measured = (_unless_stopped(index, inputs) for index in range(len(photographs.views)))
+    return conclude(
+        measured, model.facts, output,
+        lpips_note=lpips_note, settings=inputs.settings, timed=model.timed, console=console,
+    )  # fmt: skip
+
+
+def refuse_without_views(views: Sequence[View], output: Path) -> None:
+    """Raise RunError where there is nothing to measure."""
+    if not views:
+        raise RunError(
+            f"{output}: there are no test views to evaluate. Hold some out when the capture is read "
+            "(by default every 8th image is)."
+        )
+
+
+def _unless_stopped(index: int, inputs: ViewInputs) -> ViewFigures:
+    stop_if_asked()
+    return measure_view(index, inputs)
+
+
+def conclude(
+    measured: Iterable[ViewFigures],
+    facts: ModelFacts,
+    output: Path,
+    *,
+    lpips_note: str,
+    settings: EvaluationSettings,
+    timed: bool,
+    console: Console | None,
+) -> EvaluationMetrics:
+    """Gather views, in their order, into the figures of all of them; otherwise as `evaluate`. One is held at a time."""
+    gathered = _Gathered()
+    for figures in measured:
+        gathered.add(figures)
+    result = _summary(gathered, facts, lpips_note, settings, timed)
+    _write(output, result, gathered, settings.title)
+    if console is not None:
+        console.print(metrics_table(result, f"{len(gathered.rows)} {settings.title}"))
+    return result
+
+
+def _summary(
+    gathered: _Gathered, facts: ModelFacts, lpips_note: str, settings: EvaluationSettings, timed: bool
+) -> EvaluationMetrics:
+    rows = gathered.rows
+    means = {name: mean_or_none([row[name] for row in rows]) for name in RAW + CORRECTED + AFFINE}
+    pixel_bins = gathered.histogram.bins(settings.visibility_bins) if gathered.histogram else None
+    visible = [np.nan if row["mean_visibility"] is None else row["mean_visibility"] for row in rows]
+    figures = [{name: row[name] for name in RAW + CORRECTED + AFFINE} for row in rows]
+    unfitted = sum(row.get("colour_fitted") is False for row in rows)
+    notes = [note for note in (lpips_note, _exposure_note(rows, settings)) if note]
+    if unfitted:
+        notes.append(f"colour correction: too few unsaturated pixels in {unfitted} views, left as they are")
+    result = {
+        **means,
+        **{name: mean_or_none([row.get(name) for row in rows]) for name in NEUTRAL},
+        "by_visibility": pixel_bins,
+        "views_by_visibility": view_bins(visible, figures, settings.visibility_bins) if pixel_bins else None,
+        **solidity_of_all(rows),
+        **figures_of(gathered.depth_errors),
+        **largest_splats_of_all(rows),
+        **asdict(facts),
+        "fps": 1.0 / max(statistics.median(row["render_seconds"] for row in rows), 1e-9) if timed else None,
+        settings.title.replace(" ", "_"): len(rows),
+        "notes": notes,
+    }
+    measured: EvaluationMetrics = jsonable(result)
+    return measured
+
+
+def _exposure_note(rows: Sequence[Mapping[str, Any]], settings: EvaluationSettings) -> str:
+    """How the views are exposed; empty where all are in neutral colours."""
+    exposures = [exposure for row in rows if (exposure := row.get("exposure")) is not None]
+    if not exposures:
+        return ""
+    alone = sum(np.array_equal(exposure, np.eye(3, 4)) for exposure in exposures)
+    without = f"; {alone} of them neutral, for want of training photographs near by" if alone else ""
+    return f"views are drawn and measured {settings.exposed}{without}; beside that in neutral colours"
+
+
+def _write(output: Path, result: Mapping[str, Any], gathered: _Gathered, title: str) -> None:
+    if gathered.cells:
+        count = len(gathered.rows)
+        shown = f"{len(gathered.cells)} of {count}" if len(gathered.cells) < count else f"{count}"
+        psnr = "PSNR –" if result["psnr"] is None else f"PSNR {result['psnr']:.2f} dB"
+        ssim = "SSIM –" if result["ssim"] is None else f"SSIM {result['ssim']:.3f}"
+        sheet = comparison_images.contact_sheet(gathered.cells, f"{shown} {title} · {psnr} · {ssim}")
+        image_io.write_png(output / "contact_sheet.png", np.asarray(sheet))
+    write_json(output / "per_view.json", jsonable(gathered.rows))
+    write_json(output / "metrics.json", result)  # last: where it stands, the rest is complete

@@ -1,0 +1,110 @@
+"""Tables of figures for the console."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from vdgs.evaluation.by_visibility import bounds_of
+from vdgs.system.units import data_size
+
+#: key in metrics.json, what people call it, format
+FIGURES = (
+    ("psnr", "PSNR (dB) ↑", "{:.2f}"),
+    ("ssim", "SSIM ↑", "{:.4f}"),
+    ("lpips_vgg", "LPIPS vgg ↓", "{:.4f}"),
+    ("lpips_vgg_01", "LPIPS vgg, [0,1] input ↓", "{:.4f}"),
+)
+#: Of solidity: what is measured over the pixels that training cameras see; those that are null are not shown.
+SOLIDITY = (
+    ("solid_share", "opaque (alpha ≥ 0.95) ↑", "{:.2%}"),
+    ("psnr_seen_own", "PSNR before its own background (dB) ↑", "{:.2f}"),
+    ("psnr_seen_black", "PSNR before black (dB) ↑", "{:.2f}"),
+    ("psnr_seen_white", "PSNR before white (dB) ↑", "{:.2f}"),
+    ("depth_error_median_expected", "median error of expected depth (camera heights) ↓", "{:.2%}"),
+    ("depth_error_median_median", "median error of median depth (camera heights) ↓", "{:.2%}"),
+    ("depth_within_1_percent_expected", "expected depth within 1 % of the camera height ↑", "{:.2%}"),
+    ("depth_within_1_percent_median", "median depth within 1 % of the camera height ↑", "{:.2%}"),
+)
+
+
+def metrics_table(result: Mapping[str, Any], title: str) -> RenderableType:
+    """What `metrics.json` holds: quality raw, colour-corrected, after an affine map of the colours and, where pictures
+    are exposed, in neutral colours; quality by visibility, solidity, size and speed."""
+    quality = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
+    besides = {"_cc": "colour-corrected", "_affine": "affine fit"}
+    if result["psnr_neutral"] is not None:
+        besides["_neutral"] = "neutral colours"
+    for column in ("", "raw", *besides.values()):
+        quality.add_column(column, justify="left" if not column else "right")
+    for key, label, form in FIGURES:
+        others = (shown(result.get(f"{key}{suffix}"), form) for suffix in besides)
+        quality.add_row(label, shown(result[key], form), *others)
+    parts: list[RenderableType] = [quality]
+    if result["by_visibility"]:
+        parts.append(_visibility_table(result["by_visibility"]))
+    if result["psnr_seen_own"] is not None:
+        parts.append(_solidity_table(result))
+    if result["largest_splats"]:
+        parts.append(Text(_splats_line(result)))
+    parts.append(Text(_model_line(result), style="dim"))
+    parts += [Text(note, style="yellow") for note in result["notes"]]
+    return Group(*parts)
+
+
+def shown(value: float | None, form: str) -> str:
+    """The figure, or a dash where there is none."""
+    return "–" if value is None else form.format(value)
+
+
+def _visibility_table(bins: list[Mapping[str, Any]]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, title="by visibility (training cameras that see a pixel)", title_justify="left")
+    for column in ("V", "pixels", "PSNR (dB)", "SSIM", "PSNR cc"):
+        table.add_column(column, justify="right")
+    for each in bins:
+        bounds = "nothing drawn" if each["lower"] is None else bounds_of(each["lower"], each["upper"])
+        table.add_row(
+            bounds, f"{each['pixels']:,}", shown(each["psnr"], "{:.2f}"), shown(each["ssim"], "{:.4f}"),
+            shown(each.get("psnr_cc"), "{:.2f}"),
+        )  # fmt: skip
+    return table
+
+
+def _solidity_table(result: Mapping[str, Any]) -> Table:
+    table = Table(
+        box=box.SIMPLE_HEAD, show_header=False, title="of the pixels that at least 3 training cameras see",
+        title_justify="left",
+    )  # fmt: skip
+    table.add_column("")
+    table.add_column("", justify="right")
+    for key, label, form in SOLIDITY:
+        if result[key] is not None:
+            table.add_row(label, form.format(result[key]))
+    return table
+
+
+def _splats_line(result: Mapping[str, Any]) -> str:
+    return (
+        f"splats larger than the picture: {result['splats_larger_than_picture']:,}, most of them "
+        f"({result['largest_splats']:,}) in {result['largest_splats_view']}"
+    )
+
+
+def _model_line(result: Mapping[str, Any]) -> str:
+    parts = []
+    if result["fps"] is not None:
+        parts.append(f"{result['fps']:.3g} images a second")
+    if result["n_anchors"] is not None:
+        parts.append(f"{result['n_anchors']:,} anchors")
+    if result["model_bytes"] is not None:
+        parts.append(f"{result['model_bytes'] / 1e6:.1f} MB")
+    if result["train_seconds"] is not None:
+        parts.append(f"trained in {result['train_seconds']:,.0f} s")
+    if result["peak_memory_bytes"] is not None:
+        parts.append(f"peak memory {data_size(result['peak_memory_bytes'])}")
+    return " · ".join(parts)

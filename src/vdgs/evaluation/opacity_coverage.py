@@ -1,0 +1,120 @@
+"""Whether a model is opaque where photographs show ground.
+
+A model may leave ground half transparent and borrow what is missing from the colour of its background. On test views
+that look at the same ground from nearby, PSNR does not notice; seen from elsewhere, or before another background, the
+ground is a veil. So it is measured what share of the pixels that training cameras see is opaque, how PSNR over them
+changes with the background, and how many splats are larger than the picture: of such veils are made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from vdgs.evaluation.by_visibility import mean_or_none
+from vdgs.evaluation.metrics import psnr_of, squared_error, to_8bit
+from vdgs.evaluation.view_exposures import as_photographed
+from vdgs.kernels.constants import ALPHA_MIN
+from vdgs.kernels.kernel_types import Splats
+
+#: At least this opaque, a pixel counts as solid.
+SOLID_ALPHA = 0.95
+#: PSNR over seen pixels before the model's own background, a black and a white one.
+PSNRS_SEEN = ("psnr_seen_own", "psnr_seen_black", "psnr_seen_white")
+
+Colour = tuple[float, float, float]
+_BLACK: Colour = (0.0, 0.0, 0.0)
+_WHITE: Colour = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """A view as it came from the renderer, before rounding."""
+
+    image: Float[np.ndarray, "h w 3"]
+    #: None: the renderer does not say.
+    alpha: Float[np.ndarray, "h w"] | None
+    #: What is behind the model in `image`; None: not known.
+    background: Colour | None = None
+
+    def exposed(self, exposure: Float[Tensor, "3 4"]) -> Rendered:
+        """The view with the colour model of a photograph: all colours, the background's too. They may leave [0, 1]."""
+        background = self.background
+        if background is not None:
+            red, green, blue = as_photographed(np.array(background), exposure).tolist()
+            background = red, green, blue
+        return Rendered(as_photographed(self.image, exposure), self.alpha, background)
+
+    def before(self, colour: Colour) -> UInt8[np.ndarray, "h w 3"] | None:
+        """The picture in 8 bits with another background; None where alpha or its own background is not known."""
+        if self.alpha is None or self.background is None:
+            return None
+        # In the precision of the image: where alpha is 1, the bits stay, and with them what is rounded up or down.
+        change = np.subtract(colour, self.background).astype(self.image.dtype)
+        return to_8bit(self.image + (1.0 - self.alpha)[..., None] * change)
+
+
+def solidity_of_view(
+    rendered: Rendered, reference: UInt8[np.ndarray, "h w 3"], seen: Bool[np.ndarray, "h w"] | None
+) -> dict[str, float | None]:
+    """The figures of one view; None where alpha, the background or the seen pixels are not known, or there are none."""
+    row: dict[str, float | None] = {"seen_pixels": None, "solid_pixels": None, "solid_share": None}
+    row |= dict.fromkeys(PSNRS_SEEN)
+    if seen is None:
+        return row
+    count = row["seen_pixels"] = int(np.count_nonzero(seen))
+    if rendered.alpha is not None:
+        solid = row["solid_pixels"] = int(np.count_nonzero(rendered.alpha[seen] >= SOLID_ALPHA))
+        row["solid_share"] = solid / count if count else None
+    pictures = to_8bit(rendered.image), rendered.before(_BLACK), rendered.before(_WHITE)
+    for name, picture in zip(PSNRS_SEEN, pictures, strict=True):
+        if picture is not None and count:
+            row[name] = psnr_of(float(squared_error(picture, reference)[seen].mean()))
+    return row
+
+
+def solidity_of_all(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
+    """The figures of all views, from the rows of each: shares of all seen pixels, means of PSNR over the views."""
+    known = [row for row in rows if row["solid_pixels"] is not None]
+    seen = sum(row["seen_pixels"] for row in known)
+    solid = sum(row["solid_pixels"] for row in known)
+    result = {"seen_pixels": seen, "solid_share": solid / seen} if seen else {"seen_pixels": None, "solid_share": None}
+    return result | {name: mean_or_none([row[name] for row in rows]) for name in PSNRS_SEEN}
+
+
+def larger_than_picture(splats: Splats, width: int, height: int) -> int:
+    """How many splats are drawn into a picture (pixels) whose longer side their major diameter exceeds.
+
+    A splat ends where its alpha falls to ALPHA_MIN: at sqrt(2 ln(opacity / ALPHA_MIN)) standard deviations. Its centre
+    may lie anywhere, but the box around it reaches the picture.
+    """
+    a, b, c = splats.conics.double().unbind(dim=1)
+    opacities, centres = splats.opacities.double(), splats.means_px.double()
+    determinant = a * c - b * b
+    drawn = (a > 0) & (c > 0) & (determinant > 0) & (opacities >= ALPHA_MIN)
+    level = 2.0 * torch.log(opacities / ALPHA_MIN)
+    # The inverse conic is the covariance: its diagonal is (c, a) over the determinant, its larger eigenvalue the
+    # conic's larger one over the determinant (its smaller one would be lost in a difference for a needle).
+    larger = (a + c) / 2 + torch.hypot((a - c) / 2, b)
+    diameter = 2.0 * torch.sqrt(level * larger / determinant)
+    reach = torch.sqrt(level[:, None] * torch.stack([c, a], dim=1) / determinant[:, None])
+    size = centres.new_tensor([width, height])
+    touching = ((centres + reach > 0) & (centres - reach < size)).all(dim=1)
+    return int((drawn & touching & (diameter > max(width, height))).sum())
+
+
+def largest_splats_of_all(rows: Sequence[Mapping[str, Any]]) -> dict[str, int | str | None]:
+    """Splats larger than the picture over all views, and the view with most of them, from `largest_splats` of each."""
+    known = [row for row in rows if row["largest_splats"] is not None]
+    worst = max(known, key=lambda row: row["largest_splats"], default=None)
+    return {
+        "splats_larger_than_picture": sum(row["largest_splats"] for row in known) if known else None,
+        "largest_splats": worst["largest_splats"] if worst else None,
+        "largest_splats_view": worst["name"] if worst and worst["largest_splats"] else None,
+    }

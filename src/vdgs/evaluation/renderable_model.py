@@ -1,0 +1,90 @@
+"""A model as the evaluation sees it, and what is to be measured of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from vdgs.captures.capture import View
+from vdgs.evaluation import comparison_images
+from vdgs.evaluation.by_visibility import QUANTILE_BINS
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import Raster, Splats
+
+
+class RenderedView(Protocol):
+    """What a renderer returns; `alpha` [h, w] may come with it, as in `Raster`."""
+
+    @property
+    def image(self) -> Float[Tensor, "h w 3"]: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelFacts:
+    """What the evaluation reports of the model but cannot measure itself; None is unknown."""
+
+    #: "coarse" or "merged".
+    model: str | None = None
+    n_anchors: int | None = None
+    model_bytes: int | None = None
+    train_seconds: float | None = None
+    peak_memory_bytes: int | None = None
+    #: What tells the model from any other, and the settings that it was made with (`runs.keys`).
+    model_identity: str | None = None
+    key: str | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeasuredModel:
+    """A model as the evaluation sees it. Whatever is None is not known, and so are the figures that need it."""
+
+    #: Timed: the plain picture, with alpha if the renderer has it.
+    render: Callable[[Camera], RenderedView]
+    #: V per pixel [h, w], NaN where the model shows nothing; without it there are no figures by visibility.
+    visibility_map: Callable[[Camera], Float[np.ndarray, "h w"]] | None = None
+    facts: ModelFacts = ModelFacts()
+    #: Whether the time that `render` takes says anything.
+    timed: bool = True
+    #: What is behind the model in a render, RGB in [0, 1].
+    background: tuple[float, float, float] | None = None
+    #: Pixels that show what enough training cameras see (`evaluation.seen`); solidity and depth are measured on them.
+    seen_map: Callable[[Camera], Bool[np.ndarray, "h w"]] | None = None
+    #: Depth along the axis of a view's camera, inf for sky; then these two are needed as well: the model's own depth
+    #: (not timed), and how high cameras are above ground. All in the units of the model.
+    true_depth: Callable[[View], Float[np.ndarray, "h w"]] | None = None
+    render_depth: Callable[[Camera], Raster] | None = None
+    camera_height: float | None = None
+    #: The splats that a view is drawn from.
+    splats_of: Callable[[Camera], Splats] | None = None
+    #: The colour model of a view (`model.exposure`), in which its picture is measured; None: neutral colours.
+    exposure: Callable[[View], Float[Tensor, "3 4"]] | None = None
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a true depth without what it is compared with."""
+        if self.true_depth is not None and (self.render_depth is None or not self.camera_height):
+            raise ValueError("true_depth needs render_depth and a camera_height above 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationSettings:
+    """What to measure and draw."""
+
+    #: Also report every figure after colour correction (fitted on the test image itself).
+    colour_correction: bool = True
+    #: Bins by visibility, of about equal size.
+    visibility_bins: int = QUANTILE_BINS
+    #: Write photograph | render | error for every view.
+    comparisons: bool = True
+    #: What the contact sheet calls the views, and, with _ between its words, metrics.json their number.
+    title: str = "test views"
+    #: How pictures are exposed, if the model says how: what metrics.json notes of them.
+    exposed: str = "in the exposure of each photograph"
+    #: Views on the contact sheet at most, chosen evenly.
+    contact_views: int = 40
+    #: Error at the bright end of the colour map, where white is 1.
+    error_limit: float = comparison_images.ERROR_LIMIT

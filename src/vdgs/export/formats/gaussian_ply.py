@@ -1,0 +1,138 @@
+"""The PLY of 3DGS: every number as it was trained, in the layout of INRIA's program that all others read.
+
+Coordinates are those of the ground frame, z up. Header comments say where they stand.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from vdgs.errors import VdgsError
+from vdgs.export.formats.export_scene import ROWS, Facts, Scene, joined, one_line
+from vdgs.kernels.spherical_harmonics import MAX_DEGREE, function_count
+from vdgs.model.gaussians import Gaussians
+from vdgs.system.atomic_files import write_atomically
+
+LONGEST_HEADER = 1 << 16
+TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
+    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4",
+    "float32": "<f4", "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+SCALES = tuple(f"scale_{axis}" for axis in range(3))
+ROTATION = tuple(f"rot_{part}" for part in range(4))
+DC_NAMES = tuple(f"f_dc_{channel}" for channel in range(3))
+
+
+def properties(degree: int) -> tuple[str, ...]:
+    """Names of the numbers of one Gaussian, in the order of the file."""
+    rest = tuple(f"f_rest_{index}" for index in range(3 * (function_count(degree) - 1)))
+    return ("x", "y", "z", "nx", "ny", "nz", *DC_NAMES, *rest, "opacity", *SCALES, *ROTATION)
+
+
+def comments(facts: Facts) -> list[str]:
+    """Header lines that say where local coordinates stand, one fact each, as JSON."""
+    return [f"comment {name} {one_line(json.dumps(value))}" if not isinstance(value, str)
+            else f"comment {name} {one_line(value)}" for name, value in facts.known().items()]  # fmt: skip
+
+
+def write_ply(path: Path, scene: Scene) -> tuple[str, ...]:
+    """Write the scene, atomically; loses nothing. Raises VdgsError."""
+    names = properties(scene.degree)
+    lines = ["ply", "format binary_little_endian 1.0", *comments(scene.facts), f"element vertex {scene.count}"]
+    header = "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""]).encode("ascii")
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            file.write(header)
+            for piece in scene.pieces():
+                _rows(piece, len(names)).tofile(file)
+
+    write_atomically(path, write)
+    return ()
+
+
+def _rows(piece: Gaussians, width: int) -> np.ndarray:
+    n, rest = len(piece), piece.rest.shape[1]
+    rows = np.zeros((n, width), "<f4")  # normals stay zero
+    rows[:, 0:3] = piece.means.numpy()
+    rows[:, 6:9] = piece.dc.numpy()
+    rows[:, 9 : 9 + 3 * rest].reshape(n, 3, rest)[:] = piece.rest.numpy().transpose(0, 2, 1)  # channel by channel
+    rows[:, -8] = piece.logits.numpy()
+    rows[:, -7:-4] = piece.log_scales.numpy()
+    rows[:, -4:] = piece.quaternions.numpy()
+    return rows
+
+
+def read_ply(path: Path) -> Gaussians:
+    """All Gaussians of a file: see `ply_pieces`."""
+    return joined(ply_pieces(path))
+
+
+def ply_pieces(path: Path) -> Iterator[Gaussians]:
+    """The Gaussians of a binary PLY file of 3DGS, properties in any order, at most `ROWS` at a time.
+
+    Raises VdgsError for a file that is missing, of another kind, or shorter than it announces.
+    """
+    layout, count, start = _header(path)
+    names = layout.names or ()
+    rest = sum(name.startswith("f_rest_") for name in names)
+    missing = [name for name in properties(0) if name not in names and not name.startswith("n")]
+    if missing or rest not in {3 * (function_count(degree) - 1) for degree in range(MAX_DEGREE + 1)}:
+        what = f"has no {missing[0]}" if missing else f"has {rest} f_rest properties"
+        raise VdgsError(f"{path}: {what}; this is no PLY of 3DGS. Point clouds have other layouts.")
+    held = (path.stat().st_size - start) // layout.itemsize
+    if held < count:
+        raise VdgsError(f"{path}: announces {count} Gaussians but holds {held}. It is truncated; write it again.")
+    for first in range(0, max(count, 1), ROWS):
+        try:
+            table = np.fromfile(path, layout, min(ROWS, count - first), offset=start + first * layout.itemsize)
+        except OSError as error:
+            raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
+        yield _gaussians(table, rest)
+
+
+def _gaussians(table: np.ndarray, rest: int) -> Gaussians:
+    def columns(*wanted: str) -> torch.Tensor:
+        return torch.from_numpy(np.stack([table[name].astype(np.float32) for name in wanted], -1))
+
+    n = len(table)
+    coefficients = columns(*(f"f_rest_{i}" for i in range(rest))) if rest else torch.zeros(n, 0)
+    return Gaussians(
+        means=columns("x", "y", "z"), log_scales=columns(*SCALES), quaternions=columns(*ROTATION),
+        logits=columns("opacity")[:, 0], dc=columns(*DC_NAMES),
+        rest=coefficients.reshape(n, 3, rest // 3).transpose(1, 2).contiguous(),
+    )  # fmt: skip
+
+
+def _header(path: Path) -> tuple[np.dtype, int, int]:
+    """Layout of a vertex, their number, and where they begin."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(LONGEST_HEADER)
+    except OSError as error:
+        raise VdgsError(f"{path}: cannot be read ({error.strerror or error}).") from error
+    end = data.find(b"\nend_header")
+    start = data.find(b"\n", end + 1) + 1
+    if not data.startswith(b"ply") or end < 0 or not start:
+        raise VdgsError(f"{path}: is no PLY file.")
+    fields: list[tuple[str, str]] = []
+    form, count, elements = "", -1, 0
+    for words in (line.split() for line in data[:end].decode("latin-1").splitlines()):
+        if words[:1] == ["format"] and len(words) > 1:
+            form = words[1]
+        elif words[:1] == ["element"] and len(words) == 3:
+            elements += 1
+            count = int(words[2]) if elements == 1 and words[1] == "vertex" and words[2].isdecimal() else count
+        elif words[:1] == ["property"] and elements == 1:
+            if len(words) != 3 or words[1] not in TYPES:
+                raise VdgsError(f"{path}: has a property that is not understood ({' '.join(words)}).")
+            fields.append((words[2], TYPES[words[1]]))
+    if form != "binary_little_endian" or count < 0:
+        raise VdgsError(f"{path}: is no binary PLY of vertices (format {form!r}). Write it as binary_little_endian.")
+    return np.dtype(fields), count, start

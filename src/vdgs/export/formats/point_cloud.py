@@ -1,0 +1,113 @@
+"""The centres of the Gaussians as a point cloud: PLY in local coordinates, LAS and LAZ in those of the map.
+
+What is faint is written too: opacity goes along (LAS: as intensity, 0 .. 65535), so that programs can filter by it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vdgs.errors import VdgsError
+from vdgs.export.formats.export_scene import Facts, Scene, bytes_of, colours, opacities
+from vdgs.export.formats.gaussian_ply import comments
+from vdgs.system.atomic_files import write_atomically
+
+if TYPE_CHECKING:
+    import laspy
+
+LAYOUT = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("opacity", "<f4")])
+#: LAS keeps whole numbers of this, in units of the coordinates.
+STEP = 0.001
+LOST = ("sizes, rotations and changing colours are left out: these are points",)
+
+
+def write_points(path: Path, scene: Scene) -> tuple[str, ...]:
+    """Write x, y, z (ground frame), red, green, blue and opacity as PLY, atomically. Returns what was lost."""
+    names = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue", "float opacity"]
+    lines = ["ply", "format binary_little_endian 1.0", *comments(scene.facts), f"element vertex {scene.count}"]
+    header = "\n".join([*lines, *(f"property {name}" for name in names), "end_header", ""]).encode("ascii")
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            file.write(header)
+            for piece in scene.pieces():
+                rows = np.empty(len(piece), LAYOUT)
+                rows["xyz"], rows["rgb"] = piece.means.numpy(), bytes_of(colours(piece))
+                rows["opacity"] = opacities(piece)
+                rows.tofile(file)
+
+    write_atomically(path, write)
+    return LOST
+
+
+def refuse_without_laspy(path: Path, scene: Scene) -> None:
+    """Raise VdgsError where packages are missing that LAS and LAZ need."""
+    needed = ["laspy", *(["lazrs"] if path.suffix.lower() == ".laz" else []), *(["pyproj"] if scene.facts.crs else [])]
+    missing = [name for name in needed if importlib.util.find_spec(name) is None]
+    if missing:
+        raise VdgsError(f"{path}: needs {' and '.join(missing)}, not installed. Install with: pip install 'vdgs[geo]'")
+    if scene.facts.crs:
+        _crs(path, scene.facts.crs)
+
+
+def write_laz(path: Path, scene: Scene) -> tuple[str, ...]:
+    """Write a LAS 1.4 or, by the ending, LAZ file at origin + local coordinates, atomically, with the CRS as WKT.
+
+    Returns what was lost. Raises VdgsError.
+    """
+    refuse_without_laspy(path, scene)
+    import laspy
+
+    compressed = path.suffix.lower() == ".laz"
+    header = _las_header(path, scene.facts)
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file, laspy.open(
+            file, mode="w", header=header, do_compress=compressed, closefd=False
+        ) as writer:  # fmt: skip
+            origin = np.array(scene.facts.origin)
+            for piece in scene.pieces():
+                writer.write_points(_las_points(piece.means.double().numpy() + origin, bytes_of(colours(piece)),
+                                                opacities(piece), header))  # fmt: skip
+
+    write_atomically(path, write)
+    return LOST
+
+
+def _las_header(path: Path, facts: Facts) -> laspy.LasHeader:
+    import laspy
+
+    header = laspy.LasHeader(version="1.4", point_format=7)
+    header.scales = np.full(3, STEP)
+    header.offsets = np.floor(np.array(facts.origin))
+    header.generating_software = facts.program[:32]
+    if facts.crs:
+        header.add_crs(_crs(path, facts.crs))
+    return header
+
+
+def _las_points(
+    places: np.ndarray, rgb: np.ndarray, opacity: np.ndarray, header: laspy.LasHeader
+) -> laspy.ScaleAwarePointRecord:
+    import laspy
+
+    points = laspy.ScaleAwarePointRecord.zeros(len(places), header=header)
+    points.x, points.y, points.z = places.T
+    points.red, points.green, points.blue = rgb.T.astype(np.uint16) * 257
+    points.intensity = np.rint(opacity * 65535).astype(np.uint16)
+    points.return_number[:] = 1
+    points.number_of_returns[:] = 1
+    return points
+
+
+def _crs(path: Path, name: str) -> Any:
+    import pyproj
+
+    try:
+        return pyproj.CRS.from_user_input(name)
+    except pyproj.exceptions.CRSError as error:
+        raise VdgsError(f"{path}: the coordinate reference system {name!r} is not understood ({error}).") from None

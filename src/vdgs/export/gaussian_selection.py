@@ -1,0 +1,126 @@
+"""Which Gaussians of a scene go into which file, and in which coordinates: said before they are baked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from rich.console import Console
+
+from vdgs.config.commands import ExportRequest
+from vdgs.errors import VdgsError
+from vdgs.export.formats import registry
+from vdgs.export.formats.export_scene import Scene
+from vdgs.export.local_frame import FAR, Frame, frame_of, usual_crs
+from vdgs.geometry.map_projection import Placement
+from vdgs.model.decode_world import places
+from vdgs.runs.open_run import TrainedRun
+
+#: A file goes without Gaussians beyond its reach where they make at most this part of what the training cameras see.
+MOST_BEYOND = 1e-3
+
+
+def chosen(pixels: Float[np.ndarray, " g"], run: TrainedRun, asked: ExportRequest) -> Int[np.ndarray, " m"]:
+    """The Gaussians to write, ascending: drawn by a training camera, of the block, within the box, most drawn first
+    where they are too many. `pixels`: how many each makes. Raises VdgsError where none is left."""
+    k = run.model.anchors.offsets.shape[1]
+    wanted = pixels > 0
+    if asked.block is not None:
+        wanted &= np.repeat(_of_block(run, asked.block), k)
+    if asked.bbox is not None:
+        x0, y0, x1, y1 = asked.bbox
+        if not (x0 < x1 and y0 < y1):
+            raise VdgsError(f"--bbox {x0:g} {y0:g} {x1:g} {y1:g}: is empty. Give X0 Y0 X1 Y1, the lower corner first.")
+        crs = asked.crs or usual_crs(run.capture.ground, asked.to[0])
+        inside = Placement.of(run.capture.ground, crs).places(
+            places(run.model.anchors).cpu().double().reshape(-1, 3).numpy()
+        )
+        wanted &= (inside[:, :2] >= (x0, y0)).all(1) & (inside[:, :2] <= (x1, y1)).all(1)
+        if not wanted.any():
+            low, high = inside[pixels > 0, :2].min(0), inside[pixels > 0, :2].max(0)
+            raise VdgsError(
+                f"--bbox {x0:g} {y0:g} {x1:g} {y1:g}: holds nothing of the scene, which lies within "
+                f"{low[0]:.1f} {low[1]:.1f} {high[0]:.1f} {high[1]:.1f} of --crs {crs or 'UTM'}."
+            )
+    kept = np.flatnonzero(wanted)
+    if not len(kept):
+        raise VdgsError(f"{run.model_path}: no training camera draws anything of what was asked for.")
+    if 0 < asked.max_gaussians < len(kept):
+        most = np.argpartition(pixels[kept], -asked.max_gaussians)[-asked.max_gaussians :]
+        kept = np.sort(kept[most])
+    return kept
+
+
+def _of_block(run: TrainedRun, block: int) -> np.ndarray:
+    """Which anchors of a merged model a block has made."""
+    counts = [part.count for part in run.model.parts]
+    if run.name != "merged" or not 0 <= block < len(counts):
+        have = f"has blocks 0 to {len(counts) - 1}" if counts else "is not made of blocks with decoders of their own"
+        raise VdgsError(f"--block {block}: the {run.name} model {have}.")
+    return np.repeat(np.arange(len(counts)) == block, counts)
+
+
+def frame_for(path: Path, run: TrainedRun, asked: ExportRequest, centre: np.ndarray) -> Frame:
+    """The coordinates of a file: those that do not reach far have their origin nearby.
+
+    3D Tiles stand on the globe wherever it is known how, whatever --crs says of other files: no map lies between.
+    """
+    ground, kind = run.capture.ground, registry.format_of(path)
+    far = min(FAR, kind.reach / 2)
+    frame = frame_of(ground, asked.crs or usual_crs(ground, path), centre, far)  # which refuses what is no system
+    return frame_of(ground, "enu", centre, far) if kind.on_globe and ground.origin_geo is not None else frame
+
+
+def rows_for(
+    frames: Mapping[Path, Frame], run: TrainedRun, pixels: Float[np.ndarray, " g"], kept: Int[np.ndarray, " m"],
+    degree: int, console: Console,
+) -> dict[Path, Int[np.ndarray, " r"]]:  # fmt: skip
+    """Which of the Gaussians each file is given. What a format cannot hold is said before the work.
+
+    A format that does not reach far goes without the few Gaussians that lie beyond and of which the photographs show
+    next to nothing; more of them are refused.
+    """
+    means = places(run.model.anchors).cpu().reshape(-1, 3).numpy()[kept]
+    pixels = pixels[kept]
+    rows = {}
+    for path, frame in frames.items():
+        reach = registry.format_of(path).reach
+        beyond = (np.abs(_local(frame, means)) >= 0.999 * reach).any(1)
+        share = float(pixels[beyond].sum() / pixels.sum())
+        if share > MOST_BEYOND:
+            beyond[:] = False  # it is refused below
+        elif beyond.any():
+            console.print(
+                f"[yellow]note[/] {path.name}: {np.count_nonzero(beyond):,} of {len(kept):,} Gaussians lie more than "
+                f"{reach:.0f} units away, where the format does not reach; they are left out. They make "
+                f"{share:.2g} of what the training cameras see.",
+                highlight=False,
+            )
+        rows[path] = np.flatnonzero(~beyond)
+        registry.check(
+            path,
+            Scene(
+                chunks=(),
+                count=len(rows[path]),
+                degree=degree,
+                facts=frame.facts,
+                bounds=bounds_of(frame, means[rows[path]]),
+            ),
+        )
+    return rows
+
+
+def _local(frame: Frame, means: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+    local: np.ndarray = frame.apply(means.astype(np.float64))
+    return local
+
+
+def bounds_of(
+    frame: Frame, means: Float[np.ndarray, "m 3"]
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Lowest and highest local coordinates."""
+    local = _local(frame, means)
+    (x0, y0, z0), (x1, y1, z1) = local.min(axis=0).tolist(), local.max(axis=0).tolist()
+    return (x0, y0, z0), (x1, y1, z1)

@@ -1,1 +1,0 @@
-"""`vdgs inspect`: what a capture holds and how well its photographs cover the place."""

@@ -1,0 +1,51 @@
+"""Adam on rows in C++: bound by memory, threaded."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int32, Int64
+from torch import Tensor
+
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.kernel_types import AdamState
+from vdgs.kernels.torch_ref.adam import StepFactors, check_rows, check_step
+
+
+def adam_rows(
+    state: AdamState,
+    rows: Int64[Tensor, "v"] | None,
+    gradient: Float[Tensor, "v *rest"],
+    step: int | Int32[Tensor, " v"],
+    *,
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    epsilon: float = 1e-15,
+) -> bool:
+    """As `reference.adam.adam_rows`, for contiguous float32 parameters and moments.
+
+    Raises ValueError also where one of those is not contiguous. Same bits for any number of threads.
+    """
+    check_rows(state, rows, gradient)
+    factors = check_step(state, step, len(gradient), beta1, beta2, epsilon)
+    tensors = state[:3]
+    if state.parameter.dtype != torch.float32:
+        raise TypeError(f"parameter must be float32, not {state.parameter.dtype}")
+    if not all(tensor.is_contiguous() for tensor in tensors):
+        raise ValueError("parameter, first moment and second moment must be contiguous")
+    if gradient.numel() == 0:
+        return True
+    flat, first, second = (tensor.detach().view(tensor.shape[0], -1) for tensor in tensors)
+    packed = gradient.detach().contiguous().view(gradient.shape[0], -1)
+    chosen = None if rows is None else rows.contiguous()
+    updates = None if isinstance(step, int) else step.contiguous()
+    finite: bool = extension.native().adam_rows(flat, chosen, packed, first, second, updates, *rounded(factors))
+    if finite:
+        # What autograd has saved of these no longer holds their values.
+        torch.autograd.graph.increment_version(tensors)
+    return finite
+
+
+def rounded(factors: StepFactors) -> StepFactors:
+    """The same with the tables in float32."""
+    return factors._replace(rates=factors.rates.astype(np.float32), roots=factors.roots.astype(np.float32))

@@ -1,0 +1,25 @@
+"""What the C++ kernels ask of their arguments: float32, contiguous, in main memory, of the right shape."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from vdgs.geometry.camera import Camera
+
+
+def contiguous(tensor: Tensor) -> Tensor:
+    """The same numbers as the kernels read them, differentiably; the tensor itself where it is so already."""
+    return tensor.to(device="cpu", dtype=torch.float32).contiguous()
+
+
+def packed_camera(camera: Camera) -> Tensor:
+    """The camera as the kernels read it, [22] float32."""
+    return torch.from_numpy(camera.packed)
+
+
+def require_rows(rows: int, **arguments: tuple[Tensor, int]) -> None:
+    """Raise ValueError unless every named tensor is [rows, its width]: the kernels do not look again."""
+    for name, (tensor, width) in arguments.items():
+        if tuple(tensor.shape) != (rows, width):
+            raise ValueError(f"{name} must be [{rows}, {width}], not {list(tensor.shape)}")

@@ -1,0 +1,22 @@
+"""Means of ellipsoids in C++: eight Gaussians side by side, threaded by Gaussians."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.torch_ref.harmonics import check_runs
+
+
+def mean_ellipsoids(
+    log_scales: Float[Tensor, "p 3"], quaternions: Float[Tensor, "p 4"], weights: Float[Tensor, " p"],
+    starts: Int64[Tensor, " m"],
+) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 4"]]:  # fmt: skip
+    """As `reference.ellipsoids.mean_ellipsoids`. Same bits for any number of threads."""
+    check_runs(starts, len(weights))
+    found = torch.empty(len(starts), 3), torch.empty(len(starts), 4)
+    given = (each.contiguous() for each in (log_scales, quaternions, weights))
+    extension.native().mean_ellipsoids(*given, starts, *found)
+    return found

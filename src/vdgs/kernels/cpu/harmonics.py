@@ -1,0 +1,38 @@
+"""Spherical harmonics of many Gaussians in C++: sixteen Gaussians side by side, threaded by Gaussians."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.spherical_harmonics import function_count
+from vdgs.kernels.torch_ref.harmonics import check_coefficients, check_runs
+
+
+def harmonic_colours(
+    means: Float[Tensor, "m 3"], coefficients: Float[Tensor, "n c"], rows: Int64[Tensor, " m"],
+    eye: Float[Tensor, "3"], degree: int,
+) -> Float[Tensor, "m 3"]:  # fmt: skip
+    """As `reference.harmonics.harmonic_colours`. Same bits for any number of threads."""
+    check_coefficients(coefficients, rows, degree)
+    if coefficients.stride(1) != 1:
+        coefficients = coefficients.contiguous()
+    colours = torch.empty(len(rows), 3)
+    extension.native().harmonic_colours(means.contiguous(), coefficients, rows, eye.contiguous(), degree, colours)
+    return colours
+
+
+def fit_harmonics(
+    directions: Float[Tensor, "p 3"], colours: Float[Tensor, "p 3"], weights: Float[Tensor, " p"],
+    starts: Int64[Tensor, " m"], degree: int, ridge: float,
+) -> Float[Tensor, "m f 3"]:  # fmt: skip
+    """As `reference.harmonics.fit_harmonics`. Same bits for any number of threads."""
+    f = function_count(degree)
+    check_runs(starts, len(weights))
+    found = torch.empty(len(starts), 3 * f)
+    extension.native().fit_harmonics(
+        directions.contiguous(), colours.contiguous(), weights.contiguous(), starts, degree, ridge, found
+    )
+    return found.view(-1, f, 3)

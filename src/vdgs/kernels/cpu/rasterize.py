@@ -1,0 +1,128 @@
+"""Splats to a picture, in C++ on the CPU (native/cpu/rasterise/rasterise.h)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vdgs.kernels.autograd import differentiable
+from vdgs.kernels.cpu import extension as native_module
+from vdgs.kernels.kernel_types import Raster, RasterGradients, RasterPullback, Shares, Splats
+from vdgs.kernels.splat_checks import check_splats
+
+
+def rasterise(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    *,
+    depth: bool = False,
+    module: Any = None,
+) -> Raster:
+    """Blend splats front to back (3DGS, eqs. 2-3), differentiable in their five tensors and the background.
+
+    All are float32 on the CPU. `depth` asks for the expected depth, the sum of w_i depth_i, neither
+    divided by alpha nor given a background, and for the median depth, which is not differentiable; without
+    it the picture costs nothing extra. Thresholds as in vdgs.kernels.constants. `module` is the build of the
+    kernels to use (default: the one of this process).
+
+    A splat whose row holds NaN or infinity, or whose conic is not positive definite, is not drawn and
+    its gradient is zero. The result has the same bits for any number of threads.
+
+    Raises TypeError or ValueError for tensors of another type, device or shape, or a picture side
+    outside 1 .. 524272. The second derivative is not defined: asking for it raises RuntimeError.
+    """
+    return differentiable(lambda tensors: _draw(tensors, width, height, depth, module), splats, background)
+
+
+def rasterise_vjp(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    *,
+    depth: bool = False,
+    module: Any = None,
+) -> tuple[Raster, RasterPullback]:
+    """`rasterise` without autograd: the picture, and the way back from it. Raises what `rasterise` raises.
+
+    Of the arguments nothing is kept: their memory may be used again before the way back.
+    """
+    return _draw((*splats.tensors, background), width, height, depth, module)
+
+
+def shares(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    wanted: Float[Tensor, "h w 3"] | None = None,
+    *,
+    module: Any = None,
+) -> Shares:
+    """As `reference.shares.shares`: front to back a second time, four sums for each splat of a tile where the way back
+    of `rasterise` makes ten. The same bits for any number of threads."""
+    raster, pullback = _draw((*splats.tensors, background), width, height, False, module)
+    lacking = torch.zeros_like(raster.image) if wanted is None else wanted - raster.image
+    found = Shares(torch.empty(pullback.count), torch.empty(pullback.count, 3))
+    pullback.module.rasterise_shares(pullback.frame, lacking.contiguous().numpy(), *(t.numpy() for t in found))
+    return found
+
+
+def _draw(tensors: tuple[Tensor, ...], width: int, height: int, depth: bool, module: Any) -> tuple[Raster, _Pullback]:
+    """The picture of means_px, conics, colours, opacities, depths before a background, and the way back."""
+    _check(tensors, width, height)
+    module = module or native_module.native()
+    depths = (torch.empty(height, width), torch.empty(height, width)) if depth else (None, None)
+    raster = Raster(torch.empty(height, width, 3), torch.empty(height, width), *depths)
+    behind = tuple(tensors[5].tolist())
+    frame = module.rasterise_forward(
+        *(t.detach().contiguous().numpy() for t in tensors[:5]), behind, width, height,
+        *(None if t is None else t.numpy() for t in raster),
+    )  # fmt: skip
+    return raster, _Pullback(frame, module, len(tensors[0]), behind, depth)
+
+
+@dataclass(frozen=True)
+class _Pullback:
+    """What is kept of a picture for its backward pass: see `RasterPullback`."""
+
+    frame: Any
+    module: Any
+    count: int
+    background: tuple[float, ...]
+    with_depth: bool
+
+    def __call__(
+        self,
+        image: Tensor | None,
+        alpha: Tensor | None = None,
+        depth: Tensor | None = None,
+        over: tuple[Tensor, Tensor] | None = None,
+        count: int | None = None,
+    ) -> RasterGradients:
+        n = self.count if count is None else count
+        means, conics = over or (torch.empty(n, 2), torch.empty(n, 3))
+        if not 0 <= n <= self.count or not len(means) == len(conics) == n:
+            raise ValueError(f"gradients of {n} splats of {self.count} do not fit into {len(means)} and {len(conics)}")
+        colours, opacities, background = torch.empty(n, 3), torch.empty(n), torch.empty(3)
+        depths = torch.empty(n) if self.with_depth else None
+        found = RasterGradients(means, conics, colours, opacities, depths, background)
+        self.module.rasterise_backward(
+            self.frame, self.background,
+            *(None if g is None else g.contiguous().numpy() for g in (image, alpha, depth)),
+            *(None if t is None else t.numpy() for t in found),
+        )  # fmt: skip
+        return found
+
+
+def _check(tensors: tuple[Tensor, ...], width: int, height: int) -> None:
+    check_splats(tensors, width, height, "cpu")
+    n = len(tensors[0])
+    if n >= 2**31:
+        raise ValueError(f"at most 2^31 - 1 splats can be drawn at once, not {n}")

@@ -1,0 +1,45 @@
+"""How many cameras see each point, in C++: blocks of neighbouring points against frusta."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int32
+from torch import Tensor
+
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.cpu import extension
+from vdgs.kernels.cpu.cells import morton_order
+from vdgs.kernels.torch_ref.visibility import check_points
+
+#: From this many cameras on it pays to sort the points, so that whole blocks of them are decided at once.
+SORT_FROM_CAMERAS = 8
+
+
+def count_visibility(points: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int32[Tensor, "n"]:
+    """As `reference.visibility.count_visibility`, to the last point: what float32 cannot decide, float64 does.
+
+    O(n) memory. Fast where cameras see small parts of the scene: a block of 512 neighbours that lies inside
+    or outside a frustum costs one test.
+    """
+    check_points(points)
+    count = torch.zeros(points.shape[0], dtype=torch.int32)
+    if len(cameras) == 0 or points.shape[0] == 0:
+        return count
+    packed = np.stack([camera.packed_exactly for camera in cameras])
+    points = points.detach().contiguous()
+    if len(cameras) < SORT_FROM_CAMERAS:
+        extension.native().count_visibility(points, packed, count)
+        return count
+    order = morton_order(torch.nan_to_num(points, posinf=0.0, neginf=0.0))
+    sorted_count = torch.empty_like(count)
+    extension.native().count_visibility(points[order], packed, sorted_count)
+    count[order] = sorted_count
+    return count
+
+
+def mark_visible(points: Float[Tensor, "n 3"], camera: Camera) -> Bool[Tensor, "n"]:
+    """Which points one camera sees."""
+    return count_visibility(points, [camera]) > 0

@@ -1,0 +1,67 @@
+"""Compiled code on disk, found again by everything that it was made from.
+
+An entry is whole or absent (it is renamed into place), carries the digest of its code, and its name is a digest of
+sources, headers, options, compiler and target: nothing is ever stale, and processes that compile the same thing at
+once write the same entry. A damaged one is compiled again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from vdgs.errors import VdgsError
+from vdgs.system.atomic_files import write_bytes
+
+#: Overrides the folder of compiled code.
+VARIABLE = "VDGS_CUDA_CACHE"
+MAGIC = b"vdgs code 1\n"
+
+
+def cache_folder() -> Path:
+    """Where compiled code is kept: $VDGS_CUDA_CACHE, or the platform's folder for caches."""
+    if named := os.environ.get(VARIABLE):
+        return Path(named)
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return base / "vdgs" / "cuda"
+
+
+def key_of(parts: Mapping[str, str]) -> str:
+    """A digest of named texts: of the names, of the texts and of where one ends and the next begins."""
+    digest = hashlib.sha256()
+    for name, text in sorted(parts.items()):
+        for piece in (name.encode(), text.encode()):
+            digest.update(len(piece).to_bytes(8, "little") + piece)
+    return digest.hexdigest()
+
+
+def cached(name: str, parts: Mapping[str, str], make: Callable[[], bytes]) -> bytes:
+    """The code made from these parts: as it was kept, or made now and kept.
+
+    `name` (for people) begins the file's name. A folder that cannot be read or written costs time, not the work.
+    """
+    path = cache_folder() / f"{name}-{key_of(parts)[:40]}.bin"
+    if (code := _read(path)) is not None:
+        return code
+    code = make()
+    with suppress(VdgsError):
+        write_bytes(path, MAGIC + hashlib.sha256(code).digest() + code)
+    return code
+
+
+def _read(path: Path) -> bytes | None:
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    head, digest, code = content[: len(MAGIC)], content[len(MAGIC) : len(MAGIC) + 32], content[len(MAGIC) + 32 :]
+    return code if head == MAGIC and digest == hashlib.sha256(code).digest() else None

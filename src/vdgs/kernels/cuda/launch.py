@@ -1,0 +1,135 @@
+"""From a source to a running kernel: compiled for the card at hand, loaded once, its arguments checked and packed."""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from vdgs.kernels.cuda.compile_cache import cached
+from vdgs.kernels.cuda.driver import Driver, Grid, cuda_driver
+from vdgs.kernels.cuda.nvrtc import Nvrtc, Target, nvrtc
+
+OPTIONS = ("--std=c++17",)
+#: Limits of every card since compute capability 3.0.
+MOST_BLOCKS: Grid = (2**31 - 1, 65535, 65535)
+MOST_THREADS = 1024
+
+#: What a kernel may be given: a tensor (its data pointer), nothing (a null pointer), a ctypes number or a structure.
+Argument = Tensor | ctypes._SimpleCData | ctypes.Structure | None
+
+
+def read_source(name: str) -> str:
+    """A CUDA source of this package."""
+    return resources.files(__package__).joinpath("source", name).read_text(encoding="utf-8")
+
+
+def read_header(name: str) -> str:
+    """A header that the C++ of the processor is made of too."""
+    return (Path(__file__).parents[1] / "shared" / name).read_text(encoding="utf-8")
+
+
+def compile_source(name: str, target: Target, *, headers: Sequence[str] = (), compiler: Nvrtc | None = None) -> bytes:
+    """A source of this package with these shared headers, compiled, from the cache if it is there.
+
+    Raises CompileError, CudaUnavailable.
+    """
+    compiler = compiler or nvrtc()
+    source, texts = read_source(name), {title: read_header(title) for title in headers}
+    parts = {f"header {title}": text for title, text in texts.items()}
+    parts |= {"source": source, "options": "\n".join(OPTIONS), "target": target.name, "NVRTC": str(compiler.version)}
+    return cached(f"{name}-{target.name}", parts, lambda: compiler.compile(name, source, texts, target, OPTIONS))
+
+
+@dataclass(eq=False, kw_only=True)
+class Program:
+    """The kernels of one source, compiled and loaded once for each device, at the first launch there."""
+
+    name: str
+    #: Stands in for the driver of this machine.
+    driver: Driver | None = None
+    #: Names of shared headers that it includes.
+    headers: Sequence[str] = ()
+    _functions: dict[tuple[torch.device, str], int] = field(default_factory=dict)
+    _modules: dict[torch.device, int] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def launch(self, kernel: str, grid: Sequence[int], block: Sequence[int], *arguments: Argument) -> None:
+        """Queue a kernel on torch's current stream of the device that its tensors are on.
+
+        Grid and block have up to three sides; a grid with a side of zero is nothing to do. Raises ValueError for
+        tensors that are not contiguous or of several devices, or for sides out of range; TypeError for tensors of
+        another kind of device; CudaUnavailable and CompileError where the kernel cannot be made or run.
+        """
+        driver = self.driver or cuda_driver()
+        device = common_device(arguments, driver.device_type)
+        blocks, threads = _sides(grid), _sides(block)
+        _check_sides(blocks, threads)
+        if 0 in blocks:
+            return
+        function = self._function(driver, device, kernel)
+        values, pointers = pack(arguments)
+        driver.launch(function, blocks, threads, device, pointers)
+        del values  # the driver has copied them; until then the pointers lead there
+
+    def _function(self, driver: Driver, device: torch.device, kernel: str) -> int:
+        with self._lock:
+            key = (device, kernel)
+            if key not in self._functions:
+                if device not in self._modules:
+                    target = nvrtc().target_for(driver.capability(device))
+                    code = compile_source(self.name, target, headers=self.headers)
+                    self._modules[device] = driver.load(code, device)
+                self._functions[key] = driver.function(self._modules[device], kernel)
+            return self._functions[key]
+
+
+def pack(
+    arguments: Sequence[Argument],
+) -> tuple[list[ctypes._SimpleCData | ctypes.Structure], ctypes.Array[ctypes.c_void_p]]:
+    """What a launch is given: the values, which must outlive the call, and an array of pointers to them."""
+    values = [_value(argument) for argument in arguments]
+    pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
+    return values, pointers
+
+
+def common_device(arguments: Sequence[Argument], device_type: str) -> torch.device:
+    """The device of all tensors. Raises TypeError or ValueError unless a kernel can read them all there."""
+    tensors = [argument for argument in arguments if isinstance(argument, Tensor)]
+    if not tensors:
+        raise ValueError("a kernel must be given at least one tensor")
+    for tensor in tensors:
+        if tensor.device.type != device_type:
+            raise TypeError(f"a kernel's tensors must be on a {device_type} device, not on {tensor.device}")
+        if not tensor.is_contiguous():
+            raise ValueError(f"a kernel's tensors must be contiguous; one of shape {list(tensor.shape)} is not")
+    devices = {tensor.device for tensor in tensors}
+    if len(devices) > 1:
+        raise ValueError(f"a kernel's tensors are on several devices: {', '.join(sorted(map(str, devices)))}")
+    return tensors[0].device
+
+
+def _value(argument: Argument) -> ctypes._SimpleCData | ctypes.Structure:
+    if argument is None:
+        return ctypes.c_void_p(0)
+    if isinstance(argument, Tensor):
+        return ctypes.c_void_p(argument.data_ptr())
+    return argument
+
+
+def _sides(sides: Sequence[int]) -> Grid:
+    x, y, z = (*sides, 1, 1, 1)[:3]
+    return x, y, z
+
+
+def _check_sides(grid: Grid, block: Grid) -> None:
+    if any(not 0 <= side <= most for side, most in zip(grid, MOST_BLOCKS, strict=True)):
+        raise ValueError(f"a grid of {grid} blocks cannot be launched; at most {MOST_BLOCKS}")
+    if min(block) < 1 or block[0] * block[1] * block[2] > MOST_THREADS or block[2] > 64:
+        raise ValueError(f"a block of {block} threads cannot be launched; at most {MOST_THREADS}")

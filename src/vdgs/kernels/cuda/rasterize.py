@@ -1,0 +1,184 @@
+"""Splats to a picture on a GPU (source/rasterise.cu): `vdgs.kernels.torch_ref.rasterize`, tile by tile."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int32, Int64
+from torch import Tensor
+
+from vdgs.kernels.autograd import differentiable
+from vdgs.kernels.cuda.launch import Argument, Program
+from vdgs.kernels.kernel_types import OrderedSplats, Raster, RasterGradients, RasterPullback, Shares, Splats
+from vdgs.kernels.splat_checks import check_splats
+from vdgs.kernels.splat_segments import Runs
+from vdgs.kernels.torch_ref.splat_contributions import shares_by
+
+#: Side of a tile, threads of a block and sums of an entry: kTile, kThreads and kSums of the source.
+TILE_PX, THREADS, SUMS = 16, 256, 10
+PROGRAM = Program(name="rasterise.cu", headers=("image_formation.h",))
+
+
+def rasterise(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    *,
+    depth: bool = False,
+    program: Program = PROGRAM,
+) -> Raster:
+    """As `native.rasterise`, for float32 tensors on a CUDA device; median depth included. Same bits every time.
+
+    Waits for the device once: how many entries (splats times the tiles that they reach) there is room to be made for.
+    Backward takes 52 bytes an entry. Raises TypeError or ValueError for unsuitable tensors, CudaUnavailable where the
+    kernels cannot be run.
+    """
+    runs = _runs_of(splats)
+    return differentiable(lambda tensors: _draw(tensors, runs, width, height, depth, program), splats, background)
+
+
+def rasterise_vjp(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    *,
+    depth: bool = False,
+    program: Program = PROGRAM,
+) -> tuple[Raster, RasterPullback]:
+    """`rasterise` without autograd: the picture, and the way back from it, which reads the splats again."""
+    return _draw((*splats.tensors, background), _runs_of(splats), width, height, depth, program)
+
+
+def shares(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    wanted: Float[Tensor, "h w 3"] | None = None,
+) -> Shares:
+    """As `reference.shares.shares`, by the whole way back."""
+    return shares_by(rasterise_vjp, splats, background, width, height, wanted)
+
+
+def _runs_of(splats: Splats) -> Runs | None:
+    return splats.runs if isinstance(splats, OrderedSplats) else None
+
+
+@dataclass(frozen=True)
+class _Entries:
+    """What each tile shows, front to back: n entries, one for each splat and tile that it reaches. Before they are
+    sorted they stand in the order of the splats: that of the rows, or `splats`."""
+
+    owners: Int32[Tensor, " n"]  # the splat of each entry, before sorting
+    order: Int64[Tensor, " n"]  # where each entry was before sorting
+    bounds: Int64[Tensor, " tiles_and_one"]  # where those of each tile begin
+    ends: Int64[Tensor, " m"]  # where those of each splat end, before sorting
+    splats: Int32[Tensor, " m"] | None  # the rows of splats in their order; None: as they stand
+
+
+def _draw(
+    tensors: tuple[Tensor, ...], runs: Runs | None, width: int, height: int, depth: bool, program: Program
+) -> tuple[Raster, RasterPullback]:
+    """The picture of means_px, conics, colours, opacities, depths before a background, and the way back."""
+    check_splats(tensors, width, height)
+    *splats, background = (t.detach().contiguous() for t in tensors)
+    grid = -(-width // TILE_PX), -(-height // TILE_PX)
+    entries = _entries(splats, runs, grid, program)
+    image, transmittance = background.new_empty(height, width, 3), background.new_empty(height, width)
+    last = torch.empty_like(transmittance, dtype=torch.int32)
+    depths = (torch.empty_like(transmittance), torch.empty_like(transmittance)) if depth else (None, None)
+    program.launch(
+        "rasterise_forward", grid, (THREADS,), *splats, entries.owners, entries.order, entries.bounds, background,
+        ctypes.c_int(width), ctypes.c_int(height), image, transmittance, last, *depths,
+    )  # fmt: skip
+    raster = Raster(image, 1.0 - transmittance, *depths)
+    return raster, _Pullback(
+        program=program,
+        splats=splats,
+        background=background,
+        entries=entries,
+        raster=raster,
+        transmittance=transmittance,
+        last=last,
+    )
+
+
+def _order(runs: Runs, m: int, program: Program) -> Int32[Tensor, " m"]:
+    """`Runs.order` in one pass: a warp a run."""
+    order, count = runs.begins.new_empty(m), len(runs.begins)
+    ends = runs.lengths.cumsum(0, dtype=torch.int32)
+    program.launch("order_splats", _over(32 * count), (THREADS,), runs.begins, ends, ctypes.c_int(count), order)
+    return order
+
+
+def _entries(splats: list[Tensor], runs: Runs | None, grid: tuple[int, int], program: Program) -> _Entries:
+    means = splats[0]
+    count, (columns, rows) = len(means), grid
+    order = None if runs is None else _order(runs, count, program)
+    sides = order, ctypes.c_longlong(count), ctypes.c_int(columns), ctypes.c_int(rows)
+    tiles = means.new_empty(count, dtype=torch.int64)
+    program.launch("splat_tiles", _over(count), (THREADS,), *splats, *sides, tiles)
+    ends = tiles.cumsum(0)
+    # The one wait for the device in a picture: memory must be asked for by its size.
+    total = int(ends[-1]) if count else 0
+    keys, owners = means.new_empty(total, dtype=torch.int64), means.new_empty(total, dtype=torch.int32)
+    program.launch("splat_entries", _over(count), (THREADS,), *splats, *sides, ends, keys, owners)
+    ordered, before = torch.sort(keys, stable=True)
+    begins = torch.arange(columns * rows + 1, device=means.device) << 32
+    return _Entries(owners, before, torch.searchsorted(ordered, begins), ends, order)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pullback:
+    """What is kept of a picture for its backward pass: see `RasterPullback`."""
+
+    program: Program
+    splats: list[Tensor]
+    background: Tensor
+    entries: _Entries
+    raster: Raster
+    transmittance: Float[Tensor, "h w"]
+    last: Int32[Tensor, "h w"]
+
+    def __call__(
+        self,
+        image: Tensor | None,
+        alpha: Tensor | None = None,
+        depth: Tensor | None = None,
+        over: tuple[Tensor, Tensor] | None = None,
+        count: int | None = None,
+    ) -> RasterGradients:
+        means, conics, colours, opacities, depths = self.splats
+        entries, (height, width) = self.entries, self.transmittance.shape
+        wanted = [None if g is None else g.contiguous() for g in (image, alpha, depth)]
+        first = slice(count)
+        kept = ctypes.c_longlong(len(means[first]))
+        sums = means.new_zeros(len(entries.owners), SUMS)
+        picture: list[Argument] = [self.raster.image, self.transmittance, self.last, self.raster.depth]
+        self.program.launch(
+            "rasterise_backward", (-(-width // TILE_PX), -(-height // TILE_PX)), (THREADS,), *self.splats,
+            entries.owners, entries.order, entries.bounds, ctypes.c_int(width), ctypes.c_int(height), *picture,
+            *wanted, kept, sums,
+        )  # fmt: skip
+        by_means, by_conics = over or (torch.empty_like(means[first]), torch.empty_like(conics[first]))
+        by_colours, by_opacities = torch.empty_like(colours[first]), torch.empty_like(opacities[first])
+        by_depths = None if self.raster.depth is None else torch.empty_like(depths[first])
+        self.program.launch(
+            "gather_gradients", _over(len(means)), (THREADS,), *self.splats, entries.splats,
+            ctypes.c_longlong(len(means)), entries.ends, sums, kept, by_means, by_conics, by_colours, by_opacities,
+            by_depths,
+        )  # fmt: skip
+        if wanted[0] is None:
+            by_background = torch.zeros_like(self.background)
+        else:
+            by_background = (self.transmittance[..., None] * wanted[0]).sum((0, 1))
+        return RasterGradients(by_means, by_conics, by_colours, by_opacities, by_depths, by_background)
+
+
+def _over(count: int) -> tuple[int]:
+    """The grid of a kernel with a thread for each of so many."""
+    return (-(-count // THREADS),)

@@ -1,0 +1,27 @@
+"""What a GPU computes with: torch, own CUDA kernels and gsplat, put together to the whole set of operations.
+
+`vdgs.kernels.operations.ON_A_CARD` says which operation is which.
+"""
+
+from vdgs.kernels.cuda import add_view_statistics as add_view_statistics
+from vdgs.kernels.cuda import cull as cull
+from vdgs.kernels.cuda import decode as decode
+from vdgs.kernels.cuda import decode_backward_adam as decode_backward_adam
+from vdgs.kernels.cuda import decode_to_train as decode_to_train
+from vdgs.kernels.cuda import photometric_loss as photometric_loss
+from vdgs.kernels.cuda import shares as shares
+from vdgs.kernels.gpu.rasterizer import rasterise as rasterise
+from vdgs.kernels.gpu.rasterizer import rasterise_vjp as rasterise_vjp
+from vdgs.kernels.torch_ref import adam_rows as adam_rows
+from vdgs.kernels.torch_ref import cell_centres as cell_centres
+from vdgs.kernels.torch_ref import cell_keys as cell_keys
+from vdgs.kernels.torch_ref import contains as contains
+from vdgs.kernels.torch_ref import count_visibility as count_visibility
+from vdgs.kernels.torch_ref import fit_harmonics as fit_harmonics
+from vdgs.kernels.torch_ref import group_cells as group_cells
+from vdgs.kernels.torch_ref import group_max as group_max
+from vdgs.kernels.torch_ref import harmonic_colours as harmonic_colours
+from vdgs.kernels.torch_ref import mark_visible as mark_visible
+from vdgs.kernels.torch_ref import mean_ellipsoids as mean_ellipsoids
+from vdgs.kernels.torch_ref import morton_order as morton_order
+from vdgs.kernels.torch_ref import project as project

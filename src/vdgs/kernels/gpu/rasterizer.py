@@ -1,0 +1,54 @@
+"""Which rasteriser draws on a GPU: gsplat where it can be used, the own kernels elsewhere and wherever depth is asked
+for, since gsplat cannot tell the median depth of a pixel."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+from types import ModuleType
+
+from jaxtyping import Float
+from torch import Tensor
+
+from vdgs.errors import VdgsError
+from vdgs.kernels import cuda, gsplat
+from vdgs.kernels.gsplat.rasterize import GsplatUnavailable, load
+from vdgs.kernels.kernel_types import Raster, RasterPullback, Splats
+
+#: Environment variable that takes one of them: `gsplat` or `cuda`.
+VARIABLE = "VDGS_RASTERISER"
+
+
+def rasterise(
+    splats: Splats, background: Float[Tensor, "3"], width: int, height: int, *, depth: bool = False
+) -> Raster:
+    """As `native.rasterise`, for float32 tensors on a GPU."""
+    return _drawing(depth).rasterise(splats, background, width, height, depth=depth)
+
+
+def rasterise_vjp(
+    splats: Splats, background: Float[Tensor, "3"], width: int, height: int, *, depth: bool = False
+) -> tuple[Raster, RasterPullback]:
+    """`rasterise` without autograd: the picture, and the way back from it, which may read the splats again."""
+    return _drawing(depth).rasterise_vjp(splats, background, width, height, depth=depth)
+
+
+def _drawing(depth: bool) -> ModuleType:
+    return cuda if depth else chosen(os.environ.get(VARIABLE, ""))
+
+
+@cache
+def chosen(asked: str) -> ModuleType:
+    """The implementation that is asked for, or the one that can be used. Raises GsplatUnavailable where gsplat is asked
+    for and cannot be used, VdgsError for another word."""
+    if asked not in ("", "gsplat", "cuda"):
+        raise VdgsError(f"{VARIABLE} must be gsplat, cuda or not set, not {asked!r}.")
+    if asked == "cuda":
+        return cuda
+    try:
+        load()
+    except GsplatUnavailable:
+        if asked:
+            raise
+        return cuda
+    return gsplat

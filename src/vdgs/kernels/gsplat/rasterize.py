@@ -1,0 +1,127 @@
+"""Splats to a picture by gsplat: `isect_tiles`, `isect_offset_encode`, `rasterize_to_pixels`.
+
+Both sides mean the same by means (the first pixel's centre is (0.5, 0.5)), conics, alpha (from 1/255 to 0.999), the end
+of a pixel (transmittance 1e-4) and equal depths (the order of the rows: `OrderedSplats.runs` are not looked at). gsplat
+asks in addition how far each splat reaches, and knows no depth: here it is a fourth colour over a background of zero.
+Median depth it cannot tell: that is None.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from contextlib import redirect_stdout
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int32
+from torch import Tensor
+
+from vdgs.errors import VdgsError
+from vdgs.kernels.autograd import pulled_back
+from vdgs.kernels.constants import ALPHA_MIN
+from vdgs.kernels.kernel_types import Raster, RasterPullback, Splats
+from vdgs.kernels.splat_checks import check_splats
+
+#: Side of gsplat's tiles, in pixels (its default).
+TILE_PX = 16
+
+
+class GsplatUnavailable(VdgsError):
+    """gsplat is not installed or does not load."""
+
+
+def rasterise(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    *,
+    depth: bool = False,
+    engine: Any = None,
+) -> Raster:
+    """As `native.rasterise`, for tensors on a GPU; depths must be positive (gsplat sorts by their bits).
+
+    Waits for the device once, in `isect_tiles`: for how many tiles the splats reach. `engine` offers gsplat's three
+    functions (default: gsplat, which compiles its kernels when first used; that takes minutes and a CUDA toolkit).
+    Raises GsplatUnavailable without gsplat, TypeError or ValueError for unsuitable tensors.
+    """
+    engine = engine or load()
+    check_splats((*splats.tensors, background), width, height)
+    means_px, conics, colours, opacities, depths = splats.tensors
+    if not len(means_px):
+        return _empty(background, width, height, depth)
+    reach = reach_px(splats)
+    columns, rows = -(-width // TILE_PX), -(-height // TILE_PX)
+    # gsplat draws several pictures at once: this is one.
+    means, radii, near = means_px[None], reach[None], depths[None]
+    _, keys, order = engine.isect_tiles(means.detach(), radii, near.detach(), TILE_PX, columns, rows)
+    offsets = engine.isect_offset_encode(keys, 1, columns, rows).reshape(1, rows, columns)
+    painted, behind = colours, background
+    if depth:
+        painted, behind = torch.cat([colours, depths[:, None]], dim=1), torch.cat([background, background.new_zeros(1)])
+    picture, alpha = engine.rasterize_to_pixels(
+        means, conics[None], painted[None], opacities[None], width, height, TILE_PX, offsets, order,
+        backgrounds=behind[None],
+    )  # fmt: skip
+    return Raster(picture[0, ..., :3], alpha[0, ..., 0], picture[0, ..., 3] if depth else None)
+
+
+def rasterise_vjp(
+    splats: Splats,
+    background: Float[Tensor, "3"],
+    width: int,
+    height: int,
+    *,
+    depth: bool = False,
+    engine: Any = None,
+) -> tuple[Raster, RasterPullback]:
+    """`rasterise`, and the way back from it: gsplat's own derivative, those of the means in pixels among it."""
+
+    def draw(splats: Splats, background: Tensor) -> Raster:
+        return rasterise(splats, background, width, height, depth=depth, engine=engine)
+
+    return pulled_back(draw, splats, background)
+
+
+@torch.no_grad()
+def reach_px(splats: Splats) -> Int32[Tensor, "m 2"]:
+    """How far from its centre, in x and y, a splat's alpha is at least 1/255; 0 for one that is not to be drawn.
+
+    Those are the splats of which a number is not finite, or whose conic is not positive definite. On the ellipse
+    a dx² + 2 b dx dy + c dy² = q, dx² reaches q c / (a c - b²).
+    """
+    opacities = splats.opacities
+    rows = torch.cat(
+        [splats.means_px, splats.conics, splats.colours, opacities[:, None], splats.depths[:, None]], dim=1
+    )
+    a, b, c = splats.conics.unbind(dim=1)
+    determinant = a * c - b * b
+    drawn = rows.isfinite().all(dim=1) & (a > 0) & (c > 0) & (determinant > 0) & (opacities >= ALPHA_MIN)
+    level = 2 * torch.log(opacities.clamp(min=ALPHA_MIN) / ALPHA_MIN)
+    squares = torch.stack([c, a], dim=1) * (level / determinant)[:, None]
+    # Rounded up, and a pixel for what rounding makes of the other numbers; what is larger covers every picture.
+    reach = torch.ceil(torch.sqrt(squares)).clamp(max=2.0**20) + 1
+    return torch.where(drawn[:, None], reach, torch.zeros_like(reach)).to(torch.int32)
+
+
+def load() -> Any:
+    """gsplat, as installed, its kernels compiled. Raises GsplatUnavailable, with what to do, if it cannot be used."""
+    try:
+        engine = importlib.import_module("gsplat")
+        with redirect_stdout(sys.stderr):  # it tells the terminal how compiling goes; output belongs to the verbs
+            backend = importlib.import_module("gsplat.cuda._backend")
+    except Exception as error:  # its import may also fail for want of a compiler or of a fitting torch
+        raise GsplatUnavailable(
+            f"gsplat cannot be used ({type(error).__name__}: {error}). Install it: pip install 'vdgs[gsplat]'. It "
+            "needs an NVIDIA GPU, and a CUDA toolkit to compile its kernels."
+        ) from error
+    if backend._C is None:  # it prints a line and goes on
+        raise GsplatUnavailable("gsplat has no kernels: it found no CUDA toolkit (nvcc) to compile them.")
+    return engine
+
+
+def _empty(background: Tensor, width: int, height: int, depth: bool) -> Raster:
+    """A picture of nothing; the background still has its gradient."""
+    nothing = background.new_zeros(height, width)
+    return Raster(background.expand(height, width, 3).clone(), nothing, nothing.clone() if depth else None)

@@ -1,0 +1,43 @@
+"""Which anchors can be seen from a camera, in plain torch."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from vdgs.geometry.camera import NEAR, Camera
+from vdgs.kernels.constants import DILATION_PX2, FRUSTUM_MARGIN
+from vdgs.kernels.transfer import beside
+
+
+@torch.no_grad()
+def cull(positions: Float[Tensor, "n 3"], log_scales: Float[Tensor, "n 6"], camera: Camera) -> Int64[Tensor, "v"]:
+    """Indices, ascending, of the anchors whose Gaussian of scales exp(s[0:3]) may touch the image.
+
+    Kept: z > near at the centre, and the square about the projected centre that surely holds the
+    3-sigma ellipse touches the image. Its half-width along x is 3·sqrt(σ²·(fx/z)²·(1 + u²) + 0.3 px²)
+    with σ = max(exp(s[0:3])), that of the sphere around the Gaussian under the same linearisation
+    (u = clamp(x/z)) as in `project`; along y likewise. Choice: no anchor is dropped whose projected
+    ellipse touches the image; a few are kept whose ellipse does not.
+    """
+    rigid = beside(camera.camera_from_world, positions)
+    local = positions @ rigid[:3, :3].T + rigid[:3, 3]
+    sigma_squared = torch.exp(2 * log_scales[:, :3].amax(-1))
+    z = local[:, 2]
+    near_enough = z > NEAR
+    for axis, focal, centre, size, whole in (
+        (0, camera.fx, camera.cx, camera.width, camera.whole_size[0]),
+        (1, camera.fy, camera.cy, camera.height, camera.whole_size[1]),
+    ):
+        if camera.model == "orthographic":
+            pixel = focal * local[:, axis] + centre
+            stretch = torch.full_like(z, focal**2)
+        else:
+            slope = local[:, axis] / z
+            limit = FRUSTUM_MARGIN * 0.5 * whole / focal
+            pixel = focal * slope + centre
+            stretch = (focal / z) ** 2 * (1 + slope.clamp(-limit, limit) ** 2)
+        outside = torch.maximum(-pixel, pixel - size).clamp(min=0)
+        near_enough = near_enough & (outside**2 <= 9 * (sigma_squared * stretch + DILATION_PX2))
+    return near_enough.nonzero().squeeze(-1)

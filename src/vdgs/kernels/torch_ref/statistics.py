@@ -1,0 +1,55 @@
+"""Growth's statistics of one view, as index arithmetic in torch."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int32, Int64
+from torch import Tensor
+
+from vdgs.kernels.kernel_types import Statistics
+from vdgs.kernels.splat_segments import Shown, tensor_of
+from vdgs.kernels.transfer import may_look
+
+
+def add_view_statistics(
+    statistics: Statistics,
+    visible: Int64[Tensor, "v"],
+    inside: Bool[Tensor, "v"],
+    source: Int32[Tensor, "m"] | Shown,
+    opacities: Float[Tensor, "m"],
+    gradient_px: Float[Tensor, "m 2"],
+    width: int,
+    height: int,
+) -> None:
+    """Add one view to the sums that growth decides by (Scaffold-GS section 4.2), in place.
+
+    `source` is (index in `visible`) k + offset, ascending without repetition; `gradient_px` is the loss by the
+    splats' means in pixels, whose norm is taken in NDC: these run over [-1, 1] across the image, hence the factors
+    width/2 and height/2. Each drawn offset gains its norm and a count, each visible anchor the opacity of its
+    splats, and a count if it is `inside`: visible are also anchors just outside of the picture, which may touch it but
+    mostly do not. Raises IndexError for a source beyond the visible anchors, ValueError unless `inside` says something
+    of each of them, before any change.
+    """
+    k = statistics.gradient.shape[1]
+    sources = tensor_of(source)
+    check_sources(sources, visible, k)
+    check_inside(inside, visible)
+    row = sources.long()
+    slot = visible[row // k] * k + row % k
+    norm = torch.hypot(gradient_px[:, 0] * (width / 2), gradient_px[:, 1] * (height / 2))
+    statistics.gradient.view(-1)[slot] += norm
+    statistics.drawn.view(-1)[slot] += 1
+    statistics.opacity[visible] += opacities.new_zeros(len(visible)).index_add_(0, row // k, opacities)
+    statistics.seen[visible] += inside.float()
+
+
+def check_sources(source: Tensor, visible: Tensor, k: int) -> None:
+    """Raise IndexError unless the ascending sources belong to the visible anchors."""
+    if may_look(source) and len(source) and not (int(source[0]) >= 0 and int(source[-1]) < len(visible) * k):
+        raise IndexError(f"a source lies outside the {len(visible)} visible anchors of {k} offsets")
+
+
+def check_inside(inside: Tensor, visible: Tensor) -> None:
+    """Raise ValueError unless this is a mask of the visible anchors."""
+    if inside.dtype != torch.bool or inside.shape != visible.shape:
+        raise ValueError(f"inside must be bool {list(visible.shape)}, not {inside.dtype} {list(inside.shape)}")

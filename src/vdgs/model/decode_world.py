@@ -1,0 +1,53 @@
+"""What anchors spawn in the world, as one camera sees them: the Gaussians that `kernels.decode` projects.
+
+Dimensions: v anchors, k offsets of each. Scaffold-GS eqs. 3-8, as in `kernels.reference.decode`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import DecoderWeights
+from vdgs.model.anchors import Anchors
+
+
+@dataclass(frozen=True, eq=False)
+class Spawned:
+    """The k Gaussians of each anchor: all but their places depend on where they are seen from."""
+
+    #: tanh of the opacity head: not drawn where it is 0 or less.
+    opacities: Float[Tensor, "v k"]
+    colours: Float[Tensor, "v k 3"]
+    scales: Float[Tensor, "v k 3"]
+    #: wxyz, of any length.
+    quaternions: Float[Tensor, "v k 4"]
+
+
+def places(anchors: Anchors) -> Float[Tensor, "v k 3"]:
+    """Where the Gaussians are, from wherever they are seen."""
+    return anchors.positions[:, None] + anchors.offsets * anchors.log_scales[:, None, :3].exp()
+
+
+@torch.no_grad()
+def spawned(anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera) -> Spawned:
+    """The Gaussians of the anchors of the given rows."""
+    k = anchors.offsets.shape[1]
+    ray = anchors.positions[rows] - torch.as_tensor(camera.position).to(anchors.positions)
+    distance = ray.norm(dim=1, keepdim=True)
+    if camera.model == "orthographic":
+        direction = torch.as_tensor(camera.forward).to(ray).expand_as(ray)
+    else:
+        direction = ray / distance
+    inputs = torch.cat([anchors.features[rows], direction, distance], 1)
+    covariance = weights.covariance.outputs(inputs).unflatten(1, (k, 7))
+    return Spawned(
+        weights.opacity.outputs(inputs).tanh(),
+        weights.colour.outputs(inputs).unflatten(1, (k, 3)).sigmoid(),
+        anchors.log_scales[rows, None, 3:].exp() * covariance[..., :3].sigmoid(),
+        covariance[..., 3:],
+    )

@@ -1,0 +1,100 @@
+"""Where anchors start: on the voxel grid of the sparse points and of what stereo adds to them, outliers left out and
+gaps filled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Int64
+from scipy.spatial import cKDTree
+
+from vdgs.config.method import AnchorConfig
+from vdgs.errors import VdgsError
+from vdgs.geometry.camera import Camera
+from vdgs.kernels.kernel_types import FEATURE_SIZE
+from vdgs.model.anchors import Anchors
+from vdgs.model.initialization.gap_filling import gap_points
+
+#: An outlier is known by its distance to this neighbour: small clusters of false matches are outliers too.
+OUTLIER_NEIGHBOUR = 4
+
+
+def automatic_voxel(points: np.ndarray) -> float:
+    """Median distance of the points [n, 3] to their nearest other point (choice; upstream forgets the root).
+
+    Coincident points are counted once. Raises VdgsError with fewer than two distinct points.
+    """
+    distinct = np.unique(points, axis=0)
+    if len(distinct) < 2:
+        raise VdgsError(
+            f"The capture has {len(distinct)} distinct sparse point(s); at least 2 are needed to place anchors. "
+            "Run the structure-from-motion again, or give --anchors.voxel."
+        )
+    distances, _ = cKDTree(distinct).query(distinct, k=2, workers=1)
+    return float(np.median(distances[:, 1]))
+
+
+def inliers(points: np.ndarray, factor: float) -> np.ndarray:
+    """Which points [n, 3] have their fourth nearest neighbour within `factor` times the median such distance."""
+    if factor <= 0 or len(points) <= OUTLIER_NEIGHBOUR:
+        return np.ones(len(points), bool)
+    distances, _ = cKDTree(points).query(points, k=[OUTLIER_NEIGHBOUR + 1], workers=1)
+    limit = factor * np.median(distances)
+    return distances[:, 0] <= limit if limit > 0 else np.ones(len(points), bool)
+
+
+def voxel_of(points: np.ndarray, config: AnchorConfig) -> float:
+    """The edge of the voxel grid of the sparse points [n, 3]. Raises VdgsError as `automatic_voxel`."""
+    return config.voxel if config.voxel > 0 else automatic_voxel(points)
+
+
+def initial_anchors(
+    points: np.ndarray,
+    colours: np.ndarray,
+    cameras: Sequence[Camera],
+    config: AnchorConfig,
+    dense: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[Anchors, float]:
+    """Anchors on the voxel grid of the sparse points [n, 3], and the voxel used.
+
+    Points are rounded to the grid and made unique (Scaffold-GS eq. 3); so are the `dense` ones [m, 3], with their
+    colours, that stereo found beside them, and those that fill gaps seen by the training cameras. Log-scales start at
+    the logarithm of the mean distance to the three nearest other anchors, offsets at 0, features at 0 or at the
+    colours. Raises VdgsError with fewer than two distinct points.
+    """
+    voxel = voxel_of(points, config)
+    kept = inliers(points, config.outlier_distance)
+    points, colours = points[kept], colours[kept]
+    if dense is not None:
+        points, colours = (np.concatenate(pair) for pair in zip((points, colours), dense, strict=True))
+    if config.fill_gaps:
+        gaps = gap_points(points, cameras, voxel)
+        nearest = cKDTree(points).query(gaps, workers=1)[1] if len(gaps) else np.zeros(0, np.int64)
+        points, colours = np.concatenate([points, gaps]), np.concatenate([colours, colours[nearest]])
+    cells, owner = np.unique(np.round(points / voxel).astype(np.int64), axis=0, return_inverse=True)
+    positions = cells * voxel
+    n = len(positions)
+    if n > 1:
+        distances, _ = cKDTree(positions).query(positions, k=min(4, n), workers=1)
+        spacing = np.clip(distances[:, 1:].mean(axis=1), 0.5 * voxel, None)
+    else:
+        spacing = np.full(n, voxel)
+    features = np.zeros((n, FEATURE_SIZE))
+    if config.colour_start:
+        features[:, :3] = _mean_colours(colours, owner.reshape(-1), n) * 2.0 - 1.0
+    as_tensor = lambda array: torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))  # noqa: E731
+    anchors = Anchors(
+        positions=as_tensor(positions),
+        features=as_tensor(features),
+        offsets=torch.zeros(n, config.offsets, 3),
+        log_scales=as_tensor(np.repeat(np.log(spacing)[:, None], 6, axis=1)),
+    )
+    return anchors, voxel
+
+
+def _mean_colours(colours: np.ndarray, owner: Int64[np.ndarray, " n"], count: int) -> np.ndarray:
+    """Mean colour in [0, 1] of the points that share a cell, [count, 3]."""
+    sums = np.stack([np.bincount(owner, colours[:, c] / 255.0, count) for c in range(3)], axis=1)
+    return sums / np.bincount(owner, minlength=count)[:, None]

@@ -1,0 +1,255 @@
+"""Points on what a flight shows: the depths of all its photographs, where others confirm them, one for each cell.
+
+Cells are as large as pixels are there: what is only seen from afar has cells of two, four, ... times the edge. Fine
+ones would hold the noise of depths there, and nobody can bear so many.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64, UInt8
+from scipy.spatial import cKDTree
+
+from vdgs.errors import VdgsError
+from vdgs.geometry.camera import Camera
+from vdgs.model.initialization.stereo.sgm import AGREEMENT, StereoView, depth_of
+from vdgs.model.initialization.stereo.view_selection import held_by, partners
+from vdgs.system.atomic_files import remedy
+from vdgs.system.units import data_size
+from vdgs.visibility.spatial_groups import Groups
+
+#: Photographs are matched at this longest side, and enlarged at most by so much: steps of a sixteenth of a column tell
+#: depth better in larger pictures (choice).
+LONGEST_SIDE_PX, LARGEST_ZOOM = 480, 1.5
+#: Depths are looked for between these quantiles of a photograph's sparse points, and this much nearer and farther.
+QUANTILES, MARGIN = (0.01, 0.99), 0.2
+#: Edges of cells are the least one times these. Keys have room for so many.
+SIZES = 2.0 ** np.arange(4)
+#: A cell holds a point where the confirmed pixels of all photographs in it would together cover so much of one of its
+#: faces: what is matched wrongly is strewn over many cells (choice; reports/few-cameras.md).
+LEAST_COVER = 0.05
+#: Points keep so many cells from each other: a surface cuts the corners of cells, and each corner would have its own.
+SPACING = 0.7
+#: A pixel counts where at least one partner agrees on its depth, and at least this share of those that hold the place:
+#: one among many agrees by chance. Not more, for some of them do not see it.
+LEAST_AGREED = 0.25
+#: Grey photographs that are held at a time.
+HELD = 256
+#: Cells of photographs that are held at a time at least, before they are added up (72 bytes each).
+WAITING = 2**20
+#: Cells have keys within this many cells of the origin on each axis: 20 bits each, and the size on top.
+REACH = 2**19
+
+
+@dataclass(frozen=True, eq=False)
+class StereoInputs:
+    """A flight as stereo sees it: cameras at the size of their photographs, sparse points [n, 3] of the same world,
+    places [p, 3] for which partners are chosen (the points, and ground without any), and what reads photograph i: RGB
+    [h, w, 3] and the mask [h, w] of what counts (None: all)."""
+
+    cameras: Sequence[Camera]
+    points: Float[np.ndarray, "n 3"]
+    places: Float[np.ndarray, "p 3"]
+    read: Callable[[int], tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None]]
+
+
+class Cell(NamedTuple):
+    """The edge of cells that get a point each: the least, in units of the world, and in pixels of the photographs as
+    they are used, where those are larger."""
+
+    least: float
+    pixels: float
+
+    def sizes(self, pixel: Float[np.ndarray, " p"]) -> Int64[np.ndarray, " p"]:
+        """Which of `SIZES` cells have where a pixel is so wide."""
+        wide = np.log2(np.maximum(self.pixels * pixel / self.least, 1.0))
+        return np.minimum(np.rint(wide).astype(np.int64), len(SIZES) - 1)
+
+
+class DensePoints(NamedTuple):
+    """Points [m, 3] float64 and their colours [m, 3] uint8."""
+
+    points: Float[np.ndarray, "m 3"]
+    colours: UInt8[np.ndarray, "m 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Cells by their keys [c], which begin with the number of their size, and sums over the pixels that lie in them
+    [c, 8]: position, colour, 1, and the area that a pixel covers there."""
+
+    keys: Int64[np.ndarray, " c"]
+    sums: Float[np.ndarray, "c 8"]
+
+    @staticmethod
+    def of(keys: Int64[np.ndarray, " p"], values: Float[np.ndarray, "p 8"]) -> _Cells:
+        found, place = np.unique(keys, return_inverse=True)
+        sums = np.stack([np.bincount(place.reshape(-1), column, len(found)) for column in values.T], 1)
+        return _Cells(found, sums.astype(np.float64))  # bincount of nothing is of whole numbers
+
+    @staticmethod
+    def together(some: Sequence[_Cells]) -> _Cells:
+        """The cells of all of them, summed in their order."""
+        return _Cells.of(np.concatenate([each.keys for each in some]), np.concatenate([each.sums for each in some]))
+
+
+def dense_points(
+    inputs: StereoInputs, cell: Cell, scratch: Path, tell: Callable[[int, int], None], threads: int = 1
+) -> DensePoints:
+    """Match every photograph with its partners, and give each cell that enough pixels lie in the mean of them. A pixel
+    counts where the depths of partners confirm it.
+
+    `scratch` is a folder for a file of depths, gone afterwards: memory grows with the place, not with how many
+    photographs show it. `tell(done, of)` is called in this thread after each photograph, once for matching and once for
+    confirming. Deterministic, whatever `threads`; raises what `read` raises, and VdgsError where the disk has no room.
+    """
+    cameras = [_matched_size(camera) for camera in inputs.cameras]
+    others, groups = partners(inputs.cameras, inputs.places), Groups.of(torch.from_numpy(inputs.points))
+    views = lru_cache(HELD)(lambda index: _view(inputs, groups, cameras[index], index))
+    width, height = max(each.width for each in cameras), max(each.height for each in cameras)
+    steps, of = iter(range(1, 2 * len(cameras) + 1)), 2 * len(cameras)
+    with tempfile.TemporaryFile(dir=scratch) as file, ThreadPoolExecutor(max(1, threads)) as pool:
+        shape = (len(cameras), height, width)
+        _reserve(file, 2 * math.prod(shape), scratch)
+        depths = np.memmap(file, np.float16, "r+", shape=shape)
+
+        def match(index: int) -> None:
+            if others[index]:
+                depth = depth_of(views(index), [views(other) for other in others[index]])
+                depths[index, : depth.shape[0], : depth.shape[1]] = depth
+
+        def confirm(index: int) -> _Cells:
+            return _confirmed(inputs, cameras, depths, index, others[index], cell)
+
+        for _ in pool.map(match, range(len(cameras))):
+            tell(next(steps), of)
+        found = _summed(_told(pool.map(confirm, range(len(cameras))), steps, of, tell))
+        del depths
+    return _fused(found, cell)
+
+
+def _reserve(file: IO[bytes], size: int, folder: Path) -> None:
+    """Make a file so large with room on its disk: where a mapped file finds none, the system kills the process."""
+    try:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)
+        else:
+            file.truncate(size)
+    except OSError as error:
+        raise VdgsError(
+            f"{folder}: depths of stereo need {data_size(size)} there for a while ({error.strerror}). "
+            f"{remedy(error)}, then run the same command again."
+        ) from error
+
+
+def _told(cells: Iterator[_Cells], steps: Iterator[int], of: int, tell: Callable[[int, int], None]) -> Iterator[_Cells]:
+    for each in cells:
+        tell(next(steps), of)
+        yield each
+
+
+def _matched_size(camera: Camera) -> Camera:
+    longest = max(camera.width, camera.height)
+    zoom = min(LONGEST_SIDE_PX / longest, LARGEST_ZOOM)
+    return camera.resized(max(1, round(zoom * camera.width)), max(1, round(zoom * camera.height)))
+
+
+def _view(inputs: StereoInputs, groups: Groups, camera: Camera, index: int) -> StereoView:
+    """A photograph grey, at the size at which it is matched."""
+    picture, _ = inputs.read(index)
+    small = camera.width < picture.shape[1]
+    grey = cv2.resize(
+        cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (camera.width, camera.height),
+        interpolation=cv2.INTER_AREA if small else cv2.INTER_CUBIC,
+    )  # fmt: skip
+    _, depth = camera.project(inputs.points[held_by(inputs.cameras[index], inputs.points, groups)])
+    near, far = np.quantile(depth, QUANTILES) if len(depth) else (1.0, 1.0)
+    return StereoView(camera, grey, float(near) * (1 - MARGIN), float(far) * (1 + MARGIN))
+
+
+def _confirmed(
+    inputs: StereoInputs, cameras: Sequence[Camera], depths: np.ndarray, index: int, others: Sequence[int], cell: Cell
+) -> _Cells:
+    """The cells in which confirmed pixels of a photograph lie."""
+    camera = cameras[index]
+    depth = np.asarray(depths[index, : camera.height, : camera.width], np.float32)
+    known = depth > 0
+    places = camera.unproject(np.where(known, depth, 1.0))
+    held, agreed = (np.zeros(known.shape, np.int32) for _ in range(2))
+    for other in others:
+        inside, agrees = _told_by(places, cameras[other], depths[other])
+        held, agreed = held + inside, agreed + agrees
+    confirmed = known & (agreed >= 1) & (agreed >= LEAST_AGREED * held) & (np.abs(places) < REACH * cell.least).all(-1)
+    picture, mask = inputs.read(index)
+    size = (camera.width, camera.height)
+    if mask is not None:
+        confirmed &= cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST) > 0
+    colours = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    area = (depth[confirmed].astype(np.float64) ** 2 / (camera.fx * camera.fy))[:, None]
+    values = np.concatenate([places[confirmed], colours[confirmed], np.ones_like(area), area], 1)
+    sizes = cell.sizes(depth[confirmed].astype(np.float64) / inputs.cameras[index].fx)
+    edge = cell.least * SIZES[sizes]
+    x, y, z = (np.floor(values[:, axis] / edge).astype(np.int64) + REACH for axis in range(3))
+    return _Cells.of((sizes << 60) | (x << 40) | (y << 20) | z, values)
+
+
+def _told_by(
+    places: Float[np.ndarray, "h w 3"], camera: Camera, depths: Float[np.ndarray, "r c"]
+) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Which places another photograph holds in its picture, and which of them lie where its own depth says."""
+    pixels, distance = camera.project(places.reshape(-1, 3))
+    inside = camera.sees(places.reshape(-1, 3))
+    column, row = (np.where(inside, pixels[:, axis], 0).astype(np.int64) for axis in (0, 1))
+    there = np.asarray(depths[row, column], np.float64)
+    agrees = inside & (there > 0) & (np.abs(there - distance) < AGREEMENT * distance)
+    return inside.reshape(places.shape[:2]), agrees.reshape(places.shape[:2])
+
+
+def _summed(photographs: Iterable[_Cells], most_waiting: int = WAITING) -> _Cells:
+    """The cells of all photographs. Those that wait to be added are at most as many as there are, or `most_waiting`:
+    the time is that of one sum of all, and so are the bits, for each cell is summed in the order of the photographs."""
+    total, waiting = _Cells(np.zeros(0, np.int64), np.zeros((0, 8))), list[_Cells]()
+    for each in photographs:
+        waiting.append(each)
+        if sum(len(some.keys) for some in waiting) > max(most_waiting, len(total.keys)):
+            total, waiting = _Cells.together([total, *waiting]), []
+    return _Cells.together([total, *waiting])
+
+
+def _fused(found: _Cells, cell: Cell) -> DensePoints:
+    """One point for each cell that the pixels of all photographs cover well enough; of two that lie too close that of
+    the smaller cell, or of the better covered one."""
+    means = np.zeros((0, 6))
+    for size, edge in enumerate(cell.least * SIZES):
+        sums = found.sums[(found.keys >> 60 == size) & (found.sums[:, 7] >= LEAST_COVER * edge**2)]
+        sums = sums[np.argsort(-sums[:, 7], kind="stable")]
+        more = sums[:, :6] / sums[:, 6:7]
+        if len(means):
+            more = more[cKDTree(means[:, :3]).query(more[:, :3], workers=1)[0] > SPACING * edge]
+        means = np.concatenate([means, more[_apart(more[:, :3], SPACING * edge)]])
+    return DensePoints(means[:, :3], np.clip(np.rint(means[:, 3:]), 0, 255).astype(np.uint8))
+
+
+def _apart(points: Float[np.ndarray, "n 3"], distance: float) -> Bool[np.ndarray, " n"]:
+    """Which points stay where each, in their order, takes the place of those after it that are nearer than that."""
+    stays = np.ones(len(points), bool)
+    if len(points) < 2:
+        return stays
+    pairs = cKDTree(points).query_pairs(distance, output_type="ndarray")
+    pairs = np.sort(pairs, 1)
+    for first, second in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
+        if stays[first]:
+            stays[second] = False
+    return stays

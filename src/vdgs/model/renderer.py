@@ -1,0 +1,119 @@
+"""From anchors and a camera to a picture: cull, decode, rasterise."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from vdgs.geometry.camera import Camera
+from vdgs.kernels import choose
+from vdgs.kernels.kernel_types import AnchorSplats, DecoderWeights, Raster, Splats, TrainingSplats
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.anchors import Anchors
+
+
+def decode_rows(anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera) -> AnchorSplats:
+    """Splats of the anchors of the given rows, as this camera sees them."""
+    return choose(anchors.positions.device).decode(
+        anchors.positions, anchors.features, anchors.offsets, anchors.log_scales, weights, camera, rows
+    )
+
+
+def decode_rows_to_train(
+    anchors: Anchors, rows: Int64[Tensor, " v"], weights: DecoderWeights, camera: Camera
+) -> TrainingSplats:
+    """As much of `decode_rows` as a training step asks for; on a card, not in the order of the rows."""
+    return choose(anchors.positions.device).decode_to_train(
+        anchors.positions, anchors.features, anchors.offsets, anchors.log_scales, weights, camera, rows
+    )
+
+
+def visible_rows(anchors: Anchors, camera: Camera) -> Int64[Tensor, " v"]:
+    """Rows of the anchors that may touch a view, ascending."""
+    return choose(anchors.positions.device).cull(anchors.positions, anchors.log_scales, camera)
+
+
+def decode_view(
+    model: AnchorModel, camera: Camera, image: int | None = None
+) -> tuple[Int64[Tensor, " v"], AnchorSplats]:
+    """The rows that may touch a view and what they look like, each anchor by its own decoder; `source` counts rows.
+
+    `image`: as in `render`.
+    """
+    rows = visible_rows(model.anchors, camera)
+    spans = model.spans()
+    starts = rows.new_tensor([first for first, _, _ in spans] + [len(model.anchors)])
+    bounds = torch.searchsorted(rows, starts).tolist()
+    shown = [
+        (first, last, decoder)
+        for (first, last), (_, _, decoder) in zip(pairwise(bounds), spans, strict=True) if first < last
+    ] or [(0, 0, model.decoder)]  # fmt: skip
+    pieces = [
+        (first, decode_rows(model.anchors, rows[first:last], decoder.for_image(image), camera))
+        for first, last, decoder in shown
+    ]
+    return rows, _joined(pieces, model.anchors.offsets.shape[1])
+
+
+def _joined(pieces: list[tuple[int, AnchorSplats]], k: int) -> AnchorSplats:
+    """Splats of consecutive rows as one, in order; each piece with the place of its first row."""
+    if len(pieces) == 1:
+        return pieces[0][1]
+    named = {
+        field.name: torch.cat([getattr(splats, field.name) for _, splats in pieces])
+        for field in fields(AnchorSplats) if field.name != "source"
+    }  # fmt: skip
+    return AnchorSplats(**named, source=torch.cat([splats.source + first * k for first, splats in pieces]))
+
+
+def draw(splats: Splats, camera: Camera, background: Float[Tensor, "3"], depth: bool = False) -> Raster:
+    """Splats to image, alpha and (on request) expected depth, differentiable, and median depth, which is not."""
+    kernels = choose(splats.means_px.device)
+    return kernels.rasterise(splats, background, camera.width, camera.height, depth=depth)
+
+
+@torch.no_grad()
+def render(
+    model: AnchorModel,
+    camera: Camera,
+    *,
+    background: tuple[float, float, float] | None = None,
+    depth: bool = False,
+    image: int | None = None,
+) -> Raster:
+    """One view of a model: image [h, w, 3] (not clamped), alpha [h, w], expected and median depth [h, w] or None.
+
+    `background` replaces the model's own. `image` is the index of a training image whose appearance to use;
+    None takes the mean appearance.
+    """
+    _, splats = decode_view(model, camera, image)
+    return draw(splats, camera, splats.means_px.new_tensor(background or model.background), depth)
+
+
+@torch.no_grad()
+def paint(
+    model: AnchorModel, values: Float[Tensor, " n"], camera: Camera
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """A value per anchor in place of its colour, on black: the sum of the values that a pixel shows, each by its part
+    of the pixel, and alpha, the sum of the parts."""
+    rows, splats = decode_view(model, camera)
+    k = model.anchors.offsets.shape[1]
+    of_splat = values.to(rows.device)[rows][splats.source.long() // k].float()
+    grey = replace(splats, colours=of_splat[:, None].expand(-1, 3).contiguous())
+    painted = draw(grey, camera, splats.means_px.new_zeros(3))
+    return painted.image[..., 0], painted.alpha
+
+
+def render_values(model: AnchorModel, values: Float[Tensor, " n"], camera: Camera) -> Float[Tensor, "h w"]:
+    """A value per anchor drawn as a map: the alpha-weighted mean at each pixel, NaN where nothing is drawn.
+
+    Used for visibility maps (V at each pixel).
+    """
+    scale = float(values.max().clamp(min=1)) if len(values) else 1.0
+    painted, alpha = paint(model, values / scale, camera)
+    value = painted / alpha.clamp(min=1e-6) * scale
+    return torch.where(alpha > 0.5, value, torch.full_like(value, float("nan")))

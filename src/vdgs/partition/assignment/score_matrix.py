@@ -1,0 +1,228 @@
+"""How well each camera shows each block: the score matrix behind camera assignment (section IV-B, eqs. 6-7).
+
+Names and dimensions: c cameras, b blocks, n anchors, m splats of one view.
+
+The anchors of a view are decoded once. Because decoding works anchor by anchor, the splats of a block's anchors are
+exactly those that the block alone would give: each block is drawn from its share of the splats of the whole view.
+Everything is drawn over black (choice; as the methods do that the paper builds on), with the mean appearance: over the
+model's own background, a colour of the place, missing ground would too often pass for a match.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int32, Int64
+from torch import Tensor
+
+from vdgs.config.method import AssignmentConfig
+from vdgs.geometry.camera import Camera
+from vdgs.kernels import choose, threads
+from vdgs.kernels.kernel_types import Raster, Splats
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.renderer import decode_view, draw
+from vdgs.partition.blocks import Blocks, places_of
+from vdgs.visibility.visibility_counts import visibility_of
+
+#: A pixel is drawn where its alpha is above this.
+DRAWN_ALPHA = 0.5
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scores:
+    """What assignment decides from: rows are cameras, columns blocks."""
+
+    #: The mode that the scores were made in, as in AssignmentConfig.
+    mode: str
+    #: Higher: the camera belongs more to the block.
+    scores: Float[np.ndarray, "c b"]
+    #: Anchors of the block's core (those that it owns) in the frustum of the camera.
+    held: Int32[np.ndarray, "c b"]
+    #: Share of the drawn pixels that the block alone draws alike; NaN in mode `frustum`.
+    covered: Float[np.ndarray, "c b"]
+    #: Anchors that each block owns.
+    anchors: Int64[np.ndarray, " b"]
+    #: The block that owns the place beneath each camera.
+    beneath: Int64[np.ndarray, " c"]
+
+
+def score_matrix(
+    model: AnchorModel,
+    blocks: Blocks,
+    cameras: Sequence[Camera],
+    config: AssignmentConfig,
+    progress: Callable[[int, int], None] | None = None,
+) -> Scores:
+    """Score every camera for every block. `progress` is told (cameras done, all cameras) after each, in this thread.
+
+    - `coverage` (choice): |{Δ < τ and alpha of the block > 0.5}| / |{alpha of the scene > 0.5}|; Δ (eq. 6) compares
+      the scene with the widened block drawn alone. Pixels empty in both do not count; 0 where the scene is empty.
+    - `literal`: the share of *all* pixels with Δ < τ (eq. 7).
+    - `leave_one_out`: 1 - SSIM of the scene without the anchors that the block owns against the whole scene, 8 bits.
+    - `frustum`: the share of the anchors that the block owns whose centre the camera holds; nothing is drawn.
+
+    Pictures are at most `config.longest_side_px` wide and high. The scores of a camera depend on no other camera and on
+    no number of threads. Memory: O(n b) bytes, and one view for each thread.
+    """
+    return Scorer(model, blocks, config).scores(cameras, progress)
+
+
+class Scorer:
+    """Scores cameras, as many at a time as one likes (`score_matrix`)."""
+
+    def __init__(self, model: AnchorModel, blocks: Blocks, config: AssignmentConfig):
+        self._model, self._blocks, self._config = model, blocks, config
+        self._members = _Members.of(model, blocks)
+
+    def scores(self, cameras: Sequence[Camera], progress: Callable[[int, int], None] | None = None) -> Scores:
+        """The rows of some cameras."""
+        shape, members, config = (len(cameras), len(self._blocks)), self._members, self._config
+        scores, covered = np.zeros(shape, np.float32), np.full(shape, np.nan, np.float32)
+        held = np.zeros(shape, np.int32)
+        # Small pictures keep the threads of one kernel waiting for each other; those of several cameras do not.
+        workers = ThreadPoolExecutor(threads())
+        try:
+            rows = workers.map(lambda camera: _score_camera(self._model, members, camera, config), cameras)
+            for index, row in enumerate(rows):
+                held[index], scores[index], covered[index] = row
+                if progress is not None:
+                    progress(index + 1, len(cameras))
+        finally:
+            workers.shutdown(cancel_futures=True)
+        positions = np.array([camera.position[:2] for camera in cameras], np.float64).reshape(-1, 2)
+        return Scores(
+            mode=config.mode, scores=scores, held=held, covered=covered, anchors=members.counts(),
+            beneath=self._blocks.owner(positions),
+        )  # fmt: skip
+
+
+def joined(parts: Sequence[Scores]) -> Scores:
+    """The rows of several parts, one below the other; at least one part, all for the same blocks."""
+    over = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("scores", "held", "covered")}
+    beneath = np.concatenate([part.beneath for part in parts])
+    return Scores(mode=parts[0].mode, **over, anchors=parts[0].anchors, beneath=beneath)
+
+
+def difference(block: Raster, full: Raster) -> Float[np.ndarray, "h w"]:
+    """Δ(u) of eq. 6: the mean over the channels of the absolute difference."""
+    apart = np.abs(block.image.cpu().numpy() - full.image.cpu().numpy())
+    return (apart[..., 0] + apart[..., 1] + apart[..., 2]) / 3  # twice as fast as the mean over so short an axis
+
+
+def covered_share(block: Raster, full: Raster, tau: float) -> float:
+    """Share of the pixels that the scene draws which the block alone draws, and draws alike; 0 where there are none."""
+    drawn = full.alpha.cpu().numpy() > DRAWN_ALPHA
+    both = drawn & (block.alpha.cpu().numpy() > DRAWN_ALPHA)
+    if not both.any():
+        return 0.0
+    return float(np.count_nonzero(both & (difference(block, full) < tau)) / np.count_nonzero(drawn))
+
+
+def alike_share(block: Raster, full: Raster, tau: float) -> float:
+    """The coverage ratio of eq. 7 as printed: share of all pixels with Δ < τ, empty ones among them."""
+    return float(np.mean(difference(block, full) < tau))
+
+
+def dissimilarity(image: Float[Tensor, "h w 3"], full: Float[Tensor, "h w 3"]) -> float:
+    """1 - SSIM of two pictures rounded to 8 bits."""
+    rounded, target = ((each.clamp(0, 1) * 255 + 0.5).to(torch.uint8) for each in (image, full))
+    return 1.0 - float(choose(full.device).photometric_loss(rounded.float() / 255, target, None).ssim)
+
+
+@dataclass(frozen=True, eq=False)
+class _Members:
+    """Which anchors belong to which block, and the anchors sorted for counting."""
+
+    owner: Int64[Tensor, " n"]
+    #: As `Blocks.reaches`, for all blocks at once.
+    reached: Bool[Tensor, "b n"]
+    #: Anchor positions by owner, neighbours together: whole groups are then decided by one test each.
+    points: Float[Tensor, "n 3"]
+    #: Where the points of each block begin and end.
+    bounds: list[int]
+
+    @staticmethod
+    def of(model: AnchorModel, blocks: Blocks) -> _Members:
+        positions = model.anchors.positions
+        places = places_of(positions)
+        owner = blocks.owner(places)
+        reached = np.empty((len(blocks), len(places)), bool)
+        for index in range(len(blocks)):
+            reached[index] = blocks.reaches(index, places, owner)
+        near = choose(positions.device).morton_order(positions).cpu().numpy()
+        order = near[np.argsort(owner[near], kind="stable")]
+        bounds = [0, *np.cumsum(np.bincount(owner, minlength=len(blocks))).tolist()]
+        return _Members(
+            torch.from_numpy(owner).to(positions.device), torch.from_numpy(reached).to(positions.device),
+            positions[order].contiguous(), bounds,
+        )  # fmt: skip
+
+    def counts(self) -> Int64[np.ndarray, " b"]:
+        """How many anchors every block owns."""
+        return np.diff(self.bounds).astype(np.int64)
+
+    def held(self, camera: Camera) -> list[int]:
+        """How many anchors of every block the frustum holds."""
+        seen = visibility_of(self.points, [camera])
+        return [int(seen[a:b].sum()) for a, b in pairwise(self.bounds)]
+
+
+@torch.no_grad()  # holds for the thread that it is entered in
+def _score_camera(
+    model: AnchorModel, members: _Members, camera: Camera, config: AssignmentConfig
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Held anchors, scores and covered shares of one camera for every block, [b] each."""
+    held = np.array(members.held(camera), np.int32)
+    if config.mode == "frustum":
+        return held, held / np.maximum(members.counts(), 1), np.full(len(held), np.nan)
+    scores, covered = _rendered_scores(model, members, camera.within(config.longest_side_px), config)
+    return held, np.array(scores), np.array(covered)
+
+
+def _rendered_scores(
+    model: AnchorModel, members: _Members, camera: Camera, config: AssignmentConfig
+) -> tuple[list[float], list[float]]:
+    """The scores of one camera for every block in a mode that draws, and its covered shares."""
+    rows, splats = decode_view(model, camera)
+    anchor = rows[splats.source.long() // model.anchors.offsets.shape[1]]
+    full = draw(splats, camera, splats.means_px.new_zeros(3))
+    owner, reached = members.owner[anchor], members.reached[:, anchor]
+    scores, covered = [], []
+    blank = Raster(torch.zeros_like(full.image), torch.zeros_like(full.alpha), None)
+    alike_to_blank = alike_share(blank, full, config.tau) if config.mode == "literal" else 0.0
+    # Most of many blocks are nowhere in a view: what they give is known.
+    for index, shown in enumerate(reached.any(dim=1).tolist()):
+        if not shown:
+            covered.append(0.0)
+            scores.append(alike_to_blank)
+            continue
+        block = _draw_some(splats, reached[index], full, camera)
+        covered.append(covered_share(block, full, config.tau))
+        if config.mode == "literal":
+            scores.append(alike_share(block, full, config.tau))
+        elif config.mode == "leave_one_out":
+            rest = _draw_some(splats, owner != index, full, camera)
+            scores.append(0.0 if rest is full else dissimilarity(rest.image, full.image))
+        else:
+            scores.append(covered[-1])
+    return scores, covered
+
+
+def _draw_some(splats: Splats, chosen: Bool[Tensor, " m"], full: Raster, camera: Camera) -> Raster:
+    """The picture of some of the splats over black; `full`, that of all of them, where all are chosen."""
+    rows = chosen.nonzero().squeeze(1)
+    if len(rows) == len(chosen):
+        return full
+    if not len(rows):
+        return Raster(torch.zeros_like(full.image), torch.zeros_like(full.alpha), None)
+    return draw(select_splats(splats, rows), camera, splats.means_px.new_zeros(3))
+
+
+def select_splats(splats: Splats, rows: Int64[Tensor, " some"]) -> Splats:
+    """Some of the splats, in the same order: equal depths are blended in that of the rows."""
+    return replace(splats, **{field.name: getattr(splats, field.name)[rows] for field in fields(splats)})

@@ -1,0 +1,91 @@
+"""The geometry of block training: what a block moves, what it only draws, where it grows, how far its anchors move.
+
+Frozen around the core are the ring out to the widened boundary and, as context, all else that the block's cameras see
+(choice: else every pixel that no anchor covers would push the anchors at the boundary to fill the hole).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+
+import numpy as np
+import shapely
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from vdgs.config.method import BlockConfig
+from vdgs.geometry.camera import Camera
+from vdgs.model.anchors import Anchors
+from vdgs.model.renderer import visible_rows
+from vdgs.partition.blocks import Blocks, places_of
+
+#: Cells on each side of the table of the ramp.
+RAMP_CELLS = 512
+
+
+def split_anchors(anchors: Anchors, blocks: Blocks, index: int, config: BlockConfig) -> tuple[Tensor, Tensor]:
+    """What a block moves and what it only draws, as two masks [n].
+
+    Own are the anchors that the block owns (with a ring that is not frozen: that it reaches). Around it are the ring
+    and, with `config.context`, everything else.
+    """
+    place = places_of(anchors.positions)
+    owner = blocks.owner(place)
+    core, reached = owner == index, blocks.reaches(index, place, owner)
+    own = core if config.ring == "frozen" else reached
+    around = ~own if config.context else reached & ~own
+    device = anchors.positions.device
+    return torch.from_numpy(own).to(device), torch.from_numpy(around).to(device)
+
+
+def drawn_by(anchors: Anchors, cameras: Sequence[Camera]) -> Bool[Tensor, " n"]:
+    """Which anchors one of the cameras may draw."""
+    drawn = torch.zeros_like(anchors.positions[:, 0], dtype=torch.bool)
+    for camera in cameras:
+        drawn[visible_rows(anchors, camera)] = True
+    return drawn
+
+
+def holds(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor]:
+    """Which places may get new anchors: those of which the merge keeps what stands there."""
+
+    def inside(positions: Float[Tensor, "p 3"]) -> Bool[Tensor, " p"]:
+        place = places_of(positions)
+        kept = blocks.owner(place) == index if config.ring == "frozen" else blocks.reaches(index, place)
+        return torch.from_numpy(kept).to(positions.device)
+
+    return inside
+
+
+def ramp(blocks: Blocks, index: int, config: BlockConfig) -> Callable[[Tensor], Tensor] | None:
+    """The learning-rate mask of a ring that is a ramp: 1 wherever the block owns the place, and where another does,
+    falling linearly from the core to 0 at the widened boundary.
+
+    Read from a table over the block, since it is asked in every step.
+    """
+    if config.ring != "ramp":
+        return None
+    block = blocks.items[index]
+    low, high = np.array(block.expanded.bounds[:2]), np.array(block.expanded.bounds[2:])
+    centres = (np.indices((RAMP_CELLS, RAMP_CELLS)).reshape(2, -1).T + 0.5) / RAMP_CELLS * (high - low) + low
+    points = shapely.points(centres)
+    inwards, outwards = shapely.distance(block.core, points), shapely.distance(block.expanded.boundary, points)
+    share = np.where(shapely.contains(block.expanded, points), outwards / np.maximum(inwards + outwards, 1e-12), 0.0)
+    share = np.where(blocks.owner(centres) == index, 1.0, share)
+    made = share.astype(np.float32).reshape(RAMP_CELLS, RAMP_CELLS), low, (high - low) / RAMP_CELLS
+
+    @cache
+    def on(device: torch.device) -> list[Tensor]:
+        return [torch.from_numpy(each).to(device) for each in made]
+
+    def rate_mask(positions: Float[Tensor, "p 3"]) -> Float[Tensor, " p"]:
+        table, origin, cell = on(positions.device)
+        cells: Int64[Tensor, "p 2"] = ((positions[:, :2].double() - origin) / cell).floor().long()
+        inside = ((cells >= 0) & (cells < RAMP_CELLS)).all(1)
+        cells = cells.clamp(0, RAMP_CELLS - 1)
+        # What the block moves beyond the table it owns.
+        return torch.where(inside, table[cells[:, 0], cells[:, 1]], 1.0)
+
+    return rate_mask

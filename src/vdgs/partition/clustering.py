@@ -1,0 +1,154 @@
+"""Anchors clustered by place and visibility (eq. 5), plainly or into clusters of about equal size.
+
+All functions expect anchors in a canonical order (`cut.py`), which makes their results independent of the order in
+which the model holds them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from vdgs.errors import VdgsError
+from vdgs.visibility.visibility_counts import normalised
+
+#: Places are normalised between these quantiles and clipped: far outliers would squash the scene (choice).
+EXTENT = (0.01, 0.99)
+#: Centres are fitted to at most so many anchors; all others join the nearest.
+FITTED = 300_000
+#: k-means++ starts, of which the one of least inertia is kept; fewer where there are so many clusters that each costs
+#: much and tells little (clusters of all starts together).
+RESTARTS, RESTARTED_CLUSTERS = 8, 512
+
+#: Anchors that are looked at first for being distinct.
+MOST_COMPARED = 5_000
+
+#: Balanced clusters: anchors fitted to (at least, and for each cluster), Lloyd rounds, sweeps over the weights.
+BALANCED_FITTED, BALANCED_FITTED_EACH = 30_000, 4_000
+#: ... and at most so many distances from them to centres.
+BALANCED_DISTANCES = 100_000_000
+BALANCED_ROUNDS, BALANCED_SWEEPS = 30, 10
+BALANCED_TOLERANCE = 0.01
+#: Distances from features to centres that are in memory at once.
+CHUNK = 3_200_000
+
+
+def features_of(
+    places: Float[np.ndarray, "n 2"], visibility: Int64[np.ndarray, " n"], lambda_vis: float
+) -> Float[np.ndarray, "n 3"]:
+    """f_i = [x̂_i, ŷ_i, λ_vis V̂_i] (eq. 5), float64; x̂ and ŷ in [0, 1]."""
+    low, high = np.quantile(places, EXTENT, axis=0)
+    extent = np.where(high > low, high - low, 1.0)
+    unit = np.clip((places - low) / extent, 0.0, 1.0)
+    # Not 0 * V̂: without weight the visibility must leave no trace, not even -0.0.
+    third = lambda_vis * normalised(visibility) if lambda_vis else np.zeros(len(places))
+    return np.column_stack([unit, third])
+
+
+def cluster(features: Float[np.ndarray, "n 3"], count: int, seed: int, balanced: bool) -> Int64[np.ndarray, " n"]:
+    """Labels 0..count-1 by k-means++ (choice; the paper does not name its clustering).
+
+    `balanced`: sizes within a few per cent of n / count, by a power diagram (choice).
+    The same seed gives the same labels, whatever the number of threads. Raises VdgsError if there are fewer distinct
+    anchors than clusters.
+    """
+    refuse_too_many(count, features)
+    centres = _fit(_thinned(features, FITTED), count, seed)
+    weights = np.zeros(count)
+    if balanced:
+        most = min(max(BALANCED_FITTED, BALANCED_FITTED_EACH * count), max(BALANCED_DISTANCES // count, count))
+        sample = _thinned(features, most)
+        centres, weights = _fit_balanced(sample, centres)
+    return _nearest(features, centres, weights)
+
+
+def refuse_too_many(count: int, rows: Float[np.ndarray, "n d"]) -> None:
+    """Raises VdgsError if fewer than `count` of the rows are distinct."""
+    # Nearly always a few thousand rows show it; sorting millions would take seconds.
+    if len(np.unique(_thinned(rows, MOST_COMPARED), axis=0)) >= count:
+        return
+    distinct = len(np.unique(rows, axis=0))
+    if distinct < count:
+        raise VdgsError(
+            f"--blocks {count}: the scene has only {distinct} distinct anchors to cut into blocks. "
+            f"Ask for at most {distinct}, or for 1."
+        )
+
+
+def _thinned(features: np.ndarray, most: int) -> np.ndarray:
+    return features[:: -(-len(features) // most)]
+
+
+def _fit(features: np.ndarray, count: int, seed: int) -> Float[np.ndarray, "count 3"]:
+    # Imported here: it takes a second, which commands that do not cluster should not pay.
+    from sklearn.cluster import KMeans
+    from threadpoolctl import threadpool_limits
+
+    # One thread: sums of several threads differ in their last bits from run to run.
+    with threadpool_limits(1):
+        restarts = max(1, min(RESTARTS, RESTARTED_CLUSTERS // count))
+        return KMeans(count, n_init=restarts, random_state=seed, copy_x=True).fit(features).cluster_centers_
+
+
+def _fit_balanced(
+    features: np.ndarray, centres: np.ndarray
+) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, " count"]]:
+    """Lloyd's rounds in which every centre takes the same number of features; centres and weights w of the diagram.
+
+    A feature belongs to the centre of least |f - c|² - w.
+    """
+    weights = np.zeros(len(centres))
+    for _ in range(BALANCED_ROUNDS):
+        squares = _squares(features, centres)
+        weights = _balance(squares, weights)
+        labels = (squares - weights).argmin(axis=1)
+        sizes = np.bincount(labels, minlength=len(centres))
+        sums = np.column_stack([np.bincount(labels, axis, len(centres)) for axis in features.T])
+        moved = np.where(sizes[:, None] > 0, sums / np.maximum(sizes, 1)[:, None], centres)
+        still = np.abs(moved - centres).max() < 1e-4
+        centres = moved
+        if still:
+            break
+    return centres, _balance(_squares(features, centres), weights)
+
+
+def _balance(squares: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " count"]:
+    """Weights that give every centre n / count features: exact steps, one centre after the other (an auction).
+
+    In its step a centre takes the weight at which exactly its share prefers it to the best of the others.
+    """
+    n, count = squares.shape
+    share, weights, columns = n // count, weights.copy(), np.asfortranarray(squares)
+    costs = squares - weights
+    labels, least = costs.argmin(axis=1), costs.min(axis=1)
+    for _ in range(BALANCED_SWEEPS * count):
+        sizes = np.bincount(labels, minlength=count)
+        worst = int(np.abs(sizes - share).argmax())
+        if abs(sizes[worst] - share) <= max(BALANCED_TOLERANCE * share, 1):
+            break
+        # One weight changes: all costs are looked at again only of features that prefer its centre.
+        own = np.flatnonzero(labels == worst)
+        costs = squares[own] - weights
+        costs[:, worst] = np.inf
+        labels[own], least[own] = costs.argmin(axis=1), costs.min(axis=1)  # now the best of the others everywhere
+        margins = np.partition(columns[:, worst] - least, [share - 1, share])
+        weights[worst] = (margins[share - 1] + margins[share]) / 2
+        cost = columns[:, worst] - weights[worst]
+        joins = (cost < least) | ((cost == least) & (worst < labels))
+        labels[joins], least[joins] = worst, cost[joins]
+    return weights - weights.mean()
+
+
+def _squares(features: np.ndarray, centres: np.ndarray) -> Float[np.ndarray, "n count"]:
+    return np.stack([((features - centre) ** 2).sum(axis=1) for centre in centres], axis=1)
+
+
+def _nearest(features: np.ndarray, centres: np.ndarray, weights: np.ndarray) -> Int64[np.ndarray, " n"]:
+    """The centre of least |f - c|² - w, in chunks that keep memory small."""
+    chunk = max(1, CHUNK // len(centres))
+    return np.concatenate(
+        [
+            (_squares(features[start : start + chunk], centres) - weights).argmin(axis=1)
+            for start in range(0, len(features), chunk)
+        ]
+    )

@@ -1,0 +1,46 @@
+"""How many training cameras see each anchor of the coarse model (section IV-B), as numbers and as a map.
+
+RUN/visibility/  visibility.safetensors (V of every anchor), visibility.json (its distribution), map.png
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+from rich.console import Console
+
+from vdgs.plots.partition import block_maps as figures
+from vdgs.runs.open_run import refuse_empty
+from vdgs.runs.run_context import RunContext
+from vdgs.runs.visibility_store import keep_visibility
+from vdgs.system.atomic_files import read_record, write_json
+from vdgs.visibility.visibility_counts import imbalance
+
+
+def measure_visibility(context: RunContext, console: Console) -> None:
+    """V_i of every anchor: its distribution and a map from above. Skipped where it is there for this coarse model.
+
+    RunError without a coarse model, or for one without anchors.
+    """
+    run = context.run
+    file, key = run.visibility / "visibility.json", run.keys().visibility
+    if read_record(file).get("key") == key:
+        console.print(f"{file}: already there; nothing to do", highlight=False)
+        return
+    with run.locked():
+        opened = context.open_model("coarse")
+        refuse_empty(run, len(opened.model.anchors))
+        visibility = keep_visibility(opened).numpy()
+        cameras = [view.camera for view in opened.capture.train_views]
+        facts = asdict(imbalance(visibility))
+        figures.draw_visibility_map(
+            run.visibility / "map.png", opened.model.anchors.positions.numpy(), visibility, cameras,
+            opened.capture.ground.axis_names,
+        )  # fmt: skip
+        write_json(file, {"key": key, "anchors": len(visibility), "training_views": len(cameras), **facts})
+    quantiles = ", ".join(f"{share} %: {value:g}" for share, value in facts["quantiles"].items())
+    console.print(
+        f"cameras that see an anchor (V), by quantile: {quantiles}; Gini {facts['gini']:.2f}\n"
+        f"map: {run.visibility / 'map.png'}",
+        highlight=False,
+    )

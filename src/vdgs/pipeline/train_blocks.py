@@ -1,0 +1,110 @@
+"""All blocks of a run, several at once, each in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from rich.console import Console
+
+from vdgs.config.checkpointing import WatchOptions
+from vdgs.config.executor_options import ExecutorOptions
+from vdgs.distributed.job_labels import BLOCKS
+from vdgs.distributed.node_check import Question, photographs_of
+from vdgs.distributed.sharded_job import ShardedJob, ShardNeeds, Wish
+from vdgs.errors import RunError, VdgsError
+from vdgs.geometry.camera import Camera
+from vdgs.runs.cut import blocks_of
+from vdgs.runs.run_context import RunContext
+from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.stage_folder import StageFolder
+from vdgs.runs.status import Status
+from vdgs.system.memory.memory_estimate import decoded_bytes, estimate, largest_picture, need_of_block
+
+
+def train_blocks(
+    context: RunContext,
+    options: WatchOptions,
+    jobs: int,
+    console: Console,
+    device: str = "cpu",
+    where: ExecutorOptions | None = None,
+) -> None:
+    """Train, or continue, all blocks of a run that are not finished, on this machine or `where` was asked for.
+
+    `jobs` at once, each on `device`; 0 takes as many as there is room for. Raises RunError if a block failed (the
+    others are trained first), Stopped after Ctrl-C or SIGTERM (every block saved), and VdgsError where a machine of a
+    cluster cannot work on the run, before anything starts.
+    """
+    options.check()
+    if jobs < 0:
+        raise VdgsError(f"--jobs is {jobs}; it must be at least 1, or 0 for what cores and memory allow")
+    # Not resolved: other machines may mount what links point to elsewhere.
+    run = RunFolder(Path(os.path.abspath(context.run.path)))
+    began = time.monotonic()
+    with run.locked(shared=True):
+        blocks, key = blocks_of(run), run.keys().blocks
+        _remove_beyond(run, len(blocks), console)
+        left = [index for index in range(len(blocks)) if not run.block(index).is_done(key)]
+        if not left:
+            console.print(f"{context.run.path}/blocks: all {len(blocks)} trained; nothing to do", highlight=False)
+            return
+        context.release_models()  # the memory is for the blocks
+        views = context.capture.train_views
+        cameras, files = [view.camera for view in views], [run.config_file, run.coarse.model, *photographs_of(views)]
+        job = ShardedJob(
+            worker="block", request=options, folder=run.path / "blocks", kind=BLOCKS,
+            spans=tuple(range(index, index + 1) for index in range(len(blocks))),
+        )  # fmt: skip
+        needs = ShardNeeds(_block_bytes(run, cameras), lambda: Question(run.path, files), decoded_bytes(cameras))
+
+        def ready() -> None:
+            _note_discarded(run, left, key, console)
+            for index in left:
+                _mark_queued(run.block(index), key)
+
+        wish = Wish(where or ExecutorOptions(), jobs, options.image_memory_gb, device)
+        job.send(left, len(blocks), needs, wish, console, ready)
+    console.print(f"blocks trained in {(time.monotonic() - began) / 60:.1f} min", highlight=False)
+
+
+def _note_discarded(run: RunFolder, left: list[int], key: str, console: Console) -> None:
+    """Say which blocks were trained for another cut or with other settings: what they hold is about to go."""
+    old = [index for index in left if run.block(index).holds_work() and run.block(index).key() != key]
+    if old:
+        console.print(
+            f"[yellow]note[/] trained for another cut or with other settings, and trained again: block"
+            f"{'s' if len(old) > 1 else ''} {', '.join(map(str, old))}",
+            highlight=False,
+        )
+
+
+def _mark_queued(folder: StageFolder, key: str) -> None:
+    """Let a block say that it waits for its turn, and hold no work of other settings.
+
+    Not if another process trains it already: its status is then its own.
+    """
+    with suppress(RunError), folder.locked():
+        folder.discard_unless(key)
+        if not folder.is_done(key):
+            folder.set_status(Status(state="queued"))
+
+
+def _remove_beyond(run: RunFolder, count: int, console: Console) -> None:
+    """Delete blocks of an earlier cut into more of them."""
+    for folder in run.block_folders():
+        if int(folder.path.name) >= count:
+            console.print(f"[yellow]note[/] {folder.path} is of an earlier cut and is deleted", highlight=False)
+            shutil.rmtree(folder.path)
+
+
+def _block_bytes(run: RunFolder, cameras: Sequence[Camera]) -> int:
+    """Memory by estimate that the largest block needs for the program, its picture, its anchors once they have grown,
+    and those around it. Photographs that are kept have a budget of their own."""
+    method, anchors = run.method(), [each.anchors_core for each in run.partition_record().blocks]
+    pixels = largest_picture(cameras, method.block.resolutions)
+    return estimate(need_of_block(method, max(anchors), sum(anchors), pixels)).total

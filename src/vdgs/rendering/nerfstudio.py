@@ -1,0 +1,65 @@
+"""The frame that nerfstudio trains in, and the way back from it.
+
+Before it trains, nerfstudio turns a scene upright, moves it to the middle of its cameras and scales it into a unit box;
+the camera paths of its viewer are in that frame. What it did stands in the folder of the training, outputs/NAME/METHOD/
+DATE/dataparser_transforms.json: `transform`, a rigid motion [3, 4], and `scale`, with
+
+    x_nerfstudio = scale * (transform @ x_source)
+
+where the source is the original world: that of the COLMAP model, and that of transforms.json before its
+`applied_transform`, which `transform` includes. It is the source frame of our captures too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from vdgs.captures.formats.json_poses import matrix_of, number, read_json
+from vdgs.captures.formats.source_capture import rigid
+from vdgs.errors import VdgsError
+from vdgs.geometry.similarity import Similarity
+from vdgs.rendering.camera_paths import rigid_at
+
+FILE = "dataparser_transforms.json"
+#: Scales beyond these are none of a scene.
+_LEAST, _MOST = 1e-9, 1e9
+
+
+def pose_in_source(camera_from_world: Float[np.ndarray, "4 4"], nerfstudio: Similarity) -> Float[np.ndarray, "4 4"]:
+    """The pose in the source frame of a camera that stands in nerfstudio's."""
+    turned = camera_from_world[:3, :3]
+    position = -turned.T @ camera_from_world[:3, 3]
+    return rigid_at(turned @ nerfstudio.rotation, nerfstudio.apply_inverse(position[None])[0])
+
+
+def frame_beside(path: Path, capture: Path | None) -> Similarity:
+    """From the source frame to that of a camera path, by the first file that says it: beside the path, one folder up
+    (nerfstudio saves paths in camera_paths/ of its data), or in the folder of the capture.
+
+    Raises VdgsError where there is none, and CaptureError for one that is damaged.
+    """
+    beside = path.absolute().parent
+    folders = [beside, beside.parent, *([] if capture is None else [capture])]
+    found = next((folder / FILE for folder in folders if (folder / FILE).is_file()), None)
+    if found is None:
+        raise VdgsError(_missing(path, folders))
+    content = read_json(found)
+    motion = rigid(matrix_of(content.get("transform"), found, "transform"), found, "transform")
+    scale = number(content, "scale", found)
+    if scale is None or not _LEAST < scale < _MOST:
+        raise VdgsError(f"{found}: scale is {scale}; it must be a positive factor. Copy the file again.")
+    return Similarity(scale, motion[:3, :3], scale * motion[:3, 3])
+
+
+def _missing(path: Path, folders: Sequence[Path]) -> str:
+    looked = ", ".join(dict.fromkeys(str(folder) for folder in folders))
+    return (
+        f"{path}: is a camera path of nerfstudio, which turns, moves and scales a scene before it trains, and there is "
+        f"no {FILE} to say how (looked in {looked}). Copy it there from the folder of that training, "
+        f"outputs/NAME/METHOD/DATE/{FILE}. If the path is in the frame of the capture's own cameras, add "
+        '"frame": "source" to it.'
+    )

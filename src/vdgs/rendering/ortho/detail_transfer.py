@@ -1,0 +1,182 @@
+"""Detail from the photographs for an orthophoto: each pixel's place looked up in the pictures that see it best.
+
+Colours from afar (low frequencies) stay those of the scene, which knows no seams between exposures; what is finer
+than `_BLUR_PX` comes from the photographs, through the depth of the map. A photograph counts where it truly sees the
+place: the scene as that photograph shows it is no nearer, and not of quite another colour. What a pixel gets depends on
+its place and on pixels up to `HALO_PX` away, and on no tile: tiles that are drawn with such a halo show no borders.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from vdgs.captures.capture import Capture
+from vdgs.captures.image_cache import ImageCache
+from vdgs.geometry.camera import Camera
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.model.renderer import render
+
+#: Photographs looked up for one place; bytes of photographs, and depth maps, that are kept between tiles.
+_MOST_VIEWS, _BUDGET_BYTES, _KEPT_DEPTHS = 12, 512_000_000, 32
+#: Those of a tile are found by so many of its places; in between, one may be trusted this much more. How many places
+#: are looked at together.
+_PLACES, _MORE, _TOGETHER = 1000, 1.25, 16_384
+#: A photograph counts by what it is trusted more than this share of the first that is not looked up: those that come
+#: and go from place to place do so without a step, and many that are trusted alike all count (choice).
+_SPARE = 0.99
+#: How far behind the surface that a photograph shows a place may lie, in parts of its depth.
+_BEHIND = 0.01
+#: How much a view straight from above is preferred: the power of the cosine. High, so that pixels are not means.
+_STRAIGHT = 24
+#: A photograph that differs from the scene by more than this (of 1, mean over the channels) shows something else there:
+#: what stood in between, what moved, or the wrong side of an edge.
+_ALIKE = 0.08
+#: Detail is finer than this many pixels of the map; photographs fade out over so many of theirs at their borders.
+_BLUR_PX, _BORDER_PX = 6.0, 12.0
+#: How far the blur reaches: detail is right so many pixels from the border of a picture.
+HALO_PX = round(4 * _BLUR_PX)
+
+
+class Held(NamedTuple):
+    """What a sharpener keeps between tiles, at most (bytes)."""
+
+    pictures: int = 0
+    depths: int = 0
+
+
+def held_bytes(sharp: bool, capture: Capture) -> Held:
+    """What drawing keeps of photographs, where detail is taken from them."""
+    if not sharp:
+        return Held()
+    pixels = max(view.camera.width * view.camera.height for view in capture.train_views)
+    return Held(_BUDGET_BYTES, 4 * _KEPT_DEPTHS * pixels)
+
+
+class Sharpener:
+    """Takes detail from the training photographs of a capture; remembers pictures and depths between tiles."""
+
+    def __init__(self, model: AnchorModel, capture: Capture) -> None:
+        self._model = model
+        self._views = capture.train_views
+        self._pictures = ImageCache(self._views, _BUDGET_BYTES)
+        self._depths: OrderedDict[int, Float[np.ndarray, "h w"]] = OrderedDict()
+
+    def close(self) -> None:
+        """End the cache's threads."""
+        self._pictures.close()
+
+    def detail(
+        self, points: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "h w 3"], shown: Bool[np.ndarray, "h w"]
+    ) -> Float[np.ndarray, "h w 3"]:
+        """What the photographs add to the colours. `points`: the places of the pixels that are shown."""
+        light, weight = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
+        agreed = np.zeros(len(points), np.float32)
+        drawn = colours[shown]
+        chosen = self._chosen(points)
+        least = self._least(chosen, points)
+        for index in chosen:
+            where, found, trust = self._look_up(index, points, least)
+            agreement = np.exp(-0.5 * (np.abs(found - drawn[where]).mean(axis=1) / _ALIKE) ** 2)
+            light[where] += (trust * agreement)[:, None] * found
+            agreed[where] += trust * agreement
+            weight[where] += trust
+        known = agreed > 0
+        detail = np.zeros_like(colours)
+        inside = np.zeros(shown.shape, np.float32)
+        at = np.flatnonzero(shown.ravel())[known]
+        share = agreed[known, None] / weight[known, None]
+        detail.reshape(-1, 3)[at] = share * (light[known] / agreed[known, None] - colours.reshape(-1, 3)[at])
+        inside.ravel()[at] = 1.0
+        return inside[..., None] * (detail - _blurred(detail) / np.maximum(_blurred(inside)[..., None], 1e-6))
+
+    def _chosen(self, points: Float[np.ndarray, "n 3"]) -> list[int]:
+        """The photographs that are among the most trusted ones at any of the places."""
+        some = points[:: max(1, len(points) // _PLACES)]
+        trust = np.stack([_trust(view.camera, some) for view in self._views])
+        most = (trust > 0) & (_MORE * trust > _spared(trust))
+        return [int(index) for index in np.flatnonzero(most.any(axis=1))]
+
+    def _least(self, chosen: list[int], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """How much a photograph must be trusted at each place to count there."""
+        if len(chosen) <= _MOST_VIEWS:
+            return np.zeros(len(points), np.float32)
+        cameras = [self._views[index].camera for index in chosen]
+        parts = (points[first : first + _TOGETHER] for first in range(0, len(points), _TOGETHER))
+        return np.concatenate([_spared(np.stack([_trust(camera, part) for camera in cameras])) for part in parts])
+
+    def _look_up(
+        self, index: int, points: Float[np.ndarray, "n 3"], least: Float[np.ndarray, " n"]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rows of the places that a photograph truly sees, and is trusted at more than at least, their colours [m, 3]
+        in [0, 1], and by how much it is [m]."""
+        camera = self._views[index].camera
+        trust = _trust(camera, points) - least
+        rows = np.flatnonzero(trust > 0)
+        if not len(rows):
+            return rows, np.zeros((0, 3), np.float32), trust[rows]
+        picture = self._pictures.get(index)
+        pixels, depth = camera.project(points[rows])
+        column, row = pixels.astype(np.int64).T
+        clear = depth <= (1 + _BEHIND) * self._depth(index)[row, column]
+        if picture.mask is not None:
+            clear &= picture.mask.numpy()[row, column] > 0
+        rows = rows[clear]
+        found = _sampled(picture.image.numpy(), (pixels[clear] - 0.5).astype(np.float32))
+        return rows, found, trust[rows]
+
+    def _depth(self, index: int) -> Float[np.ndarray, "h w"]:
+        """Median depth of the scene in a photograph; infinite where it shows nothing solid."""
+        if index in self._depths:
+            self._depths.move_to_end(index)
+            return self._depths[index]
+        with torch.inference_mode():
+            found = render(self._model, self._views[index].camera, depth=True).median_depth
+        assert found is not None
+        depth = found.cpu().numpy()
+        self._depths[index] = np.where(depth > 0, depth, np.inf)
+        if len(self._depths) > _KEPT_DEPTHS:
+            self._depths.popitem(last=False)
+        return self._depths[index]
+
+
+def _straight(camera: Camera, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """How straight from above a camera sees places: the cosine to the vertical, 0 from below."""
+    rays = camera.position - points
+    return (rays[:, 2] / np.linalg.norm(rays, axis=1)).clip(min=0.0)
+
+
+def _trust(camera: Camera, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """How much a photograph is trusted at places, if nothing stands in between: 0 where they are not in its picture."""
+    pixels, depth = camera.project(points)
+    border = np.minimum.reduce([pixels[:, 0], pixels[:, 1], camera.width - pixels[:, 0], camera.height - pixels[:, 1]])
+    held = (depth > 0) & (border > 1.0)
+    trust = np.zeros(len(points), np.float32)
+    trust[held] = _straight(camera, points[held]) ** _STRAIGHT * np.minimum(border[held] / _BORDER_PX, 1.0)
+    return trust
+
+
+def _spared(trust: Float[np.ndarray, "views n"]) -> Float[np.ndarray, " n"]:
+    """How much, at each place, a photograph is trusted that `_MOST_VIEWS` others make needless; 0 without so many."""
+    if len(trust) <= _MOST_VIEWS:
+        return np.zeros(trust.shape[1], np.float32)
+    return _SPARE * np.partition(trust, -1 - _MOST_VIEWS, axis=0)[-1 - _MOST_VIEWS]
+
+
+def _blurred(values: Float[np.ndarray, "h w ..."]) -> Float[np.ndarray, "h w ..."]:
+    return cv2.GaussianBlur(values, (2 * HALO_PX + 1,) * 2, _BLUR_PX)
+
+
+def _sampled(image: np.ndarray, at: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """Colours in [0, 1] between the pixels of an image, cubic."""
+    side = 1 << 14
+    padded = np.zeros((-(-max(len(at), 1) // side) * side, 2), np.float32)
+    padded[: len(at)] = at
+    grid = padded.reshape(-1, side, 2)
+    found = cv2.remap(image, grid[..., 0], grid[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return found.reshape(-1, 3)[: len(at)].astype(np.float32) / 255

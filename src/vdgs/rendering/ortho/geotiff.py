@@ -1,0 +1,113 @@
+"""GeoTIFF files: written tile by tile, then rewritten as cloud-optimised ones with overviews."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vdgs.errors import VdgsError
+from vdgs.geometry.map_projection import Placement
+from vdgs.rendering.ortho.pixel_grid import TILE_PX, Grid
+
+#: What GDAL may keep of files in memory: in bytes, as rasterio takes it; GDAL itself would take 128 for megabytes.
+CACHE_BYTES = 128 << 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layer:
+    """One file of a map: what its bands are called, their type, unit and what stands for nothing."""
+
+    name: str
+    title: str
+    bands: tuple[str, ...]
+    dtype: str
+    nodata: float | None
+    #: How overviews are made: "average" for pictures, "nearest" for heights and counts: the mean of a roof and a street
+    #: is a height that nothing has.
+    overviews: str
+    unit: str = ""
+
+    @property
+    def bytes_per_pixel(self) -> int:
+        return len(self.bands) * int(np.dtype(self.dtype).itemsize)
+
+
+def require_rasterio() -> Any:
+    """The module. Raises VdgsError where it is not installed."""
+    try:
+        import rasterio
+        import rasterio.shutil
+        import rasterio.windows
+    except ImportError:
+        raise VdgsError("Maps are GeoTIFFs, which need rasterio: pip install 'vdgs[geo]'.") from None
+    return rasterio
+
+
+def bounded_cache() -> Any:
+    """A context in which GDAL keeps no more than `CACHE_BYTES` of files in memory, whatever the size of the machine."""
+    return require_rasterio().Env(GDAL_CACHEMAX=CACHE_BYTES)
+
+
+def crs_of(placement: Placement) -> Any:
+    """The system as rasterio knows it: that of the catalogue, or a local one with name and unit."""
+    crs = require_rasterio().crs.CRS
+    if placement.wkt is not None:
+        return crs.from_user_input(placement.crs)
+    unit = f'"metre",{placement.metres:g}' if placement.unit == "m" else '"unit of unknown size",1'
+    name = placement.name.replace('"', "'")
+    return crs.from_wkt(f'LOCAL_CS["{name}",UNIT[{unit}],AXIS["x",EAST],AXIS["y",NORTH]]')
+
+
+@contextmanager
+def writing(file: Path, layer: Layer, grid: Grid, placement: Placement, tags: dict[str, str]) -> Iterator[Any]:
+    """A tiled GeoTIFF open for `write_tile`; its name must end in .tif."""
+    rasterio = require_rasterio()
+    alpha = "alpha" in layer.bands
+    options = {"photometric": "RGB", "alpha": "YES"} if alpha else {}
+    with rasterio.open(
+        file, "w", driver="GTiff", width=grid.width, height=grid.height, count=len(layer.bands), dtype=layer.dtype,
+        crs=crs_of(placement), transform=rasterio.Affine(grid.gsd, 0.0, grid.left, 0.0, -grid.gsd, grid.top),
+        nodata=layer.nodata, tiled=True, blockxsize=TILE_PX, blockysize=TILE_PX, compress="DEFLATE", zlevel=1,
+        bigtiff="IF_SAFER", **options,
+    ) as stream:  # fmt: skip
+        stream.update_tags(**tags, TITLE=layer.title, AREA_OR_POINT="Area")
+        for index, name in enumerate(layer.bands, start=1):
+            stream.set_band_description(index, name)
+        if layer.unit:
+            stream.units = (layer.unit,) * len(layer.bands)
+        yield stream
+
+
+def write_tile(stream: Any, column: int, row: int, values: np.ndarray) -> None:
+    """Write bands [b, h, w] at a place of an open file."""
+    window = require_rasterio().windows.Window(column, row, values.shape[2], values.shape[1])
+    stream.write(values, window=window)
+
+
+def cloud_optimised(source: Path, file: Path, layer: Layer) -> None:
+    """Rewrite a GeoTIFF as a cloud-optimised one: overviews, DEFLATE with a predictor.
+
+    Raises OSError where the result is not what was written: GDAL closes files without a word when a disk is full.
+    """
+    rasterio = require_rasterio()
+    predictor = "FLOATING_POINT" if layer.dtype.startswith("float") else "STANDARD"
+    rasterio.shutil.copy(
+        source, file, driver="COG", COMPRESS="DEFLATE", PREDICTOR=predictor, BLOCKSIZE=TILE_PX, BIGTIFF="IF_SAFER",
+        OVERVIEW_RESAMPLING=layer.overviews.upper(), NUM_THREADS="ALL_CPUS",
+    )  # fmt: skip
+    with rasterio.open(source) as written, rasterio.open(file) as read:
+        if any(written.checksum(band) != read.checksum(band) for band in written.indexes):
+            raise OSError(f"{layer.name} came out damaged")
+
+
+def read_small(file: Path, longest_px: int) -> tuple[np.ndarray, float]:
+    """Bands [b, h, w] of a file at most so many pixels long, from its overviews, and how many pixels one stands for."""
+    with require_rasterio().open(file) as stream:
+        factor = max(1.0, max(stream.width, stream.height) / longest_px)
+        shape = (stream.count, max(1, round(stream.height / factor)), max(1, round(stream.width / factor)))
+        return stream.read(out_shape=shape), stream.height / shape[1]

@@ -1,0 +1,66 @@
+"""The folder of a map: what its files are called, whose they are, and how they come to stand in it together."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from vdgs.captures.output_guard import refuse_in_a_capture
+from vdgs.errors import VdgsError
+from vdgs.system.atomic_files import read_record, write_json
+
+ORTHOPHOTO, DSM, VISIBILITY = "orthophoto.tif", "dsm.tif", "visibility.tif"
+HILLSHADE, PREVIEW, FACTS = "hillshade.png", "preview.png", "map.json"
+NAMES = (ORTHOPHOTO, DSM, VISIBILITY, HILLSHADE, PREVIEW, FACTS)
+
+
+def software() -> str:
+    """What map.json calls the program that drew the files beside it."""
+    from vdgs import __version__
+
+    return f"vdgs {__version__}"
+
+
+def refuse_foreign(folder: Path) -> None:
+    """Raise VdgsError where maps may not go: among inputs of a capture, or where files of their names are not ours."""
+    refuse_in_a_capture(folder)
+    if folder.exists() and not folder.is_dir():
+        raise VdgsError(f"{folder}: is a file. Give a folder for the maps.")
+    there = [name for name in NAMES if os.path.lexists(folder / name)]
+    if there and not _is_ours(folder):
+        raise VdgsError(
+            f"{folder}: holds {', '.join(there)}, and no {FACTS} says that `vdgs map` wrote them. Nothing was drawn. "
+            "Give a new or an empty folder for --output; one with maps of vdgs gets the new ones in their place."
+        )
+
+
+def _is_ours(folder: Path) -> bool:
+    return str(read_record(folder / FACTS).get("software")).startswith("vdgs ")
+
+
+@contextmanager
+def staged(folder: Path) -> Iterator[Path]:
+    """A folder inside `folder` whose files come to stand in it when all are there; nothing is left if not.
+
+    map.json comes last: while files take their places it says only whose they are. Raises VdgsError, with the remedy,
+    where the disk refuses.
+    """
+    staging = folder / f".maps-{os.getpid()}"
+    try:
+        staging.mkdir(parents=True, exist_ok=True)
+        yield staging
+        write_json(folder / FACTS, {"software": software(), "finished": False})
+        for file in sorted(staging.iterdir(), key=lambda file: (file.name == FACTS, file.name)):
+            os.replace(file, folder / file.name)
+    except OSError as error:  # rasterio's errors are such too
+        raise VdgsError(
+            f"{folder}: the maps cannot be written ({error.strerror or error}). Free some space or give another "
+            "--output; maps that were there are kept."
+        ) from error
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()

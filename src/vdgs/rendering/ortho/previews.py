@@ -1,0 +1,175 @@
+"""Pictures of a map for people: the hillshade, and a sheet with scale, north, extent and legend."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from vdgs.geometry.map_projection import Placement
+from vdgs.plots.style import DPI, FAINT, INK, SEEN, placer, plain, titles
+from vdgs.plots.visibility_map import steps
+from vdgs.rendering.ortho.geotiff import read_small
+from vdgs.rendering.ortho.pixel_grid import Grid
+from vdgs.rendering.ortho.tile_renderer import NO_COUNT, NO_HEIGHT
+from vdgs.system.documents import MapMetadata
+
+#: The sun of a hillshade: from the north-west, half way up, as on printed maps.
+AZIMUTH_DEG, ALTITUDE_DEG = 315.0, 45.0
+#: Longest side of pictures, in pixels.
+LONGEST_PX = 2400
+_PANEL_PX = 1400
+HEIGHT_COLOURS = "terrain"
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What a sheet says beside its pictures."""
+
+    name: str
+    grid: Grid
+    placement: Placement
+    facts: MapMetadata
+
+
+def hillshade(heights: Float[np.ndarray, "h w"], pixel: float) -> Float[np.ndarray, "h w"]:
+    """Light on a surface (NaN where there is none), 0 to 1, for pixels of so many units; level ground has 0.71."""
+    down, right = np.gradient(heights, pixel) if min(heights.shape) > 1 else (np.zeros_like(heights),) * 2
+    # The normal is (-right, down, 1): rows run south, north is up.
+    azimuth, altitude = np.radians(AZIMUTH_DEG), np.radians(ALTITUDE_DEG)
+    sun = np.array([np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)])
+    lit = (sun[2] - sun[0] * right + sun[1] * down) / np.sqrt(1 + right * right + down * down)
+    return np.where(np.isfinite(heights), np.nan_to_num(lit, nan=sun[2]).clip(0, 1), np.nan)
+
+
+def hillshade_png(dsm: Path, file: Path, grid: Grid) -> None:
+    """Grey relief with transparent holes, at most `LONGEST_PX` long."""
+    heights, factor = _heights(dsm, LONGEST_PX)
+    light = hillshade(heights, grid.gsd * factor)
+    shown = np.isfinite(light)
+    grey = (np.nan_to_num(light) * 255 + 0.5).astype(np.uint8)
+    done, content = cv2.imencode(".png", np.dstack([grey, grey, grey, np.where(shown, 255, 0).astype(np.uint8)]))
+    assert done
+    file.write_bytes(content.tobytes())
+
+
+def preview_png(orthophoto: Path, dsm: Path, visibility: Path, file: Path, sheet: Sheet) -> None:
+    """Orthophoto, shaded heights and V side by side (above each other where the map is wide), each with its legend."""
+    grid = sheet.grid
+    x0, y0, x1, y1 = grid.bounds
+    across, along = x1 - x0, y1 - y0
+    scale = min(5.2 / across, 6.4 / along)
+    width, height = max(across * scale, 2.6), max(along * scale, 2.2)
+    figure = Figure(figsize=(3 * width + 4.9, height + 2.3), dpi=DPI)
+    canvas, place = FigureCanvasAgg(figure), placer(figure)
+    rgba = np.moveaxis(read_small(orthophoto, _PANEL_PX)[0], 0, -1)
+    heights, factor = _heights(dsm, _PANEL_PX)
+    counts = read_small(visibility, _PANEL_PX)[0][0]
+    panels = [place(0.95 + k * (width + 1.1) - (0.35 if k else 0.0), 0.8, width, height) for k in range(3)]
+    panels[0].imshow(rgba, extent=(x0, x1, y0, y1), interpolation="nearest")
+    _draw_heights(figure, panels[1], heights, hillshade(heights, grid.gsd * factor), sheet)
+    _draw_counts(figure, panels[2], counts, sheet)
+    for axes, title in zip(panels, ("orthophoto", "surface and its heights", "training cameras, V"), strict=True):
+        axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", facecolor="#f3f1ec")
+        axes.set_title(title, fontsize=10, color=INK, loc="left")
+        plain(axes)
+        for axis, most in ((axes.xaxis, 3), (axes.yaxis, 5)):
+            axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10]))
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}".replace(",", " ")))
+        axes.tick_params(labelsize=8)
+    for axes in panels[1:]:
+        axes.set_yticklabels([])
+    east, north = ("easting", "northing") if sheet.placement.crs.startswith(("EPSG", "enu")) else ("x", "y")
+    panels[0].set(xlabel=f"{east} ({sheet.placement.unit})", ylabel=f"{north} ({sheet.placement.unit})")
+    _scale_bar(panels[0], grid, sheet.placement)
+    _north(panels[0], "N" if east == "easting" else "y")
+    facts = sheet.facts
+    titles(
+        figure, sheet.name,
+        f"{sheet.placement.name}; {grid.width} x {grid.height} pixels of {grid.gsd:g} {sheet.placement.unit}; "
+        f"{facts['model']} model, {facts['training_cameras']} training photographs",
+        f"Heights: {sheet.placement.heights}. Blank: nothing solid, or no photograph looks there.",
+    )  # fmt: skip
+    canvas.print_png(file)  # type: ignore[arg-type]
+
+
+def _heights(dsm: Path, longest_px: int) -> tuple[Float[np.ndarray, "h w"], float]:
+    values, factor = read_small(dsm, longest_px)
+    return np.where(values[0] == np.float32(NO_HEIGHT), np.nan, values[0]).astype(np.float64), factor
+
+
+def _draw_heights(figure: Figure, axes: Axes, heights: np.ndarray, light: np.ndarray, sheet: Sheet) -> None:
+    x0, y0, x1, y1 = sheet.grid.bounds
+    there = heights[np.isfinite(heights)]
+    low, high = (float(v) for v in np.quantile(there, [0.005, 0.995])) if there.size else (0.0, 1.0)
+    norm = Normalize(low, max(high, low + 1e-6))
+    colours = matplotlib.colormaps[HEIGHT_COLOURS](0.15 + 0.7 * norm(np.nan_to_num(heights, nan=low)).clip(0, 1))
+    colours[..., :3] *= (0.25 + 0.75 * np.nan_to_num(light) / np.sin(np.radians(ALTITUDE_DEG))).clip(0, 1.2)[..., None]
+    colours[..., 3] = np.isfinite(heights)
+    axes.imshow(colours.clip(0, 1), extent=(x0, x1, y0, y1), interpolation="nearest")
+    shown = matplotlib.colors.ListedColormap(matplotlib.colormaps[HEIGHT_COLOURS](np.linspace(0.15, 0.85, 256)))
+    _legend(figure, axes, ScalarMappable(norm, shown), f"height ({sheet.placement.unit})")
+
+
+def _draw_counts(figure: Figure, axes: Axes, counts: np.ndarray, sheet: Sheet) -> None:
+    x0, y0, x1, y1 = sheet.grid.bounds
+    there = counts != NO_COUNT
+    top, norm = steps(counts[there]) if there.any() else (10, Normalize(0, 10))
+    shown = np.ma.masked_array(np.minimum(counts, top), ~there)
+    axes.imshow(shown, extent=(x0, x1, y0, y1), cmap=SEEN, norm=norm, interpolation="nearest")
+    _legend(figure, axes, ScalarMappable(norm, SEEN), f"V, to {top}")
+
+
+def _legend(figure: Figure, axes: Axes, colours: ScalarMappable, label: str) -> None:
+    """A bar at the right of a panel."""
+    box = axes.get_position()
+    bar = figure.add_axes(
+        (box.x1 + 0.08 / figure.get_figwidth(), box.y0, 0.1 / figure.get_figwidth(), box.height * 0.6)
+    )
+    legend = figure.colorbar(colours, cax=bar)
+    legend.outline.set_visible(False)  # type: ignore[operator]
+    legend.locator = MaxNLocator(5, integer=True)
+    legend.update_ticks()
+    legend.minorticks_off()
+    bar.tick_params(labelsize=7, colors=FAINT, labelcolor=INK, length=2)
+    bar.set_title(label, fontsize=7, color=INK, loc="left", pad=4)
+
+
+def _scale_bar(axes: Axes, grid: Grid, placement: Placement) -> None:
+    """A round length of about a quarter of the map, on white."""
+    x0, y0, x1, y1 = grid.bounds
+    length = round_length((x1 - x0) / 4)
+    left, low, thick = x0 + 0.05 * (x1 - x0), y0 + 0.05 * (y1 - y0), 0.012 * (y1 - y0)
+    for k, colour in enumerate((INK, "white")):
+        axes.add_patch(
+            matplotlib.patches.Rectangle((left + k * length / 2, low), length / 2, thick, fc=colour, ec=INK, lw=0.8)
+        )
+    axes.text(
+        left + length / 2, low + 1.6 * thick, f"{length:g} {placement.unit}", ha="center", va="bottom", fontsize=8,
+        color=INK, bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5},
+    )  # fmt: skip
+
+
+def _north(axes: Axes, name: str) -> None:
+    """An arrow to the top, which is grid north where there is one."""
+    axes.annotate(
+        name, xy=(0.94, 0.97), xytext=(0.94, 0.86), xycoords="axes fraction", ha="center", va="center", fontsize=9,
+        fontweight="bold", color=INK, arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 1.2},
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5},
+    )  # fmt: skip
+
+
+def round_length(about: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above `about`."""
+    power = 10.0 ** np.floor(np.log10(about))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= about * (1 + 1e-9)))

@@ -1,0 +1,128 @@
+"""A capture looked at before anyone trains: numbers as a table and as report.json, and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from vdgs.captures.capture import Capture
+from vdgs.captures.image_checks import CheckedImages
+from vdgs.captures.output_guard import refuse_among_inputs
+from vdgs.captures.reconstruction import ReconstructionFacts, facts_rows, left_out_lines
+from vdgs.captures.validation import judge, reprojection_words
+from vdgs.geometry.camera import Camera
+from vdgs.geometry.row_sampling import sample_points
+from vdgs.report.capture_figures import draw_map, draw_visibility
+from vdgs.report.capture_stats import CaptureReport, length, measure
+from vdgs.system.atomic_files import jsonable, write_json
+from vdgs.visibility.visibility_counts import visibility_of
+
+#: Points looked at when there are more, and fewer where there are many cameras.
+MOST_POINTS = 200_000
+LEAST_POINTS = 20_000
+MOST_PROJECTIONS = 2e8
+
+
+def inspect_capture(capture: Capture, output: Path, checked: CheckedImages | None = None) -> CaptureReport:
+    """Measure the capture; write report.json and two figures into the folder `output` (made if absent).
+
+    `checked` is what decoding its photographs told, where they were decoded. Raises VdgsError for an output among the
+    capture's inputs.
+    """
+    refuse_among_inputs(output, capture)
+    output.mkdir(parents=True, exist_ok=True)
+    few_enough = int(np.clip(MOST_PROJECTIONS / len(capture.train_views), LEAST_POINTS, MOST_POINTS))
+    points = sample_points(capture.points, few_enough)
+    visibility = _visibility(points, [view.camera for view in capture.train_views])
+    report = measure(capture, points, visibility, judge(capture), checked)
+    figures = [output / "visibility_map.png", output / "visibility.png"]
+    draw_map(capture, report, points, visibility, figures[0])
+    draw_visibility(report, visibility, figures[1])
+    report = replace(report, figures=[file.name for file in figures])
+    write_json(output / "report.json", jsonable(asdict(report)))
+    return report
+
+
+def _visibility(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """V of points [n, 3], int64 [n]."""
+    return visibility_of(torch.from_numpy(np.ascontiguousarray(points)), cameras).numpy().astype(np.int64)
+
+
+def print_report(
+    report: CaptureReport, console: Console | None = None, reconstruction: ReconstructionFacts | None = None
+) -> None:
+    """The report as a table for people, with how the capture was made of photographs, where it was made here."""
+    console = console or Console()
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column()
+    for label, value in _rows(report):
+        table.add_row(label, escape(value))
+    for label, value in facts_rows(reconstruction) if reconstruction is not None else ():
+        table.add_row(label, escape(value))
+    console.print(table)
+    for warning in report.warnings:
+        console.print(f"[yellow]Warning:[/] {escape(warning)}", highlight=False)
+    for problem in report.problems:
+        console.print(f"[red]Problem:[/] {escape(problem)}", highlight=False)
+    if reconstruction is not None:
+        for line in left_out_lines(reconstruction):
+            console.print(f"[yellow]Left out:[/] {escape(line)}", highlight=False)
+        for line in reconstruction.advice:
+            console.print(f"Next flight: {escape(line)}", highlight=False)
+
+
+def _rows(report: CaptureReport) -> list[tuple[str, str]]:
+    unit = report.unit
+    sizes = ", ".join(f"{width} x {height}" for width, height in report.image_sizes[:3])
+    more = len(report.image_sizes) - 3
+    quantiles = ", ".join(f"{value:g} ({q} %)" for q, value in report.visibility_quantiles.items())
+    below = ", ".join(f"{share:.1%} by < {limit}" for limit, share in report.share_below.items())
+    low, middle, high = report.camera_height
+    rows = [
+        ("Photographs", f"{report.photographs} ({report.train} train, {report.test} test), {report.source}"),
+        (
+            "Images",
+            f"{report.images or '.'}/: {sizes}" + (f" and {more} more sizes" if more > 0 else "") + " px",
+        ),
+        ("Focal length", f"{report.focal_px:.1f} px ({report.field_of_view_deg:.0f}° across)"),
+        ("Sparse points", f"{report.points}, median spacing {length(report.point_spacing, unit)}"),
+        ("Ground frame", report.ground + ("" if report.metric else " (not metric)")),
+        ("Extent", " x ".join(f"{value:.4g}" for value in report.extent) + f" {unit} (1-99 % of the points)"),
+        ("Camera height", f"{middle:.4g} {unit} (from {low:.4g} to {high:.4g}), tilt {report.tilt_deg:.1f}°"),
+        ("Ground sample distance", f"{length(report.ground_sample_distance, unit)} per pixel"),
+        ("Cameras per point V", quantiles),
+        ("Poorly seen points", f"{below} cameras; Gini {report.visibility_gini:.2f}"),
+        ("Masks", _masks(report)),
+        ("Cameras and points", _agreement(report)),
+        ("Images in memory", f"{report.image_bytes / 2**20:.0f} MiB"),
+    ]
+    if report.origin_geo is not None:
+        latitude, longitude, altitude = report.origin_geo
+        rows.insert(5, ("Origin", f"{latitude:.7f}, {longitude:.7f}, {altitude:.1f} m"))
+    return rows
+
+
+def _masks(report: CaptureReport) -> str:
+    """How much of the photographs is left out."""
+    left_out = "photographs not decoded" if report.masked_share is None else f"{report.masked_share:.1%} masked out"
+    if not report.masks and not report.masked_share:
+        return "none"
+    transparent = "" if report.masks else ", by transparency"
+    return f"of {report.masks} of {report.photographs} photographs; {left_out}{transparent}"
+
+
+def _agreement(report: CaptureReport) -> str:
+    """Whether the points lie where the photographs show them, and by what that was judged."""
+    seen = f"{report.share_seen:.1%} of the points lie in front of and inside a training camera"
+    if not report.sightings:
+        return f"{seen} (the capture has no tracks to reproject)"
+    error = reprojection_words(float("inf") if report.reprojection_px is None else report.reprojection_px)
+    return f"median reprojection error {error} ({report.sightings} sightings of the model's tracks); {seen}"

@@ -1,0 +1,156 @@
+"""What a capture holds and where it looks thin, in numbers, before anyone trains.
+
+The visibility V of a sparse point is the number of *training* cameras whose frustum holds it (z > near,
+projected centre on the image; no occlusion), as in section IV-B of the VDGS paper. Where V is small, a
+scene trains badly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from vdgs.captures.capture import Capture
+from vdgs.captures.image_checks import CheckedImages
+from vdgs.captures.validation import Soundness
+from vdgs.geometry.row_sampling import sample_points
+from vdgs.visibility.visibility_counts import LIMITS, imbalance, visibility_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureReport:
+    """Numbers about a capture; lengths are in `unit` of the ground frame."""
+
+    source: str
+    images: str
+    unit: str
+    photographs: int
+    train: int
+    test: int
+    #: Distinct image sizes, (width, height) in pixels, most frequent first.
+    image_sizes: list[tuple[int, int]]
+    #: Median horizontal focal length in pixels and field of view in degrees.
+    focal_px: float
+    field_of_view_deg: float
+    points: int
+    #: Median distance of a sparse point to its nearest neighbour.
+    point_spacing: float
+    ground: str
+    metric: bool
+    #: Latitude, longitude (deg) and altitude (m) of the origin, where known.
+    origin_geo: tuple[float, float, float] | None
+    #: x, y, z between the 1 % and 99 % quantiles of the sparse points.
+    extent: tuple[float, float, float]
+    #: Minimum, median, maximum height of the cameras above the median sparse point.
+    camera_height: tuple[float, float, float]
+    tilt_deg: float
+    #: Ground sample distance: median of depth / focal length over the views, per pixel.
+    ground_sample_distance: float | None
+    #: V of the points: quantiles by percent, mean, and Gini coefficient (0 = all seen alike).
+    visibility_quantiles: dict[int, float]
+    visibility_mean: float
+    visibility_gini: float
+    #: Share of points that fewer than 3, 5, 10 training cameras see.
+    share_below: dict[int, float]
+    #: Bytes that all images take in memory, as uint8.
+    image_bytes: int
+    #: Photographs with a mask, and the share of all pixels that masks and transparency leave out; None: not decoded.
+    masks: int
+    masked_share: float | None
+    #: Median reprojection error in pixels as used, on so many sightings; None where the capture has no tracks, or where
+    #: most of their points lie behind the cameras.
+    reprojection_px: float | None
+    sightings: int
+    #: Share of the points that at least one training camera sees.
+    share_seen: float
+    #: What makes training pointless, and what a person should know but need not mend.
+    problems: list[str]
+    warnings: list[str]
+    figures: list[str]
+
+
+def measure(
+    capture: Capture, points: np.ndarray, visibility: np.ndarray, soundness: Soundness, checked: CheckedImages | None
+) -> CaptureReport:
+    """The report on a capture, given (a sample of) its points and their V; `checked` None: nothing was decoded."""
+    cameras = [view.camera for view in capture.views]
+    ground_height = float(np.median(points[:, 2]))
+    heights = np.array([camera.position[2] for camera in cameras]) - ground_height
+    sizes, counts = np.unique([(c.width, c.height) for c in cameras], axis=0, return_counts=True)
+    low, high = np.quantile(points, [0.01, 0.99], axis=0)
+    spacing = cKDTree(points).query(points, k=2)[0][:, 1] if len(points) > 1 else np.zeros(1)
+    focal = float(np.median([camera.fx for camera in cameras]))
+    fields = [2 * np.degrees(np.arctan(camera.width / 2 / camera.fx)) for camera in cameras]
+    tilts = [np.degrees(np.arccos(np.clip(-camera.forward[2], -1, 1))) for camera in cameras]
+    masked = sum(view.camera.width * view.camera.height for view in capture.views if view.mask_path)
+    origin = capture.ground.origin_geo
+    seen = imbalance(visibility)
+    return CaptureReport(
+        source=capture.source,
+        images=capture.images,
+        unit=capture.ground.unit,
+        photographs=len(cameras),
+        train=len(capture.train_views),
+        test=len(capture.test_views),
+        image_sizes=[(int(w), int(h)) for w, h in sizes[np.argsort(-counts, kind="stable")]],
+        focal_px=focal,
+        field_of_view_deg=float(np.median(fields)),
+        points=len(capture.points),
+        point_spacing=float(np.median(spacing)),
+        ground=capture.ground.how,
+        metric=capture.ground.metric,
+        origin_geo=None if origin is None else (float(origin[0]), float(origin[1]), float(origin[2])),
+        extent=tuple(float(value) for value in high - low),  # type: ignore[arg-type]
+        camera_height=(float(heights.min()), float(np.median(heights)), float(heights.max())),
+        tilt_deg=float(np.median(tilts)),
+        ground_sample_distance=_ground_sample_distance(capture, points),
+        visibility_quantiles=seen.quantiles,
+        visibility_mean=seen.mean,
+        visibility_gini=seen.gini,
+        share_below=seen.share_below,
+        image_bytes=sum(3 * camera.width * camera.height for camera in cameras) + masked,
+        masks=sum(view.mask_path is not None for view in capture.views),
+        masked_share=None if checked is None else checked.masked_share,
+        reprojection_px=soundness.reprojection_px,
+        sightings=soundness.sightings,
+        share_seen=float((visibility > 0).mean()),
+        problems=list(soundness.problems),
+        warnings=[
+            *capture.warnings,
+            *(checked.warnings if checked else ()),
+            *soundness.warnings,
+            *_findings(visibility),
+        ],
+        figures=[],
+    )
+
+
+def _ground_sample_distance(capture: Capture, points: np.ndarray) -> float | None:
+    few = np.ascontiguousarray(sample_points(points, 20_000))
+    places, distances = torch.from_numpy(few), []
+    for view in capture.views:
+        seen = np.flatnonzero(visibility_of(places, [view.camera]).numpy())
+        if len(seen):
+            distances.append(float(np.median(view.camera.project(few[seen])[1])) / view.camera.fx)
+    return float(np.median(distances)) if distances else None
+
+
+def _findings(visibility: np.ndarray) -> list[str]:
+    """What the visibility says that a person should know."""
+    thin = float((visibility < LIMITS[0]).mean())
+    if thin <= 0.05:
+        return []
+    return [
+        f"{thin:.0%} of the points are seen by fewer than {LIMITS[0]} training cameras; "
+        "expect these parts to come out poorly (see the map)."
+    ]
+
+
+def length(value: float | None, unit: str) -> str:
+    """A length for people: centimetres where metres would be small."""
+    if value is None:
+        return "unknown"
+    return f"{value * 100:.3g} cm" if unit == "m" and value < 1 else f"{value:.3g} {unit}"

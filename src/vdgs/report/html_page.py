@@ -1,0 +1,162 @@
+"""The building blocks of the page. Text goes in as it is and is escaped here, nowhere else."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NewType
+
+from vdgs.report.embedded_images import Picture
+
+#: Markup, as against text.
+Html = NewType("Html", str)
+
+#: The browser may load nothing: all is in the file.
+POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+STYLE = """
+:root { color-scheme: light; }
+* { box-sizing: border-box; }
+body { margin: 0; background: #fff; color: #22262b; font: 16px/1.5 system-ui, -apple-system, "Segoe UI", sans-serif; }
+main { max-width: 68rem; margin: 0 auto; padding: 1.5rem 1rem 4rem; overflow-wrap: anywhere; }
+h1 { font-size: 1.7rem; line-height: 1.2; margin: 0.5rem 0; }
+h2 { font-size: 1.25rem; margin: 2.5rem 0 0.5rem; padding-top: 0.75rem; border-top: 1px solid #d5d9dd; }
+h3 { font-size: 1rem; margin: 1.5rem 0 0.25rem; }
+p { margin: 0.5rem 0; max-width: 46rem; }
+.facts, figcaption { color: #59626b; font-size: 0.875rem; }
+.verdict { font-size: 1.15rem; font-weight: 600; margin: 1rem 0; }
+.note { border-left: 4px solid #d08700; padding: 0.3rem 0.8rem; background: #fff8e6; }
+.absent { color: #59626b; font-style: italic; }
+nav { font-size: 0.875rem; margin: 1rem 0; }
+nav a { margin-right: 1rem; white-space: nowrap; }
+a { color: #1f5f8b; }
+.scroll { overflow-x: auto; margin: 0.75rem 0; }
+table { border-collapse: collapse; font-size: 0.9rem; font-variant-numeric: tabular-nums; overflow-wrap: normal; }
+th, td { padding: 0.25rem 0.9rem 0.25rem 0; text-align: right; vertical-align: top; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; }
+table.wordy td:last-child, table.wordy th:last-child { text-align: left; white-space: normal; min-width: 12rem; }
+thead th { border-bottom: 1px solid #8a939b; font-weight: 600; }
+tbody tr + tr td { border-top: 1px solid #eceff1; }
+figure { margin: 1rem 0; break-inside: avoid; }
+figcaption { margin-top: 0.25rem; }
+img { display: block; max-width: 100%; height: auto; }
+.tall img { width: 34rem; }
+.gallery { display: flex; flex-wrap: wrap; gap: 0.5rem 1.25rem; }
+.gallery figure { flex: 1 1 17rem; max-width: 30rem; margin: 0.5rem 0; }
+details { margin: 0.75rem 0; }
+summary { cursor: pointer; color: #1f5f8b; }
+pre { overflow-x: auto; background: #f5f7f8; padding: 0.75rem; font-size: 0.8rem; line-height: 1.4; }
+@media (max-width: 44rem) { .wide img { max-width: none; width: 44rem; } }
+@media print {
+  body { font-size: 10pt; }
+  main { max-width: none; padding: 0; }
+  nav { display: none; }
+  h2, h3 { break-after: avoid; }
+  tr { break-inside: avoid; }
+  .scroll { overflow: visible; }
+  table { font-size: 8pt; }
+  th, td { padding-right: 0.5rem; }
+  thead th { white-space: normal; vertical-align: bottom; }
+  img { max-height: 17cm; }
+  .wide img, .tall img { max-width: 100%; width: auto; }
+  .gallery figure { flex-basis: 45%; max-width: 48%; }
+  pre { white-space: pre-wrap; }
+}
+"""
+#: Control characters but tab and line feed, and halves of surrogate pairs: no page may hold them.
+_FORBIDDEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+
+
+def escaped(text: str) -> Html:
+    """Text as markup: `<` and its like stand for themselves, characters that a page may not hold become �."""
+    return Html(html.escape(_FORBIDDEN.sub("\N{REPLACEMENT CHARACTER}", text)))
+
+
+def joined(parts: Iterable[Html]) -> Html:
+    return Html("\n".join(part for part in parts if part))
+
+
+def paragraph(text: str, kind: str = "") -> Html:
+    """`kind` is "", facts, verdict, note or absent."""
+    return Html(f"<p{_class(kind)}>{escaped(text)}</p>") if text else Html("")
+
+
+def link(address: str, text: str, more: str = "") -> Html:
+    """A paragraph that leads to a file, and what follows the link."""
+    return Html(f'<p><a href="{escaped(address)}">{escaped(text)}</a>{escaped(more)}</p>')
+
+
+def heading(text: str) -> Html:
+    return Html(f"<h3>{escaped(text)}</h3>")
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "", wordy: bool = False) -> Html:
+    """Numbers stand to the right, but in the first column and, if `wordy`, the last. Nothing if there is no row."""
+    if not rows:
+        return Html("")
+    cells = "".join(f'<th scope="col">{escaped(cell)}</th>' for cell in head)
+    lines = "\n".join("<tr>" + "".join(f"<td>{escaped(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    # The caption stands outside, so that it does not scroll with a wide table.
+    return Html(
+        f"{paragraph(caption, 'facts')}\n"
+        f'<div class="scroll"><table{_class("wordy" if wordy else "")}>\n<thead><tr>{cells}</tr></thead>\n'
+        f"<tbody>\n{lines}\n</tbody></table></div>"
+    )
+
+
+def figure(picture: Picture | None, caption: str, alt: str, wide: bool = False, tall: bool = False) -> Html:
+    """A picture that is `wide` is not squeezed to the width of a phone but scrolls; one that is
+    `tall` does not fill a desk.
+
+    Nothing if there is no picture.
+    """
+    if picture is None:
+        return Html("")
+    image = f'<img src="{picture.data_uri()}" width="{picture.width}" height="{picture.height}" alt="{escaped(alt)}">'
+    words = f"<figcaption>{escaped(caption)}</figcaption>" if caption else ""
+    return Html(
+        f'<figure{_class("wide" if wide else "tall" if tall else "")}><div class="scroll">{image}</div>{words}</figure>'
+    )
+
+
+def gallery(figures: Iterable[Html]) -> Html:
+    """Small figures side by side, as many as fit."""
+    shown = joined(figures)
+    return Html(f'<div class="gallery">\n{shown}\n</div>') if shown else shown
+
+
+def details(summary: str, content: Html) -> Html:
+    """What is shown on demand."""
+    return Html(f"<details><summary>{escaped(summary)}</summary>\n{content}\n</details>") if content else content
+
+
+def preformatted(text: str) -> Html:
+    return Html(f"<pre>{escaped(text)}</pre>")
+
+
+def section(name: str, title: str, parts: Iterable[Html], notes: Iterable[str] = ()) -> Html:
+    """A section that links reach as `#name`; `notes` say what of the run could not be read."""
+    body = joined([*(paragraph(note, "note") for note in notes), *parts])
+    return Html(f'<section id="{escaped(name)}">\n<h2>{escaped(title)}</h2>\n{body}\n</section>')
+
+
+def contents(entries: Iterable[tuple[str, str]]) -> Html:
+    """Links to sections, given as name and title."""
+    links = " ".join(f'<a href="#{escaped(name)}">{escaped(title)}</a>' for name, title in entries)
+    return Html(f"<nav>{links}</nav>")
+
+
+def document(title: str, parts: Iterable[Html], facts: Mapping[str, str] | None = None) -> str:
+    """A whole page; `facts` stand in its head, for programs."""
+    told = "".join(f'<meta name="{escaped(k)}" content="{escaped(v)}">\n' for k, v in (facts or {}).items())
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{escaped(POLICY)}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"{told}<title>{escaped(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<main>\n"
+        f"{joined(parts)}\n</main>\n</body>\n</html>\n"
+    )
+
+
+def _class(name: str) -> str:
+    return f' class="{name}"' if name else ""

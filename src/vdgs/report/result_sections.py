@@ -1,0 +1,256 @@
+"""What came out: the verdict, test views, quality by visibility, by block and at the seams."""
+
+from __future__ import annotations
+
+from pathlib import PurePosixPath
+
+from vdgs.evaluation.by_visibility import bounds_of
+from vdgs.evaluation.image_io import file_stems
+from vdgs.report.charts import draw_gains, draw_pairs
+from vdgs.report.formatting import decibels, figure_of, gain, share, similarity
+from vdgs.report.html_page import Html, details, figure, gallery, paragraph, section, table
+from vdgs.report.run_reader import Record, Shown, Source
+from vdgs.system.units import ABSENT, count, data_size
+
+COARSE, MERGED = "coarse/evaluation", "evaluation"
+#: Rows of the table of test views, and pictures of seams, at most.
+MOST_VIEWS, MOST_SEAMS = 400, 3
+#: key in metrics.json, what people call it, format of a value and of a difference
+MEASURES = (
+    ("psnr", "PSNR (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("psnr_cc", "PSNR, colour-corrected (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("psnr_neutral", "PSNR in neutral colours (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("ssim", "SSIM ↑", "{:.4f}", "{:+.4f}"),
+    ("ssim_cc", "SSIM, colour-corrected ↑", "{:.4f}", "{:+.4f}"),
+    ("ssim_neutral", "SSIM in neutral colours ↑", "{:.4f}", "{:+.4f}"),
+    ("lpips_vgg", "LPIPS vgg ↓", "{:.4f}", "{:+.4f}"),
+    ("lpips_vgg_cc", "LPIPS vgg, colour-corrected ↓", "{:.4f}", "{:+.4f}"),
+    ("lpips_vgg_01", "LPIPS vgg, [0, 1] input ↓", "{:.4f}", "{:+.4f}"),
+    ("lpips_vgg_01_cc", "LPIPS vgg, [0, 1] input, colour-corrected ↓", "{:.4f}", "{:+.4f}"),
+    ("solid_share", "share of seen pixels that is opaque ↑", "{:.4f}", "{:+.4f}"),
+    ("psnr_seen_own", "PSNR of seen pixels before its own background (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("psnr_seen_black", "PSNR of seen pixels before black (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("psnr_seen_white", "PSNR of seen pixels before white (dB) ↑", "{:.2f}", "{:+.2f}"),
+    ("depth_error_median_expected", "median error of expected depth (camera heights) ↓", "{:.4f}", "{:+.4f}"),
+    ("depth_error_median_median", "median error of median depth (camera heights) ↓", "{:.4f}", "{:+.4f}"),
+    ("depth_within_1_percent_expected", "share with expected depth within 1 % ↑", "{:.4f}", "{:+.4f}"),
+    ("depth_within_1_percent_median", "share with median depth within 1 % ↑", "{:.4f}", "{:+.4f}"),
+    ("splats_larger_than_picture", "splats larger than the picture, all test views ↓", "{:,.0f}", "{:+,.0f}"),
+)
+
+
+def metrics_of(source: Source) -> tuple[Record, Record]:
+    """Figures of the coarse and of the merged model; where nothing is merged yet, a run evaluates its coarse model."""
+    coarse, merged = source.record(f"{COARSE}/metrics.json"), source.record(f"{MERGED}/metrics.json")
+    if merged.text("model") == "coarse":
+        return coarse or merged, Record({})
+    return coarse, merged
+
+
+def verdict(coarse: Record, merged: Record) -> str:
+    """The result in one line."""
+    before, after = coarse.number("psnr"), merged.number("psnr")
+    if after is None and before is None:
+        return "Nothing is evaluated yet."
+    if after is None or before is None:
+        name, one = ("Coarse", coarse) if after is None else ("Merged", merged)
+        return (
+            f"{name} model: PSNR {decibels(one.number('psnr'))} dB (colour-corrected "
+            f"{decibels(one.number('psnr_cc'))}), SSIM {similarity(one.number('ssim'))}."
+        )
+    return (
+        f"Coarse → merged: PSNR {decibels(before)} → {decibels(after)} dB ({gain(after, before)}), colour-corrected "
+        f"{_change(coarse, merged, 'psnr_cc', '{:.2f}')} dB; SSIM {_change(coarse, merged, 'ssim', '{:.4f}')}."
+    )
+
+
+def _change(coarse: Record, merged: Record, key: str, form: str) -> str:
+    before, after = coarse.number(key), merged.number(key)
+    signed = form.replace("{:", "{:+")
+    return f"{figure_of(before, form)} → {figure_of(after, form)} ({gain(after, before, signed)})"
+
+
+def result_table(coarse: Record, merged: Record) -> Html:
+    """Every measure of both models and the difference; measures that neither has are left out."""
+    rows = [
+        [label, figure_of(coarse.number(key), form), figure_of(merged.number(key), form),
+         gain(merged.number(key), coarse.number(key), signed)]
+        for key, label, form, signed in MEASURES
+        if (coarse.number(key), merged.number(key)) != (None, None)
+    ]  # fmt: skip
+    for key, label, words in (
+        ("n_anchors", "anchors", count),
+        ("model_bytes", "size of the model", data_size),
+        ("fps", "images drawn a second", lambda value: figure_of(value, "{:.1f}")),
+        ("test_views", "test views", count),
+    ):
+        pair = coarse.number(key), merged.number(key)
+        if pair != (None, None):
+            rows.append([label, words(pair[0]), words(pair[1]), ""])
+    notes = dict.fromkeys(merged.texts("notes") + coarse.texts("notes"))
+    lines = [table(["", "coarse", "merged", "Δ"], rows), *(paragraph(note, "facts") for note in notes)]
+    return Html("\n".join(lines))
+
+
+def views_section(shown: Shown) -> Html:
+    source = shown.source()
+    folder = MERGED if source.has(f"{MERGED}/per_view.json") else COARSE
+    rows = [row for row in source.rows(f"{folder}/per_view.json") if row.number("psnr") is not None]
+    other = {row.text("name"): row for row in source.rows(f"{COARSE}/per_view.json")} if folder == MERGED else {}
+    parts: list[Html] = []
+    if not rows and not source.exists(f"{MERGED}/per_view.json", f"{COARSE}/per_view.json"):
+        parts.append(paragraph("No test view is evaluated yet.", "absent"))
+    for kind, row in _best_median_worst(rows):
+        parts.append(_comparison(source, folder, kind, row, other.get(row.text("name"), Record({}))))
+    parts.append(_least_solid(source, folder, rows))
+    sheet = source.picture(f"{folder}/contact_sheet.png")
+    parts.append(figure(sheet, "All test views (or an even choice of them).", "contact sheet of the test views", True))
+    parts.append(details(f"All {len(rows)} test views in numbers", _views_table(rows, other)))
+    return section("views", "Test views", parts, source.notes)
+
+
+def _best_median_worst(rows: list[Record]) -> list[tuple[str, Record]]:
+    """By PSNR; fewer where there are fewer than three views."""
+    ranked = sorted(rows, key=lambda row: row.number("psnr") or 0.0)
+    if not ranked:
+        return []
+    chosen = {len(ranked) - 1: "Best", (len(ranked) - 1) // 2: "Median", 0: "Worst"}
+    return [(kind, ranked[rank]) for rank, kind in sorted(chosen.items(), reverse=True)]
+
+
+def _comparison(source: Source, folder: str, kind: str, row: Record, coarse: Record) -> Html:
+    name, stem = row.text("name") or "unnamed", PurePosixPath(row.text("render") or "").stem
+    caption = f"{kind}: {name}, {decibels(row.number('psnr'))} dB, SSIM {similarity(row.number('ssim'))}"
+    if coarse.number("psnr") is not None:
+        caption += f" (coarse {decibels(coarse.number('psnr'))} dB)"
+    if row.number("mean_visibility") is not None:
+        caption += f", mean V {row.number('mean_visibility'):.1f}"
+    picture = source.picture(f"{folder}/comparisons/{stem}.png") if stem else None
+    if picture is None:
+        return paragraph(f"{caption}. Its picture is not there.", "absent")
+    return figure(picture, f"{caption}.", f"photograph, render and error of {name}", True)
+
+
+def _least_solid(source: Source, folder: str, rows: list[Record]) -> Html:
+    """Alpha of the view with the lowest share of opaque pixels: where ground is half transparent, it is grey."""
+    known = [(solid, row) for row in rows if (solid := row.number("solid_share")) is not None and row.text("alpha")]
+    if not known:
+        return Html("")
+    solid, row = min(known, key=lambda each: each[0])
+    name, stem = row.text("name") or "unnamed", PurePosixPath(row.text("alpha") or "").stem
+    caption = (
+        f"Least solid: alpha of {name}, white is opaque. Of its pixels that at least 3 training cameras see, "
+        f"{share(solid)} have alpha of at least 0.95."
+    )
+    return figure(source.picture(f"{folder}/alpha/{stem}.png"), caption, f"alpha of {name}")
+
+
+def _views_table(rows: list[Record], other: dict[str | None, Record]) -> Html:
+    lines = []
+    for row in rows[:MOST_VIEWS]:
+        before = other.get(row.text("name"), Record({})).number("psnr")
+        lines.append(
+            [row.text("name") or ABSENT, figure_of(row.number("mean_visibility"), "{:.2f}"), decibels(before),
+             decibels(row.number("psnr")), gain(row.number("psnr"), before), decibels(row.number("psnr_cc")),
+             similarity(row.number("ssim")), similarity(row.number("lpips_vgg")), share(row.number("solid_share")),
+             count(row.number("largest_splats"))]
+        )  # fmt: skip
+    head = ["view", "mean V", "PSNR coarse", "PSNR", "Δ", "PSNR cc", "SSIM", "LPIPS vgg", "solid", "large splats"]
+    caption = f"The first {MOST_VIEWS} of {len(rows)}" if len(rows) > MOST_VIEWS else ""
+    return table(head, lines, caption)
+
+
+def by_visibility_section(shown: Shown) -> Html:
+    source = shown.source()
+    coarse, merged = metrics_of(source)
+    bins = merged.rows("by_visibility") or coarse.rows("by_visibility")
+    theirs = {_bounds(row): row for row in coarse.rows("by_visibility")}
+    pairs = [(theirs.get(_bounds(row), Record({})), row if merged else Record({})) for row in bins]
+    parts = [paragraph("Pixels of all test views, by the number V of training photographs that see the place drawn.")]
+    if not bins:
+        parts.append(paragraph("There are no figures by visibility yet.", "absent"))
+    names = [_bounds(row) for row in bins]
+    parts.append(_bins_table(bins, pairs))
+    before, after = ([each.number("psnr") for each in side] for side in zip(*pairs, strict=True)) if pairs else ([], [])
+    gains = [None if a is None or b is None else a - b for b, a in zip(before, after, strict=True)]
+    labels = [name.replace(" to ", "–").replace(" ", "\n") for name in names]
+    parts.append(
+        gallery(
+            [figure(draw_pairs(labels, before, after), "", "PSNR by visibility"),
+             figure(draw_gains(labels, gains), "", "gain of PSNR by visibility")]
+        )
+    )  # fmt: skip
+    return section("by-visibility", "Quality by visibility", parts, source.notes)
+
+
+def _bounds(row: Record) -> str:
+    lower, upper = row.number("lower"), row.number("upper")
+    return "nothing drawn" if lower is None or upper is None else bounds_of(lower, upper)
+
+
+def _bins_table(bins: list[Record], pairs: list[tuple[Record, Record]]) -> Html:
+    rows = []
+    for row, (coarse, merged) in zip(bins, pairs, strict=True):
+        line = [_bounds(row), count(row.number("pixels"))]
+        for key, form, signed in (("psnr", "{:.2f}", "{:+.2f}"), ("psnr_cc", "{:.2f}", "{:+.2f}"),
+                                  ("ssim", "{:.4f}", "{:+.4f}")):  # fmt: skip
+            before, after = coarse.number(key), merged.number(key)
+            line += [figure_of(before, form), figure_of(after, form), gain(after, before, signed)]
+        rows.append(line)
+    head = ["V", "pixels", "PSNR coarse", "merged", "Δ", "PSNR cc coarse", "merged", "Δ", "SSIM coarse", "merged", "Δ"]
+    return table(head, rows)
+
+
+def seams_section(shown: Shown) -> Html:
+    source = shown.source()
+    facts = source.record(f"{MERGED}/by_block.json")
+    parts: list[Html] = []
+    if not facts and not source.exists(f"{MERGED}/by_block.json"):
+        parts.append(paragraph("There are no figures by block: fewer than two blocks are merged.", "absent"))
+    rows = [_block_row(count(row.number("block")), row) for row in facts.rows("blocks")]
+    if rows and facts.inner("all"):
+        rows.append(_block_row("all", facts.inner("all")))
+    head = ["block", "pixels", "PSNR coarse", "PSNR alone", "PSNR merged", "merged − coarse"]
+    parts.append(
+        table(
+            head,
+            rows,
+            "PSNR pooled over the pixels of test views that show a block (not a mean over views). "
+            "Alone: the block as trained, before the merge",
+        )
+    )
+    parts.append(paragraph(_seam_sentence(facts.inner("seams"))))
+    parts += _seam_pictures(source, facts.rows("views"))
+    return section("seams", "Per block, and the seams between blocks", parts, source.notes)
+
+
+def _block_row(name: str, row: Record) -> list[str]:
+    before, alone, after = (row.number(f"psnr_{key}") for key in ("coarse", "alone", "merged"))
+    return [name, count(row.number("pixels")), decibels(before), decibels(alone), decibels(after), gain(after, before)]
+
+
+def _seam_sentence(seams: Record) -> str:
+    ratio = seams.number("seam_mae")
+    if ratio is None:
+        return ""
+    near, pixels = seams.number("border_px"), seams.number("border_pixels")
+    return (
+        f"Within {figure_of(near, '{:g}')} px of a border between blocks ({count(pixels)} pixels), the error relative "
+        f"to elsewhere is {ratio:.2f} times what it is in the coarse model, which has no seams (mean absolute error; "
+        f"squared error {figure_of(seams.number('seam_mse'), '{:.2f}')}). 1 is no seam; above 1, borders got worse."
+    )
+
+
+def _seam_pictures(source: Source, views: list[Record]) -> list[Html]:
+    """The views in which most pixels lie near a border."""
+    names = [row.text("name") or "" for row in views]
+    near = [row.number("border_pixels") or 0.0 for row in views]
+    found = [
+        (-pixels, name, f"{MERGED}/seams/{stem}.png")
+        for pixels, name, stem in zip(near, names, file_stems(names), strict=True)
+        if source.has(f"{MERGED}/seams/{stem}.png")
+    ]
+    return [
+        figure(source.picture(file), f"{name}: the model before and after the merge.", f"seams in {name}", True)
+        for _, name, file in sorted(found)[:MOST_SEAMS]
+    ]

@@ -1,0 +1,198 @@
+"""Files of a run, read with caution: a report is also written of runs that are unfinished or damaged."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vdgs.report.embedded_images import Picture, PictureError, load_picture
+from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_status import RunStanding, Standing
+
+#: Characters of one text, and entries of one list of texts, that a report shows.
+LONGEST_TEXT, MOST_TEXTS = 600, 40
+#: Numbers beyond are damage.
+LARGEST = 1e30
+
+
+@dataclass(frozen=True)
+class Record:
+    """A JSON object in which anything may be missing or of another kind than expected."""
+
+    values: Mapping[str, Any]
+
+    def __bool__(self) -> bool:
+        return bool(self.values)
+
+    def number(self, key: str) -> float | None:
+        """A number that a run may hold, or None: not NaN, infinity or nonsense that no axis can show."""
+        value = self.values.get(key)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            return None
+        return float(value) if abs(value) <= LARGEST else None
+
+    def text(self, key: str) -> str | None:
+        value = self.values.get(key)
+        return _shortened(value) if isinstance(value, str) else None
+
+    def texts(self, key: str) -> list[str]:
+        values = self.values.get(key)
+        if not isinstance(values, list):
+            return []
+        found = [_shortened(value) for value in values if isinstance(value, str)]
+        more = len(found) - MOST_TEXTS
+        return found[:MOST_TEXTS] + ([f"… and {more} more"] if more > 0 else [])
+
+    def inner(self, key: str) -> Record:
+        return _record(self.values.get(key))
+
+    def rows(self, key: str) -> list[Record]:
+        return _rows(self.values.get(key))
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The run that a report shows, and how far its stages are."""
+
+    run: RunFolder
+    standing: RunStanding
+
+    def source(self) -> Source:
+        """Its files, for one section: those that do not fit the run are left out."""
+        stale = {stage.folder: _out_of_date(stage) for stage in self.standing.stages if stage.state == "stale"}
+        return Source(self.run.path, stale)
+
+    def state_of(self, name: str) -> str:
+        """How far a stage is, in words."""
+        stage = self.standing.of(name)
+        state, why = STATES.get(stage.state, stage.state), stage.why
+        if stage.state == "unknown" and stage.status is not None:  # the caution at the top says the rest
+            state, why = stage.status.state, stage.status.why or ""
+        return state + (f": {why}" if why else "")
+
+    def cautions(self) -> list[str]:
+        """What to say of all that is shown though nobody knows whether it fits."""
+        unknown = [stage for stage in self.standing.stages if stage.state == "unknown"]
+        if not unknown:
+            return []
+        names = ", ".join(stage.name for stage in unknown)
+        return [f"It cannot be told whether these were made with the settings of the run: {names} ({unknown[0].why})."]
+
+
+#: States that need more words than their name.
+STATES = {"stale": "out of date", "unknown": "not known"}
+
+
+def _out_of_date(stage: Standing) -> str:
+    """Why a stage is left out, in a sentence."""
+    folder, why = stage.folder, stage.why
+    return f"{folder}: {why}; it is left out. `vdgs status` says which command makes it anew."
+
+
+class Source:
+    """The files of a run folder, for one section: what cannot be read is left out, and `notes` says so.
+
+    So are files below the folders in `stale`, each with the sentence that says why.
+    """
+
+    def __init__(self, root: Path, stale: Mapping[str, str] | None = None):
+        self._root, self._stale = root, stale or {}
+        self.notes: list[str] = []
+
+    def has(self, name: str) -> bool:
+        if self._is_stale(name):
+            return False
+        return os.path.exists(self._root / name)  # unlike Path.exists, no error for names that no file can have
+
+    def exists(self, *names: str) -> bool:
+        """Whether one of these files is there, in date or not."""
+        return any(os.path.exists(self._root / name) for name in names)
+
+    def _is_stale(self, name: str) -> bool:
+        """Whether a file that is there does not fit the run; the notes then say why, once."""
+        why = next((why for folder, why in self._stale.items() if name.startswith(f"{folder}/")), None)
+        if why is None or name.endswith("/status.json") or not os.path.exists(self._root / name):
+            return False
+        if why not in self.notes:
+            self.notes.append(why)
+        return True
+
+    def record(self, name: str) -> Record:
+        """The JSON object of a file; empty if there is none."""
+        return _record(self._json(name, dict))
+
+    def rows(self, name: str) -> list[Record]:
+        """The JSON objects of a file that lists them."""
+        return _rows(self._json(name, list))
+
+    def lines(self, name: str) -> list[Record]:
+        """The JSON objects of a file with one on each line."""
+        text = self.text(name)
+        found, bad = [], 0
+        for line in (text or "").splitlines():
+            try:
+                record = _record(json.loads(line))
+            except (ValueError, RecursionError):
+                record = Record({})
+            if record:
+                found.append(record)
+            else:
+                bad += 1
+        if bad:
+            self.notes.append(f"{name}: {bad} line{'s' if bad > 1 else ''} could not be read and {_are(bad)} left out.")
+        return found
+
+    def text(self, name: str) -> str | None:
+        """The text of a file; None if there is none."""
+        path = self._root / name
+        try:
+            return path.read_text(encoding="utf-8", errors="replace") if self.has(name) else None
+        except OSError as error:
+            self.notes.append(f"{name} cannot be read ({error.strerror or error}).")
+            return None
+
+    def picture(self, name: str) -> Picture | None:
+        """A PNG of the run, ready to embed; None if there is none."""
+        path = self._root / name
+        if not self.has(name):
+            return None
+        try:
+            return load_picture(path)
+        except PictureError as error:
+            self.notes.append(f"{name} is damaged or not a PNG ({error}); it is left out.")
+            return None
+
+    def _json(self, name: str, kind: type) -> Any:
+        text = self.text(name)
+        if text is None:
+            return None
+        try:
+            value = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            self.notes.append(f"{name} is damaged, not valid JSON ({error}); what it says is left out.")
+            return None
+        if not isinstance(value, kind):
+            expected = "an object" if kind is dict else "a list"
+            self.notes.append(f"{name} is damaged, it does not hold {expected}; what it says is left out.")
+            return None
+        return value
+
+
+def _are(count: int) -> str:
+    return "is" if count == 1 else "are"
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= LONGEST_TEXT else text[:LONGEST_TEXT] + "…"
+
+
+def _record(value: Any) -> Record:
+    return Record(value if isinstance(value, dict) else {})
+
+
+def _rows(value: Any) -> list[Record]:
+    return [Record(each) for each in value if isinstance(each, dict)] if isinstance(value, list) else []

@@ -1,0 +1,91 @@
+"""`vdgs status`: how far a run is, in lines for people and as plain values for programs."""
+
+from __future__ import annotations
+
+import shlex
+from collections import Counter
+from dataclasses import replace
+
+from rich.console import Console
+from rich.markup import escape
+
+from vdgs.report.write_report import report_standing
+from vdgs.runs.run_folder import REPORT, RunFolder
+from vdgs.runs.run_status import RunStanding, Standing, standing_of
+from vdgs.runs.status import Status
+from vdgs.system.documents import RunStatus, StageStatus
+
+#: Exit code of `vdgs status` for a run that is not whole: something of it is missing, runs, failed or is out of date.
+NOT_WHOLE = 3
+STYLES = {
+    "done": "green", "running": "cyan", "queued": "dim", "stopped": "yellow", "failed": "red", "stale": "yellow",
+    "missing": "dim", "unknown": "yellow",
+}  # fmt: skip
+
+
+def whole_standing(run: RunFolder) -> RunStanding:
+    """How far a run is, its report included. Raises RunError for a folder that holds no run."""
+    run.config_file.exists() or run.settings()  # which says that there is none
+    standing = standing_of(run)
+    return replace(standing, stages=(*standing.stages, report_standing(run, standing)))
+
+
+def print_status(run: RunFolder, console: Console) -> int:
+    """Say how far every stage and block is and what to type next; 0 if the run is whole, else `NOT_WHOLE`."""
+    standing = whole_standing(run)
+    width = max(len(stage.name) for stage in standing.stages)
+    for stage in standing.stages:
+        said = "; ".join(part for part in (progress_of(stage.status), stage.why) if part)
+        state = f"[{STYLES[stage.state]}]{stage.state:<8}[/]"
+        console.print(f"{stage.name:<{width}}  {state}  {escape(said)}".rstrip(), highlight=False)
+    counted = Counter(stage.state for stage in standing.stages)
+    console.print(", ".join(f"{count} {state}" for state, count in counted.items()), highlight=False)
+    console.print(escape(f"next: {next_step(standing)}"), highlight=False)
+    return 0 if standing.whole else NOT_WHOLE
+
+
+def status_facts(run: RunFolder) -> RunStatus:
+    """The same for programs."""
+    standing = whole_standing(run)
+    return {
+        "run": str(run.path), "whole": standing.whole, "at_work": standing.at_work,
+        "next": standing.next_command() or None, "stages": [_facts(stage) for stage in standing.stages],
+    }  # fmt: skip
+
+
+def next_step(standing: RunStanding) -> str:
+    """What a person does next, in a line."""
+    if command := standing.next_command():
+        return command
+    if standing.at_work:
+        return "nothing to type: it is at work"
+    run = shlex.quote(str(standing.path))
+    return f"open {standing.path / REPORT}, or film it: vdgs render {run} --views flyover --output flyover.mp4"
+
+
+def progress_of(status: Status | None) -> str:
+    """How far training came, in a few words."""
+    if status is None:
+        return ""
+    parts = []
+    if status.iteration is not None and status.iterations is not None:
+        parts.append(f"{status.iteration:,} of {status.iterations:,} iterations")
+    elif status.blocks_trained is not None and status.iterations is not None:
+        parts.append(f"{status.blocks_trained} trained blocks, {status.iterations:,} iterations in all")
+    if status.anchors is not None:
+        parts.append(f"{status.anchors:,} anchors")
+    if status.psnr_training is not None:
+        parts.append(f"{status.psnr_training:.2f} dB while training")
+    if status.state == "running" and status.seconds_left is not None:
+        parts.append(f"about {status.seconds_left:,} s left")
+    elif status.seconds is not None:
+        parts.append(f"{status.seconds:,.0f} s")
+    return ", ".join(parts)
+
+
+def _facts(stage: Standing) -> StageStatus:
+    status = stage.status or Status()
+    return {
+        "stage": stage.name, "state": stage.state, "why": stage.why or None, "folder": stage.folder,
+        "iteration": status.iteration, "iterations": status.iterations, "seconds_left": status.seconds_left,
+    }  # fmt: skip

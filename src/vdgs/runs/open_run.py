@@ -1,0 +1,176 @@
+"""A run opened for looking at it or for building on it: its capture, and one of its models."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from vdgs.captures.capture import Capture
+from vdgs.captures.capture_metadata import refuse_another_capture
+from vdgs.captures.loading import load_capture
+from vdgs.config.commands import ModelName
+from vdgs.errors import CaptureError, RunError
+from vdgs.model.anchor_model import AnchorModel
+from vdgs.runs.model_integrity import load_vouched
+from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_status import standing_of
+from vdgs.runs.stage_folder import StageFolder
+from vdgs.runs.status import Status
+from vdgs.system.atomic_files import read_json
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenedModel:
+    """One of the models of a run."""
+
+    folder: RunFolder
+    model: AnchorModel
+    model_path: Path
+    #: Which model it is, "coarse" or "merged", and the status of the stage that made it.
+    name: str
+    status: Status
+    #: Of the settings that it was made with (`runs.keys`).
+    key: str
+    #: Why it is not the model that one would expect (no merged one, or one that is out of date); empty where it is.
+    caution: str
+
+    @property
+    def line(self) -> str:
+        """Which model it is, in a few words."""
+        return _model_line(self.name, len(self.model.anchors), self.model_path)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model is."""
+        return self.model.anchors.positions.device
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainedRun(OpenedModel):
+    """A run opened for looking at it: one of its models, and its capture as it was trained on."""
+
+    capture: Capture
+
+
+def open_run(path: Path, which: ModelName = "best", device: torch.device | str = "cpu") -> TrainedRun:
+    """Open a run, its model on a device.
+
+    Raises RunError if it is none or not trained, CaptureError if its photographs are gone.
+    """
+    folder = RunFolder(path)
+    capture = open_capture(folder)
+    return with_capture(open_model(folder, which, device), capture)
+
+
+def with_capture(opened: OpenedModel, capture: Capture) -> TrainedRun:
+    """An opened model and the capture of its run. Raises RunError where it was made from another one."""
+    refuse_another_capture(opened.model_path, opened.model.metadata.capture, capture)
+    return TrainedRun(**vars(opened), capture=capture)
+
+
+def open_model(folder: RunFolder, which: ModelName = "best", device: torch.device | str = "cpu") -> OpenedModel:
+    """Open a model of a run on a device, without the capture. Raises RunError if it is not trained."""
+    found = find_model(folder, which)
+    return found.opened(folder, load_vouched(found.stage, found.key).to(torch.device(device)))
+
+
+def refuse_empty(folder: RunFolder, anchors: int | None) -> None:
+    """Raise RunError where the coarse model of a run holds no anchors (None: not known): nothing can be built on it."""
+    if anchors == 0:
+        growth = folder.method().training.growth
+        raise RunError(
+            f"{folder.coarse.path}: the coarse model holds no anchors: in training all of them were taken for "
+            f"transparent and removed. Give a smaller --growth.prune-opacity (it is {growth.prune_opacity:g}) or a "
+            "larger --growth.start, to `vdgs run` with --redo or in a new --output, and look at the photographs with "
+            "`vdgs inspect`: do they show the place, through the right cameras?"
+        )
+
+
+@dataclass(frozen=True)
+class FoundModel:
+    """One of the models of a run, not read yet; as `OpenedModel`."""
+
+    stage: StageFolder
+    name: ModelName
+    key: str
+    caution: str
+
+    @property
+    def line(self) -> str:
+        """Which model it is, in a few words."""
+        return _model_line(self.name, self.stage.status().anchors or 0, self.stage.model)
+
+    def opened(self, folder: RunFolder, model: AnchorModel) -> OpenedModel:
+        """The same with the model that was read of it."""
+        return OpenedModel(
+            folder=folder, model=model, model_path=self.stage.model, name=self.name, status=self.stage.status(),
+            key=self.key, caution=self.caution,
+        )  # fmt: skip
+
+
+def _model_line(name: str, anchors: int, file: Path) -> str:
+    return f"{name} model ({anchors:,} anchors, {file.stat().st_size / 1e6:,.1f} MB)"
+
+
+def find_model(folder: RunFolder, which: ModelName = "best") -> FoundModel:
+    """Which model of a run is meant. Raises RunError if it is not trained."""
+    keys, name = folder.keys(), which
+    if which == "best":
+        name = "merged" if folder.merged.is_done(keys.merge) else "coarse"
+    stage, key = (folder.merged, keys.merge) if name == "merged" else (folder.coarse, keys.coarse)
+    if not stage.is_done(key):
+        raise RunError(_not_there(folder, name))
+    return FoundModel(stage, name, key, _caution(folder, name) if which != "coarse" else "")
+
+
+def _not_there(folder: RunFolder, name: str) -> str:
+    """Why a model cannot be opened, and what to do."""
+    standing = standing_of(folder)
+    found = standing.of("merge" if name == "merged" else "coarse")
+    why = f"state: {found.state}" + (f", {found.why}" if found.why else "")
+    command = standing.next_command()
+    return f"{folder.path}: has no {name} model of its settings yet ({why})." + (
+        f" Next: {command}" if command else " A process works on it: wait for it."
+    )
+
+
+def _caution(folder: RunFolder, name: str) -> str:
+    """What to say of a model that is not the merged one, or of a merged one that is out of date."""
+    standing = standing_of(folder)
+    merged = standing.of("merge")
+    if merged.state == "done":
+        return merged.why
+    again = f"Next: {command}" if (command := standing.next_command()) else "A process works on the run."
+    if name == "merged":
+        return f"the merged model is out of date: {merged.why}. Merge again: vdgs merge {shlex.quote(str(folder.path))}"
+    state = f"there is one that was {merged.why}" if merged.state == "stale" else "there is none yet"
+    return f"this is the coarse model, not the merged one: {state}. {again}"
+
+
+def open_capture(folder: RunFolder, at: Path | None = None) -> Capture:
+    """The capture of a run, read as the run was started; `at` is where it lies if not where it lay.
+
+    Raises CaptureError if it is gone or changed its form.
+    """
+    settings = folder.settings()
+    written = Path(settings.capture_path)
+    if at is None and not written.is_dir():
+        raise CaptureError(
+            f"{written}: the capture of {folder.path} is not there. If it was moved, say where it lies now: "
+            "--capture PATH."
+        )
+    return load_capture(at or written, settings.capture)
+
+
+def remember_capture(folder: RunFolder, at: Path) -> Capture:
+    """Let a run find its capture where it lies now; returns it. Raises RunError for another capture than the run's, and
+    where another process works on the run or drives it."""
+    capture = open_capture(folder, at.resolve())
+    with folder.driven(), folder.locked():
+        if folder.capture_file.exists():
+            refuse_another_capture(folder.capture_file, read_json(folder.capture_file), capture)
+        folder.move_capture(at)
+    return capture

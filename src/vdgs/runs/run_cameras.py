@@ -1,0 +1,129 @@
+"""What a run keeps of its flight: every camera, so that it can be drawn where the capture is not.
+
+RUN/cameras.json is written when the coarse stage begins, and belongs to the capture that capture.json describes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from vdgs.captures.camera_height import camera_height
+from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.captures.capture_metadata import fingerprint
+from vdgs.captures.output_guard import folders_of_inputs
+from vdgs.errors import RunError
+from vdgs.geometry.camera import Camera
+from vdgs.runs.run_folder import RunFolder
+from vdgs.system.atomic_files import read_json, write_json
+from vdgs.system.documents import CaptureMetadata, JsonObject
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Flight:
+    """The cameras of a capture by the names of their photographs, in the ground frame."""
+
+    train: tuple[tuple[str, Camera], ...]
+    test: tuple[tuple[str, Camera], ...]
+    ground: GroundFrame
+    #: The median of the sparse points: what a film turns about.
+    middle: Float[np.ndarray, "3"]
+    #: How high the training cameras fly (`captures.heights`).
+    height: float
+    #: Where the capture lies, and the folders that hold its photographs and masks: nothing is written there.
+    root: Path
+    inputs: tuple[Path, ...]
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The training cameras."""
+        return [camera for _, camera in self.train]
+
+
+def flight_of(capture: Capture) -> Flight:
+    """The flight of a capture that is there."""
+    return Flight(
+        train=tuple((view.name, view.camera) for view in capture.train_views),
+        test=tuple((view.name, view.camera) for view in capture.test_views), ground=capture.ground,
+        middle=np.median(capture.points, axis=0), height=camera_height(capture), root=capture.root,
+        inputs=tuple(folders_of_inputs(capture)),
+    )  # fmt: skip
+
+
+def keep_flight(run: RunFolder, capture: Capture) -> None:
+    """Write the flight of a capture into its run."""
+    ground, root = capture.ground, capture.root.resolve()
+    write_json(
+        run.cameras_file,
+        {
+            "fingerprint": fingerprint(capture),
+            "ground_frame": {
+                "scale": ground.scale, "rotation": ground.rotation.tolist(), "translation": ground.translation.tolist(),
+                "metric": ground.metric, "how": ground.how, "origin_geo": ground.origin_geo,
+            },
+            "middle": np.median(capture.points, axis=0).tolist(),
+            "camera_height": camera_height(capture),
+            "input_folders": [_within(root, folder) for folder in folders_of_inputs(capture)],
+            "views": [_plain(view) for view in capture.views],
+        },
+    )  # fmt: skip
+
+
+def kept_flight(run: RunFolder, capture: CaptureMetadata | None) -> Flight | None:
+    """The flight that the run keeps, if it is that of the capture that a model describes; None for a run of a version
+    that kept none. RunError if the file is damaged."""
+    if not run.cameras_file.exists():
+        return None
+    record = read_json(run.cameras_file)
+    root = Path(run.settings().capture_path)
+    try:
+        if record["fingerprint"] != (capture or {}).get("fingerprint"):
+            return None
+        frame = record["ground_frame"]
+        geo = frame["origin_geo"]
+        ground = GroundFrame(
+            scale=float(frame["scale"]), rotation=np.array(frame["rotation"], np.float64),
+            translation=np.array(frame["translation"], np.float64), metric=bool(frame["metric"]), how=str(frame["how"]),
+            origin_geo=None if geo is None else tuple(geo),
+        )  # fmt: skip
+        views = [(each["split"], _view(each)) for each in record["views"]]
+        return Flight(
+            train=tuple(view for split, view in views if split == "train"),
+            test=tuple(view for split, view in views if split == "test"), ground=ground,
+            middle=np.array(record["middle"], np.float64), height=float(record["camera_height"]), root=root,
+            inputs=tuple(root / str(folder) for folder in record["input_folders"]),
+        )  # fmt: skip
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise RunError(
+            f"{run.cameras_file}: is damaged ({error}). Delete it; the cameras are then read from the capture."
+        ) from error
+
+
+def _within(root: Path, folder: Path) -> str:
+    """A folder as the root of the capture knows it, so that it is found where the capture was moved to; whole where it
+    lies elsewhere."""
+    whole = folder.absolute()
+    for path in (whole, whole.resolve()):
+        if path.is_relative_to(root):
+            return path.relative_to(root).as_posix()
+    return str(whole)
+
+
+def _plain(view: View) -> JsonObject:
+    camera = view.camera
+    return {
+        "name": view.name, "split": view.split, "camera_from_world": camera.camera_from_world.tolist(),
+        "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+        "width": camera.width, "height": camera.height,
+    }  # fmt: skip
+
+
+def _view(record: JsonObject) -> tuple[str, Camera]:
+    pose = np.array(record["camera_from_world"], np.float64).reshape(4, 4)
+    fx, fy, cx, cy = (float(record[key]) for key in ("fx", "fy", "cx", "cy"))
+    return str(record["name"]), Camera(
+        camera_from_world=pose, fx=fx, fy=fy, cx=cx, cy=cy, width=int(record["width"]), height=int(record["height"])
+    )

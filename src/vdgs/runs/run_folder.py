@@ -1,0 +1,206 @@
+"""The run folder: settings, states and results of one run, as files (docs/architecture.md)."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from vdgs.captures.reconstruction import is_reconstruction
+from vdgs.config.method import MethodConfig
+from vdgs.errors import RunError, VdgsError
+from vdgs.partition.block_records import PartitionRecord
+from vdgs.runs.config_file import ConfigFile, changed_options
+from vdgs.runs.run_settings import SECTIONS, RunSettings
+from vdgs.runs.stage_folder import StageFolder
+from vdgs.runs.stage_keys import StageKeys, stage_keys
+from vdgs.system.atomic_files import read_json
+from vdgs.system.file_locks import hold, seems_locked
+from vdgs.system.records import record_of
+
+#: The page about a run, in its folder (`vdgs report`).
+REPORT = "report.html"
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run on disk."""
+
+    path: Path
+
+    @property
+    def own_capture(self) -> Path:
+        """The capture that a run of photographs alone makes of them."""
+        return self.path / "capture"
+
+    @property
+    def config_file(self) -> Path:
+        return self.path / "config.yaml"
+
+    @property
+    def config(self) -> ConfigFile:
+        return ConfigFile(self.config_file)
+
+    @property
+    def capture_file(self) -> Path:
+        return self.path / "capture.json"
+
+    @property
+    def cameras_file(self) -> Path:
+        return self.path / "cameras.json"
+
+    @property
+    def coarse(self) -> StageFolder:
+        return StageFolder(self.path / "coarse")
+
+    def block(self, index: int) -> StageFolder:
+        return StageFolder(self.path / "blocks" / f"{index:02d}")
+
+    def block_folders(self) -> list[StageFolder]:
+        """Those that are there, in order; a folder whose name is no number is not ours."""
+        paths = [path for path in (self.path / "blocks").glob("[0-9]*") if path.name.isdecimal()]
+        return [StageFolder(path) for path in sorted(paths, key=lambda path: int(path.name))]
+
+    @property
+    def visibility(self) -> Path:
+        return self.path / "visibility"
+
+    @property
+    def partition(self) -> Path:
+        return self.path / "partition"
+
+    def partition_record(self) -> PartitionRecord:
+        """What partition.json says; nothing if the scene is not cut yet. RunError if the file is damaged."""
+        file = self.partition / "partition.json"
+        try:
+            return record_of(PartitionRecord, read_json(file)) if file.exists() else PartitionRecord()
+        except (VdgsError, ValueError) as error:
+            raise RunError(f"{file}: is damaged. Cut the scene again: vdgs partition {self.path}") from error
+
+    @property
+    def merged(self) -> StageFolder:
+        return StageFolder(self.path / "merged")
+
+    @property
+    def evaluation(self) -> Path:
+        return self.path / "evaluation"
+
+    def begin(self, settings: RunSettings, checked: Sequence[str] = SECTIONS, command: str | None = None) -> None:
+        """Write the settings of a new run, or check that those of the run that is there are the same.
+
+        `command` is the one that begins it, kept so that people can be told how to continue.
+
+        Only the sections named in `checked` are compared. Raises RunError with the differences if they are not the
+        same, and if the folder holds something else.
+        """
+        if self.config_file.exists():
+            changed = changed_options(self.settings(), settings, checked)
+            if changed:
+                raise RunError(
+                    f"{self.config_file}: this run was started with other settings:\n  "
+                    + "\n  ".join(changed)
+                    + "\nGive the old settings to continue it, or another --output to start a new run."
+                )
+            return
+        self.refuse_strangers()
+        self.config.write(settings, command)
+
+    def refuse_strangers(self) -> None:
+        """Raise RunError where a new run would be begun among other files."""
+        if self.config_file.exists():
+            return
+        known = {".lock", self._driver.name, *([self.own_capture.name] if is_reconstruction(self.own_capture) else [])}
+        if self.path.exists() and not self.path.is_dir():
+            raise RunError(f"{self.path}: is a file. Choose a folder for --output.")
+        strangers = (
+            [p.name for p in self.path.iterdir() if p.name not in known and p.suffix != ".tmp"]
+            if self.path.exists()
+            else []
+        )
+        if strangers:
+            raise RunError(
+                f"{self.path}: holds other files ({', '.join(sorted(strangers)[:3])}) and no config.yaml. "
+                "Choose an empty or a new folder for --output."
+            )
+
+    def change_settings(self, settings: RunSettings, redo: bool, command: str | None = None) -> list[str]:
+        """Give a run other settings; returns what changed, one line each. `command` as in `begin`.
+
+        Raises RunError, with the differences, if trained work depends on what changed, unless `redo` allows to
+        lose it. Stages delete what was made for other settings when they next run (`StageFolder.discard_unless`).
+        """
+        old = self.settings()
+        if old == settings:
+            return []
+        changed = changed_options(old, settings)
+        after = stage_keys(settings, self.coarse_identity())
+        lost = []
+        if self.coarse.holds_work() and self.coarse.key() != after.coarse:
+            lost.append("the coarse model")
+        blocks = [folder for folder in self.block_folders() if folder.holds_work() and folder.key() != after.blocks]
+        if blocks:
+            lost.append(f"{len(blocks)} blocks" if len(blocks) > 1 else "a block")
+        if lost and not redo:
+            raise RunError(
+                f"{self.config_file}: other settings than this run has:\n  " + "\n  ".join(changed)
+                + f"\nThey make {' and '.join(lost)} useless. Add --redo to train that again, give the old settings to "
+                "continue, or take another --output."
+            )  # fmt: skip
+        self.config.write(settings, command)
+        if self.coarse.path.exists():  # at once: nothing must be built on a model of other settings
+            self.coarse.discard_unless(after.coarse)
+        return changed
+
+    def move_capture(self, to: Path) -> None:
+        """Remember that the capture of the run lies elsewhere now. That it is the same one is for the caller to see."""
+        settings, command = self.settings(), self.config.command()
+        before, now = settings.capture_path, str(to.resolve())
+        if before == now:
+            return
+        words = shlex.split(command) if command else []
+        moved = shlex.join([now if word == before else word for word in words]) if before in words else None
+        self.config.write(replace(settings, capture_path=now), moved)
+
+    def settings(self) -> RunSettings:
+        """The settings of the run (`ConfigFile.settings`)."""
+        return self.config.settings()
+
+    def method(self) -> MethodConfig:
+        """The settings of the run but for the capture."""
+        return self.settings().method
+
+    def keys(self) -> StageKeys:
+        """The key of every stage, for the settings that config.yaml holds and the coarse model that is there."""
+        return stage_keys(self.settings(), self.coarse_identity())
+
+    def coarse_identity(self) -> str | None:
+        """What tells the coarse model from any other; None while there is none."""
+        return self.coarse.status().model
+
+    @contextmanager
+    def locked(self, shared: bool = False) -> Iterator[None]:
+        """Hold the run for this process, or share it with others that do (blocks are trained side by side).
+
+        RunError if another process stands in the way.
+        """
+        with hold(self.path, shared):
+            yield
+
+    @contextmanager
+    def driven(self) -> Iterator[None]:
+        """Take this run from stage to stage, so that others can see it between two stages too (`is_driven`).
+
+        Whoever changes its settings holds it meanwhile: between two stages, and while a model is measured or drawn, a
+        driver holds nothing else. RunError if another process drives the run.
+        """
+        with hold(self._driver):
+            yield
+
+    def is_driven(self) -> bool:
+        return seems_locked(self._driver)
+
+    @property
+    def _driver(self) -> Path:
+        return self.path / ".run"

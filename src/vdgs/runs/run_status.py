@@ -1,0 +1,275 @@
+"""How far a run is: what every stage and block came to, and whether that was made with the settings it has now.
+
+All that shows results of a run, builds on them or advises what to do next asks here, so that they say the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from vdgs.errors import VdgsError
+from vdgs.partition.block_records import PartitionRecord
+from vdgs.runs.model_integrity import foreign, to_delete
+from vdgs.runs.run_folder import RunFolder
+from vdgs.runs.run_settings import RunSettings
+from vdgs.runs.stage_folder import StageFolder
+from vdgs.runs.stage_keys import StageKeys, stage_keys
+from vdgs.runs.status import Status
+from vdgs.system.atomic_files import read_record
+from vdgs.system.file_locks import seems_locked
+
+#: `stale`: made with other settings, for another cut or from another model than the run has now. `unknown`: something
+#: is there, and no record says with which settings it was made.
+State = Literal["done", "running", "queued", "stopped", "failed", "stale", "missing", "unknown"]
+
+#: Why a result is stale, in words that end a sentence about it.
+OTHER_SETTINGS = "made with other settings than the run has now"
+OTHER_CUT = "trained for another cut or with other settings than the run has now"
+OTHER_BLOCKS = "its blocks are not those that it was merged from"
+OTHER_MODEL = "measured with another model than the run has now"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Standing:
+    """How far one stage of a run, or one of its blocks, is."""
+
+    name: str
+    state: State
+    folder: str
+    """What it made, inside the run."""
+    why: str = ""
+    """One line; empty where there is nothing to say."""
+    status: Status | None = None
+    """What the stage notes of itself, where it trains or merges."""
+    made: str = ""
+    """What tells what it made from any other."""
+    remedy: str = ""
+    """What to do before its command is of use."""
+
+
+@dataclass(frozen=True)
+class RunStanding:
+    """How far a run is."""
+
+    path: Path
+    stages: tuple[Standing, ...]
+    """In the order in which they are made."""
+    command: str | None = None
+    """The command that began the run, where its settings are still those that it asked for."""
+    driven: bool = False
+    """A command takes it from stage to stage."""
+
+    def of(self, name: str) -> Standing:
+        """A stage by its name: coarse, coarse evaluation, visibility, partition, cameras, block N, merge, evaluation.
+
+        Raises KeyError for a name that there is not.
+        """
+        return {stage.name: stage for stage in self.stages}[name]
+
+    @property
+    def blocks(self) -> list[Standing]:
+        return [stage for stage in self.stages if stage.name.startswith("block ")]
+
+    @property
+    def whole(self) -> bool:
+        """Every stage is done, with the settings of the run."""
+        return all(stage.state == "done" for stage in self.stages)
+
+    @property
+    def at_work(self) -> bool:
+        return self.driven or any(stage.state == "running" for stage in self.stages)
+
+    @property
+    def digest(self) -> str:
+        """What tells this standing from any other: a report of it is out of date once it differs."""
+        content = [[stage.name, stage.state, stage.made] for stage in self.stages]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+    def next_command(self) -> str:
+        """What to type next; empty while something runs, and where all is done."""
+        if self.at_work:
+            return ""
+        for stage in self.stages:
+            if stage.state == "unknown":
+                return f"mend {shlex.quote(str(self.path / 'config.yaml'))}"
+            if stage.state != "done":
+                if self._continues and not stage.remedy:
+                    return self.command or ""
+                return stage.remedy + self._command_for(stage.name)
+        return ""
+
+    @property
+    def _continues(self) -> bool:
+        """The command that began the run takes it to its end: it asked for all stages, and for the settings that the
+        run has."""
+        others = any(stage.state == "stale" and stage.why in (OTHER_SETTINGS, OTHER_CUT) for stage in self.stages)
+        return (self.command or "").startswith("vdgs run ") and not others
+
+    def _command_for(self, stage: str) -> str:
+        run = shlex.quote(str(self.path))
+        if stage == "coarse":
+            return self.command or f"the `vdgs run` or `vdgs coarse` command that began {run}"
+        verbs = {
+            "visibility": f"visibility {run}", "partition": f"partition {run}", "cameras": f"partition {run}",
+            "merge": f"merge {run}", "coarse evaluation": f"eval {run} --model coarse", "evaluation": f"eval {run}",
+            "report": f"report {run}",
+        }  # fmt: skip
+        return f"vdgs {verbs.get(stage, f'train {run}')}"
+
+
+def standing_of(run: RunFolder, settings: RunSettings | None = None) -> RunStanding:
+    """How far a run is, for its settings or for others. Reads only, and never fails on what it reads: what is damaged
+    is `unknown`, and says why."""
+    try:
+        keys, why = run.keys() if settings is None else stage_keys(settings, run.coarse_identity()), ""
+    except VdgsError as error:
+        keys, why = None, _first_line(str(error))
+    return RunStanding(run.path, tuple(_Survey(run, keys, why).stages()), run.config.command(), run.is_driven())
+
+
+@dataclass(frozen=True)
+class _Survey:
+    """One look at a run, whose keys are None where they cannot be known."""
+
+    run: RunFolder
+    keys: StageKeys | None
+    why_unknown: str
+
+    def stages(self) -> Iterator[Standing]:
+        run = self.run
+        coarse = self._trained("coarse", run.coarse, self._key("coarse"), OTHER_SETTINGS, run.path)
+        yield coarse
+        yield self._visibility()
+        yield self._measured("coarse evaluation", run.coarse.path / "evaluation", coarse)
+        yield from self._cut()
+        blocks = [
+            self._trained(f"block {int(folder.path.name)}", folder, self._key("blocks"), OTHER_CUT, folder.path)
+            for folder in self._block_folders()
+        ]
+        yield from blocks
+        merged = self._merged(blocks)
+        yield merged
+        yield self._measured("evaluation", run.evaluation, merged)
+
+    def _key(self, stage: str) -> str | None:
+        return None if self.keys is None else str(getattr(self.keys, stage))
+
+    def _judged(
+        self, name: str, folder: Path, there: bool, found: object, wanted: object, made: str, why: str = OTHER_SETTINGS
+    ) -> Standing:
+        """A stage whose record says with which settings it was made (`found`); None where it does not."""
+        state: State
+        if not there:
+            state, why = "missing", ""
+        elif self.keys is None:
+            state, why = "unknown", self.why_unknown
+        elif found is None:
+            state, why = "unknown", "nothing says with which settings it was made"
+        elif found != wanted:
+            state = "stale"
+        else:
+            state, why = "done", ""
+        return Standing(name=name, state=state, folder=self._inside(folder), why=why, made=made)
+
+    def _inside(self, folder: Path) -> str:
+        return folder.relative_to(self.run.path).as_posix()
+
+    def _visibility(self) -> Standing:
+        file = self.run.visibility / "visibility.json"
+        found = read_record(file).get("key")
+        wanted = self._key("visibility")
+        return self._judged("visibility", file.parent, file.exists(), found, wanted, str(found))
+
+    def _record(self) -> PartitionRecord:
+        try:
+            return self.run.partition_record()
+        except VdgsError:
+            return PartitionRecord()
+
+    def _cut(self) -> Iterator[Standing]:
+        folder, record = self.run.partition, self._record()
+        there = (folder / "partition.json").exists()
+        cut = self._judged("partition", folder, there, record.key, self._key("partition"), str(record.key))
+        cameras = self._judged(
+            "cameras", folder, there, record.assignment_key, self._key("assignment"), str(record.assignment_key)
+        )
+        yield cut
+        yield cameras
+
+    def _block_folders(self) -> list[StageFolder]:
+        """Those of the present cut, begun or not, and those that are there."""
+        count, keys, record = 0, self.keys, self._record()
+        if keys is not None and (record.key, record.assignment_key) == (keys.partition, keys.assignment):
+            count = len(record.blocks)
+        there = {int(folder.path.name): folder for folder in self.run.block_folders()}
+        return [there.get(index, self.run.block(index)) for index in sorted({*there, *range(count)})]
+
+    def _trained(self, name: str, folder: StageFolder, key: str | None, other: str, locked: Path) -> Standing:
+        inside = self._inside(folder.path)
+        try:
+            status = folder.status()
+        except VdgsError as error:
+            return Standing(name=name, state="unknown", folder=inside, why=_first_line(str(error)))
+        state, why = self._state_of(folder, status, key, other, locked)
+        if state == "done" and (wrong := foreign(folder, key or "", _number(name))):
+            remedy = f"delete {to_delete(folder)}, then "
+            return Standing(
+                name=name, state="stale", folder=inside, why=f"model.safetensors is {wrong}", status=status,
+                remedy=remedy,
+            )  # fmt: skip
+        return Standing(name=name, state=state, folder=inside, why=why, status=status, made=status.model or "")
+
+    def _state_of(
+        self, folder: StageFolder, status: Status, key: str | None, other: str, locked: Path
+    ) -> tuple[State, str]:
+        if status.state == "new" and not folder.holds_work():
+            return "missing", ""
+        if self.keys is None:
+            return "unknown", self.why_unknown
+        if folder.key() != key:
+            return "stale", other
+        if status.state == "done":
+            return ("done", status.why or "") if folder.model.exists() else ("missing", f"{folder.model.name} is gone")
+        if status.state == "running" and not seems_locked(locked):
+            return "stopped", "its process ended without a word; it continues from its last checkpoint"
+        if status.state in ("running", "queued", "stopped", "failed"):
+            return status.state, _first_line(status.why or "")  # type: ignore[return-value]
+        return "stopped", "it has a checkpoint, and says nothing of itself"
+
+    def _merged(self, blocks: list[Standing]) -> Standing:
+        merged = self.run.merged
+        found = self._trained("merge", merged, self._key("merge"), OTHER_SETTINGS, self.run.path)
+        if found.state != "done" or found.status is None:
+            return found
+        models = tuple((b.status.model if b.status else None) if b.state == "done" else None for b in blocks)
+        stands_in = [block.name for block, model in zip(blocks, models, strict=True) if model is None]
+        if found.status.block_models != models:
+            return Standing(
+                name="merge", state="stale", folder=found.folder, why=OTHER_BLOCKS, status=found.status, made=found.made
+            )
+        why = f"the coarse model stands in for {', '.join(stands_in)}" if stands_in else ""
+        return Standing(name="merge", state="done", folder=found.folder, why=why, status=found.status, made=found.made)
+
+    def _measured(self, name: str, folder: Path, model: Standing) -> Standing:
+        """Figures of a model: they are worth what the model is."""
+        there = (folder / "metrics.json").exists()
+        record = read_record(folder / "status.json")
+        made = json.dumps([record.get(each) for each in ("model", "lpips_weights", "bins")])
+        found = record.get("model")
+        known = model.made if model.state == "done" else ""
+        return self._judged(name, folder, there, found, known or None, made, OTHER_MODEL)
+
+
+def _number(name: str) -> int | None:
+    """Of a block, from the name of its standing."""
+    return int(name.split()[1]) if name.startswith("block ") else None
+
+
+def _first_line(text: str) -> str:
+    return text.strip().splitlines()[0] if text.strip() else ""

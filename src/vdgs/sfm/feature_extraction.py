@@ -1,0 +1,206 @@
+"""Cameras and features: photographs brought upright, one camera for each kind, their features in COLMAP's database."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+from PIL import Image, ImageOps
+from rich.console import Console
+
+from vdgs.captures.image_files import pillow_quietly
+from vdgs.errors import CaptureError
+from vdgs.sfm.image_list import LeftOut
+from vdgs.sfm.image_metadata import Photograph
+from vdgs.sfm.workspace import Work, call, progress
+from vdgs.system.atomic_files import write_atomically
+
+#: A focal length over the longer side where nothing says one: COLMAP's own guess.
+GUESSED_FOCAL = 1.2
+#: Photographs of fewer pixels of their longer side, and all where there are so few, are searched at twice their size:
+#: three times the work, half as many points again.
+SMALL_PX, FEW_PHOTOGRAPHS = 1200, 40
+#: Photographs that one call searches, for each thread: between two calls work can stop.
+AT_ONCE = 2
+#: Photographs with fewer features cannot be matched.
+FEW_FEATURES = 100
+_UPRIGHT_QUALITY = 97
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """Photographs that one camera took: the same maker, serial number, size and focal length."""
+
+    camera: str
+    width: int
+    height: int
+    focal_px: float
+    known: bool
+    """Whether something says the focal length."""
+    source: str
+    photographs: tuple[Photograph, ...]
+
+
+def kinds_of(photographs: Sequence[Photograph]) -> list[Kind]:
+    """Photographs by the cameras that they share, in the order of their first names; their numbers are 1, 2, ..."""
+    groups: dict[tuple[object, ...], list[Photograph]] = {}
+    for photo in photographs:
+        focal = photo.lens.focal if photo.lens else None
+        groups.setdefault((photo.camera, photo.width, photo.height, focal and round(focal, 4)), []).append(photo)
+    kinds = []
+    for members in groups.values():
+        first = members[0]
+        lens, longer = first.lens, max(first.width, first.height)
+        focal = (lens.focal if lens else GUESSED_FOCAL) * longer
+        source = lens.source if lens else "a guess"
+        kinds.append(
+            Kind(
+                camera=first.camera,
+                width=first.width,
+                height=first.height,
+                focal_px=focal,
+                known=bool(lens),
+                source=source,
+                photographs=tuple(members),
+            )
+        )
+    return kinds
+
+
+def stand_upright(work: Work, photographs: Sequence[Photograph]) -> list[LeftOut]:
+    """Fill the work folder with links to the photographs, and upright copies of those that EXIF says lie.
+
+    Returns those that could not be decoded. Photographs themselves are never changed.
+    """
+    failed = []
+    for photo in photographs:
+        target = work.photographs / photo.name
+        if target.exists():
+            continue
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if photo.orientation == 1:
+            target.unlink(missing_ok=True)  # a link that leads nowhere
+            os.symlink(photo.path.resolve(), target)
+            continue
+        try:
+            _write_upright(photo.path, target)
+        except (OSError, SyntaxError, ValueError) as error:
+            failed.append(LeftOut(photo.name, f"cannot be decoded ({error}): copy it again"))
+    return failed
+
+
+def _write_upright(source: Path, target: Path) -> None:
+    with pillow_quietly(), Image.open(source) as image:
+        upright = ImageOps.exif_transpose(image).convert("RGB")
+    kind = (
+        "PNG" if target.suffix.lower() == ".png" else "TIFF" if target.suffix.lower() in (".tif", ".tiff") else "JPEG"
+    )
+
+    def write(file: Path) -> None:
+        upright.save(file, kind, quality=_UPRIGHT_QUALITY, subsampling=0)
+
+    write_atomically(target, write)
+
+
+def open_database(work: Work, kinds: Sequence[Kind]) -> None:
+    """The database with one camera for each kind of photographs, unless it is there."""
+    work.path.mkdir(parents=True, exist_ok=True)
+    database = pycolmap.Database.open(work.database)
+    try:
+        if database.num_cameras() == len(kinds):
+            return
+        database.clear_all_tables()
+        for kind in kinds:
+            params = [kind.focal_px, kind.width / 2, kind.height / 2, 0.0]
+            camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=kind.width, height=kind.height, params=params)
+            camera.has_prior_focal_length = kind.known
+            number = database.write_camera(camera)
+            rig = pycolmap.Rig()
+            rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number))
+            database.write_rig(rig)
+    finally:
+        database.close()
+
+
+def find_features(
+    work: Work, kinds: Sequence[Kind], feature_size: int, most: int, threads: int, console: Console
+) -> dict[str, int]:
+    """Features of all photographs into the database; those that are there already are kept. Returns their numbers."""
+    names = [photo.name for kind in kinds for photo in kind.photographs if (work.photographs / photo.name).exists()]
+    count, done = len(names), 0
+    with progress(console, "features, photographs", count) as tell:
+        for number, kind in enumerate(kinds, 1):
+            missing = [photo.name for photo in kind.photographs if (work.photographs / photo.name).exists()]
+            there = feature_counts(work)
+            done += sum(name in there for name in missing)
+            missing = [name for name in missing if name not in there]
+            octave = -1 if is_searched_finely(max(kind.width, kind.height), feature_size, count) else 0
+            for masked in (False, True):  # COLMAP takes masks for all photographs of a call, or for none
+                names = [name for name in missing if work.mask(name).exists() == masked]
+                for start in range(0, len(names), AT_ONCE * threads):
+                    chunk = names[start : start + AT_ONCE * threads]
+                    _extract(work, chunk, masked, number, octave, feature_size, most, threads)
+                    done += len(chunk)
+                    tell(done)
+    return feature_counts(work)
+
+
+def is_searched_finely(longer_side: int, feature_size: int, count: int) -> bool:
+    """Whether photographs of this size, so many in all, are searched at twice their size."""
+    return min(longer_side, feature_size) < SMALL_PX or count <= FEW_PHOTOGRAPHS
+
+
+def _extract(
+    work: Work,
+    names: list[str],
+    masked: bool,
+    camera: int,
+    first_octave: int,
+    feature_size: int,
+    most: int,
+    threads: int,
+) -> None:
+    reader, options = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+    reader.existing_camera_id = camera
+    if masked:
+        reader.mask_path = work.masks
+    options.num_threads, options.max_image_size, options.use_gpu = threads, feature_size, False
+    options.sift.first_octave, options.sift.max_num_features = first_octave, most
+    call(
+        pycolmap.extract_features, work.database, work.photographs, names, reader_options=reader,
+        extraction_options=options, device=pycolmap.Device.cpu,
+    )  # fmt: skip
+
+
+def feature_counts(work: Work) -> dict[str, int]:
+    """Numbers of features by the names of photographs in the database."""
+    database = pycolmap.Database.open(work.database)
+    try:
+        return {
+            image.name: database.num_keypoints_for_image(image.image_id)
+            for image in database.read_all_images()
+            if database.exists_keypoints(image.image_id)
+        }
+    finally:
+        database.close()
+
+
+def without_features(photographs: Sequence[Photograph], counts: dict[str, int]) -> list[LeftOut]:
+    """Photographs that COLMAP could not decode, or found nearly nothing in (outside their masks)."""
+    found = []
+    for photo in photographs:
+        count = counts.get(photo.name)
+        if count is None:
+            found.append(LeftOut(photo.name, "cannot be decoded: copy it again"))
+        elif count < FEW_FEATURES:
+            where = " where its mask is white" if photo.may_be_masked else ""
+            found.append(LeftOut(photo.name, f"shows only {count} features{where}: blurred, dark, sky or water?"))
+    if len(photographs) - len(found) < 3:
+        raise CaptureError(
+            f"{len(photographs) - len(found)} of {len(photographs)} photographs show enough to be matched; a scene "
+            f"needs 3. The first: {found[0].name} {found[0].why}."
+        )
+    return found

@@ -1,0 +1,263 @@
+"""Surveyed points that photographs show: ODM's gcp_list.txt, read and checked before the work."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from vdgs.captures.name_resolution import Lookup, ambiguity
+from vdgs.errors import CaptureError
+from vdgs.geometry.geodesy import enu_from_geodetic
+from vdgs.geometry.similarity import is_collinear
+from vdgs.sfm.image_list import Collection
+from vdgs.sfm.image_metadata import Photograph
+
+#: Fewer points fix no place, scale and directions.
+LEAST_POINTS = 3
+#: Photographs that must show a point: one view tells a line, no place.
+LEAST_SIGHTINGS = 2
+#: Points farther from the photographs than this are in another zone, or east and north have changed places (metres).
+FAR_M = 20_000.0
+#: A word for all points of the file, where some are named to be held out.
+ALL = "all"
+#: Larger files, and points higher above or below the sea, are none (bytes, metres).
+_LONGEST_FILE, _HIGHEST_M = 1 << 24, 20_000.0
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Where a photograph shows a point."""
+
+    photograph: str
+    """Its name in the capture."""
+    pixel: tuple[float, float]
+    """From the upper left corner of the upright photograph; 0.5, 0.5 is the middle of its first pixel."""
+
+
+@dataclass(frozen=True)
+class ControlPoint:
+    """A surveyed point."""
+
+    name: str
+    geodetic: tuple[float, float, float]
+    """Latitude and longitude (WGS 84) in degrees, height in metres as the file has it."""
+    sightings: tuple[Sighting, ...]
+    held_out: bool
+    """Only measured afterwards (a check point)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """All surveyed points of a file."""
+
+    points: tuple[ControlPoint, ...]
+    system: str
+    """The coordinate system that the file names."""
+    source: str
+    notes: tuple[str, ...]
+
+    @property
+    def places_the_model(self) -> bool:
+        return any(not point.held_out for point in self.points)
+
+    def enu(self, origin: tuple[float, float, float]) -> Float[np.ndarray, "n 3"]:
+        """All points in metres east, north, up of an origin."""
+        return enu_from_geodetic(np.array([point.geodetic for point in self.points]), origin)
+
+    @property
+    def middle(self) -> tuple[float, float, float]:
+        """An origin, where positions give none."""
+        latitude, longitude, height = np.median([point.geodetic for point in self.points], axis=0).tolist()
+        return latitude, longitude, height
+
+
+@dataclass(frozen=True)
+class _Line:
+    number: int
+    place: tuple[float, float, float]
+    pixel: tuple[float, float]
+    photograph: str
+    name: str
+
+
+def read_control(file: Path, collection: Collection, held_out: Sequence[str]) -> Control:
+    """The points of a gcp_list.txt: a first line with the coordinate system, then x y z px py photograph [name].
+
+    Pixels are those of the file as it is, before EXIF's orientation, as ODM counts them. Points named in `held_out`
+    (`all`: every one) are check points. What photographs show that were left out is not used.
+
+    Raises CaptureError for a file that cannot be read, a system that is unknown, lines that are none, photographs that
+    are not there, pixels outside them, names that are not there, and points that are too few or along a line.
+    """
+    header, lines = _lines(file)
+    by_name = _by_name(collection)
+    found = [(line, _sighting(line, by_name, file)) for line in lines]
+    transform, system = _system(header, file)
+    groups: dict[tuple[object, ...], list[tuple[_Line, Sighting | None]]] = {}
+    for line, sighting in found:
+        groups.setdefault((line.name,) if line.name else line.place, []).append((line, sighting))
+    names = [group[0][0].name or f"point {k}" for k, group in enumerate(groups.values(), 1)]
+    _check_held_out(held_out, names, file)
+    points = []
+    for name, group in zip(names, groups.values(), strict=True):
+        geodetic = _place([line for line, _ in group], name, transform, system, file)
+        seen = tuple(sighting for _, sighting in group if sighting is not None)
+        points.append(ControlPoint(name, geodetic, seen, ALL in held_out or name in held_out))
+    return _checked(points, system, file)
+
+
+def _place(lines: Sequence[_Line], name: str, transform: Any, system: str, file: Path) -> tuple[float, float, float]:
+    """Latitude, longitude and height of a point that lines speak of."""
+    first = lines[0]
+    other = next((line for line in lines if line.place != first.place), None)
+    if other is not None:
+        raise CaptureError(
+            f"{file}: line {other.number}: the point {name} has another place in line {first.number}. Mend one of them."
+        )
+    latitude, longitude, height = (float(value) for value in transform(np.array([first.place]))[0])
+    if not all(map(math.isfinite, (latitude, longitude, height))) or abs(latitude) > 90 or abs(height) > _HIGHEST_M:
+        raise CaptureError(
+            f"{file}: line {first.number}: {', '.join(f'{value:.10g}' for value in first.place)} is no place in "
+            f"{system}. Is it the right system, and x (east) before y (north)?"
+        )
+    return latitude, longitude, height
+
+
+def check_near(control: Control, positions: np.ndarray, origin: tuple[float, float, float], file: Path) -> None:
+    """Raise CaptureError where the points [n, 3] lie nowhere near the positions [m, 3] of the photographs."""
+    if not len(positions):
+        return
+    away = float(np.median(np.linalg.norm(control.enu(origin)[:, :2] - np.median(positions[:, :2], axis=0), axis=1)))
+    if away > FAR_M:
+        raise CaptureError(
+            f"{file}: its points lie {away / 1000:,.0f} km from the photographs. Is {control.system} the right system "
+            "and zone, and x (east) before y (north)?"
+        )
+
+
+def _lines(file: Path) -> tuple[str, list[_Line]]:
+    try:
+        if file.stat().st_size > _LONGEST_FILE:
+            raise CaptureError(f"{file}: is far too large for a list of control points.")
+        text = file.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise CaptureError(f"{file}: cannot be read ({error.strerror}).") from error
+    except UnicodeDecodeError:
+        raise CaptureError(f"{file}: is not a text file. A gcp_list.txt is expected.") from None
+    rows = [(k, line.strip()) for k, line in enumerate(text.splitlines(), 1)]
+    rows = [(k, line) for k, line in rows if line and not line.startswith("#")]
+    if not rows:
+        raise CaptureError(f"{file}: is empty. The first line names the coordinate system, such as EPSG:32615.")
+    return rows[0][1], [_line(line, number, file) for number, line in rows[1:]]
+
+
+def _line(text: str, number: int, file: Path) -> _Line:
+    words = text.split("\t") if text.count("\t") >= 5 else text.split()
+    try:
+        x, y, z, across, down = (float(word) for word in words[:5])
+        photograph = words[5].strip()
+    except (ValueError, IndexError):
+        raise CaptureError(
+            f"{file}: line {number}: {text[:80]!r} is not `x y z px py photograph [name]`. Mend the line."
+        ) from None
+    if not all(map(math.isfinite, (x, y, z, across, down))):
+        raise CaptureError(f"{file}: line {number}: numbers must be finite. Mend the line.")
+    name = words[6].strip() if len(words) > 6 else ""
+    return _Line(number, (x, y, z), (across, down), photograph, name)
+
+
+def _system(header: str, file: Path) -> tuple[Any, str]:
+    """What brings x, y, z [n, 3] to latitude, longitude and height, and the name of their system."""
+    try:
+        import pyproj
+    except ImportError:
+        raise CaptureError(f"{file}: needs pyproj: pip install 'vdgs[geo]'.") from None
+    try:
+        crs = pyproj.CRS.from_user_input(_named(header))
+        flat = len(crs.axis_info) == 2
+        change = pyproj.Transformer.from_crs(crs, "EPSG:4326" if flat else "EPSG:4979", always_xy=True)
+    except pyproj.exceptions.ProjError:
+        raise CaptureError(
+            f"{file}: the first line must name the coordinate system (EPSG:32615, WGS84 UTM 15N, or a PROJ string), "
+            f"and {header[:60]!r} names none."
+        ) from None
+
+    def to_geodetic(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        x, y, z = places.T
+        if flat:  # heights are metres as they are, whatever they are measured from
+            longitude, latitude = change.transform(x, y)
+        else:
+            longitude, latitude, z = change.transform(x, y, z)
+        return np.stack([latitude, longitude, z], axis=1)
+
+    return to_geodetic, crs.name if crs.name != "unknown" else header
+
+
+def _named(header: str) -> str:
+    """ODM's own words for systems, `WGS84` and `WGS84 UTM 15N`, as codes; others as they are."""
+    words = header.upper().split()
+    if words == ["WGS84"]:
+        return "EPSG:4326"
+    if words[:2] == ["WGS84", "UTM"] and len(words) == 3 and words[2][:-1].isdecimal() and words[2][-1] in "NS":
+        return f"EPSG:{(32600 if words[2][-1] == 'N' else 32700) + int(words[2][:-1])}"
+    return header
+
+
+def _by_name(collection: Collection) -> Lookup[Photograph | str]:
+    """Photographs, and names of those left out."""
+    left_out: list[tuple[str, Photograph | str]] = [(each.name, each.name) for each in collection.left_out]
+    return Lookup([*((photo.name, photo) for photo in collection.photographs), *left_out])
+
+
+def _sighting(line: _Line, by_name: Lookup[Photograph | str], file: Path) -> Sighting | None:
+    """None in a photograph that was left out."""
+    found = by_name.find(line.photograph)[1] or by_name.find_elsewhere(line.photograph)[1]
+    where = f"{file}: line {line.number}:"
+    if not found:
+        raise CaptureError(f"{where} there is no photograph {line.photograph!r}. Mend the name, or remove the line.")
+    photo = found[0]
+    if len(found) > 1:
+        one, other = (each if isinstance(each, str) else each.name for each in found[:2])
+        raise CaptureError(f"{where} {ambiguity(line.photograph, one, other)}")
+    if isinstance(photo, str):
+        return None
+    width, height = photo.stored_size
+    if not (0 <= line.pixel[0] <= width and 0 <= line.pixel[1] <= height):
+        raise CaptureError(
+            f"{where} pixel {line.pixel[0]:g}, {line.pixel[1]:g} is outside {photo.name}, which has {width} x {height}."
+            " Was the photograph made smaller since?"
+        )
+    return Sighting(photo.name, photo.upright(line.pixel))
+
+
+def _check_held_out(held_out: Sequence[str], names: Sequence[str], file: Path) -> None:
+    unknown = [name for name in held_out if name not in names and name != ALL]
+    if unknown:
+        raise CaptureError(f"--check-points {unknown[0]}: {file} has {', '.join(names[:20])}; or say {ALL}.")
+
+
+def _checked(points: list[ControlPoint], system: str, file: Path) -> Control:
+    """Without points that too few photographs show. Raises CaptureError where too few are left to place a model."""
+    seen = [point for point in points if len({each.photograph for each in point.sightings}) >= LEAST_SIGHTINGS]
+    lonely = [point.name for point in points if point not in seen]
+    notes = [f"{file.name}: only one photograph shows {', '.join(lonely[:5])}; not used."] if lonely else []
+    used = [point for point in seen if not point.held_out]
+    if not seen or (used and len(used) < LEAST_POINTS):
+        raise CaptureError(
+            f"{file}: {len(used)} points that {LEAST_SIGHTINGS} photographs show, and {LEAST_POINTS} are needed to "
+            f"place a scene{' (' + '; '.join(notes) + ')' if notes else ''}. With fewer: --check-points {ALL}"
+        )
+    control = Control(tuple(seen), system, file.name, tuple(notes))
+    targets = control.enu(control.middle)[[not point.held_out for point in seen]]
+    if used and is_collinear(targets):
+        raise CaptureError(
+            f"{file}: its points lie along one line, about which a scene could still turn. Survey one beside it, or "
+            f"use them as check points: --check-points {ALL}"
+        )
+    return control

@@ -1,0 +1,44 @@
+"""What `vdgs run` asks of the reconstruction, where it is given photographs."""
+
+from __future__ import annotations
+
+from vdgs.config.capture_options import CaptureOptions
+from vdgs.config.commands import RunRequest
+from vdgs.config.sfm_options import SfmRequest
+from vdgs.errors import VdgsError
+from vdgs.runs.run_folder import RunFolder
+from vdgs.sfm.image_list import only_photographs
+
+
+def of_photographs(asked: RunRequest) -> bool:
+    """Whether a run is asked for of photographs, not of a capture. VdgsError for several folders that are not all of
+    photographs alone."""
+    if only_photographs(asked.capture):
+        return True
+    if asked.photographs:
+        raise VdgsError(
+            f"{asked.capture}: only folders of photographs alone can be several; a capture is given by itself."
+        )
+    return False
+
+
+def sfm_request(asked: RunRequest) -> SfmRequest:
+    """Photographs into RUN/capture. Raises VdgsError for options that speak of a capture that is not there yet."""
+    options = asked.options
+    for flag, value in (("--georef", options.georef), ("--up", None if options.up == "auto" else options.up)):
+        if value is not None:
+            raise VdgsError(f"{flag} is about a capture's world; photographs get theirs from their positions (--gps).")
+    if options.masks != CaptureOptions.masks:
+        raise VdgsError(
+            f"--masks {options.masks}: names a folder of a capture. Masks of photographs alone are those in "
+            f"{CaptureOptions.masks}/ beside them: rename the folder."
+        )
+    run = RunFolder(asked.output)
+    run.refuse_strangers()
+    return SfmRequest(
+        photographs=(asked.capture, *asked.photographs),
+        output=run.own_capture,
+        gps=options.gps,
+        threads=asked.threads,
+        options=asked.sfm,
+    )

@@ -1,0 +1,181 @@
+"""The work folder of a reconstruction: which steps are done, for which photographs and settings; calls into COLMAP."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pycolmap
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from vdgs.captures.reconstruction import STEPS
+from vdgs.errors import CaptureError, VdgsError
+from vdgs.system.atomic_files import read_record, write_json
+from vdgs.system.stop_signals import stop_if_asked
+from vdgs.system.units import rough_duration
+
+Result = TypeVar("Result")
+#: Seconds between two looks whether a person asked to stop.
+_GLANCE = 0.2
+#: Work that takes fewer seconds needs no lines about how far it is.
+_QUIET = 30.0
+
+
+@dataclass(frozen=True)
+class Work:
+    """OUTPUT/work: links to the photographs, COLMAP's database, models, and what is done."""
+
+    path: Path
+
+    @property
+    def photographs(self) -> Path:
+        """Upright photographs by their names in the capture: links, or copies of those that lay on their side."""
+        return self.path / "photographs"
+
+    @property
+    def masks(self) -> Path:
+        """Masks of upright photographs, as COLMAP names them."""
+        return self.path / "masks"
+
+    def mask(self, name: str) -> Path:
+        """Where the mask of a photograph is, if it has one."""
+        return self.masks / f"{name}.png"
+
+    @property
+    def database(self) -> Path:
+        return self.path / "database.db"
+
+    @property
+    def models(self) -> Path:
+        return self.path / "models"
+
+    @property
+    def snapshots(self) -> Path:
+        """Where the mapper writes what it has from time to time; whole only once it goes on."""
+        return self.path / "snapshots"
+
+    @property
+    def kept(self) -> Path:
+        """Whole models that mapping goes on from, by how many photographs they place."""
+        return self.path / "kept"
+
+    def is_done(self, step: str, key: str) -> bool:
+        return self._steps("done").get(step) == key
+
+    def is_begun(self, step: str, key: str) -> bool:
+        """Whether what there is of a step was made for these photographs and settings."""
+        return self._steps("begun").get(step) == key
+
+    def begin(self, step: str, key: str) -> None:
+        self._note("begun", step, key)
+
+    def finish(self, step: str, key: str) -> None:
+        self._note("done", step, key)
+
+    def remove(self) -> None:
+        shutil.rmtree(self.path, ignore_errors=True)
+
+    def _steps(self, which: str) -> dict[str, str]:
+        steps = read_record(self.path / STEPS).get(which)
+        return steps if isinstance(steps, dict) else {}
+
+    def _note(self, which: str, step: str, key: str) -> None:
+        steps = {name: self._steps(name) for name in ("begun", "done")}
+        steps[which][step] = key
+        if which == "begun":
+            steps["done"].pop(step, None)
+        write_json(self.path / STEPS, steps)
+
+
+def key_of(*parts: Any) -> str:
+    """A short key of anything that JSON can hold."""
+    return blake2b(json.dumps(parts, sort_keys=True, default=str).encode(), digest_size=12).hexdigest()
+
+
+def call(function: Callable[..., Result], *arguments: Any, **named: Any) -> Result:
+    """Call a long function of COLMAP beside this thread, so that Ctrl-C is heard and ends it where it is whole.
+
+    Raises VdgsError for what COLMAP cannot do, and what asked to stop.
+    """
+    token, ended, over = pycolmap.CancellationToken(), dict[str, Any](), threading.Event()
+
+    def work() -> None:
+        try:
+            ended["result"] = function(*arguments, **named, cancellation_token=token)
+        except BaseException as error:
+            ended["error"] = error
+        finally:
+            over.set()
+
+    thread = threading.Thread(target=work, name="colmap")
+    try:
+        thread.start()
+        # Not by joining the thread: a join that is interrupted takes the thread for ended.
+        while not over.wait(_GLANCE):
+            pass
+        stop_if_asked()
+    except BaseException:
+        token.cancel()
+        while not over.wait(_GLANCE) and thread.ident is not None:  # None: stopped before it began
+            pass
+        raise
+    thread.join()
+    error = ended.get("error")
+    if isinstance(error, (MemoryError, KeyboardInterrupt)):
+        raise error
+    if error is not None:
+        said = " ".join(str(error).split())
+        if "full" in said or "disk I/O" in said:
+            raise VdgsError(f"the disk is full ({said}). Free some space; the same command then goes on.") from error
+        raise CaptureError(f"COLMAP could not go on ({said}). What was done is kept.") from error
+    return ended["result"]
+
+
+@contextmanager
+def progress(console: Console, title: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar with the time left where the console is a terminal, else a line for every tenth; yields what tells how many
+    are done."""
+    if not console.is_terminal:
+        console.print(f"{title}: {total}", highlight=False)
+        yield _Lines(title, total, console)
+        return
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task(title, total=total)
+        yield lambda done: bar.update(task, completed=done)
+
+
+class _Lines:
+    """How far work is, for logs: a line for every tenth, with the time left, and none in the first half minute."""
+
+    def __init__(self, title: str, total: int, console: Console) -> None:
+        self.title, self.total, self.console = title, total, console
+        self.began, self.first, self.told = time.monotonic(), -1, 0
+
+    def __call__(self, done: int) -> None:
+        if self.first < 0:
+            self.first = done  # what was done before tells nothing of the pace
+        seconds, tenth = time.monotonic() - self.began, 10 * done // max(1, self.total)
+        if seconds < _QUIET or tenth <= self.told or done <= self.first or done >= self.total:
+            return
+        self.told = tenth
+        left = seconds / (done - self.first) * (self.total - done)
+        self.console.print(f"{self.title}: {done} of {self.total}, about {rough_duration(left)} left", highlight=False)
+
+
+def quiet_colmap() -> None:
+    """COLMAP's own log is for its makers: errors come as exceptions, progress is shown here."""
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    pycolmap.set_random_seed(0)

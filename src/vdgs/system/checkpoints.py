@@ -1,0 +1,93 @@
+"""Checkpoints of a stage: whole or absent, checked when read, the last two kept.
+
+A state is `NNNNNNNN.safetensors` (tensors) and, written after it, `NNNNNNNN.json` (iteration, facts, size and
+CRC-32 of the tensors' file). A state counts only if its JSON is there and the CRC agrees, so that a cut-off or
+damaged write is noticed and the state before it is used.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from vdgs.system.atomic_files import write_atomically, write_json
+from vdgs.system.tensors import read_whole, size_and_checksum, write_tensors
+
+KEPT = 2
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """What a state holds: the iteration after which it was taken, small facts, tensors."""
+
+    iteration: int
+    facts: Mapping[str, Any]
+    tensors: Mapping[str, Tensor]
+
+
+def save_state(folder: Path, state: SavedState) -> None:
+    """Write a state and remove all but the newest two. Raises VdgsError if the disk refuses."""
+    path = state_file(folder, state.iteration)
+    write_atomically(path, lambda temporary: write_tensors(temporary, state.tensors))
+    # Of what the disk has, not of what was meant: read again, from the system's cache.
+    size, crc = size_and_checksum(path)
+    sidecar = {"iteration": state.iteration, "bytes": size, "crc32": crc, "facts": dict(state.facts)}
+    write_json(path.with_suffix(".json"), sidecar)
+    for old in sidecars(folder)[:-KEPT]:
+        old.unlink()
+        old.with_suffix(".safetensors").unlink(missing_ok=True)
+    remove_leftovers(folder)
+
+
+def state_file(folder: Path, iteration: int) -> Path:
+    """The tensors of the state that is saved after an iteration."""
+    return folder / f"{iteration:08d}.safetensors"
+
+
+def sidecars(folder: Path) -> list[Path]:
+    """The files that make states count, oldest first."""
+    return sorted(folder.glob("*.json"))
+
+
+def load_newest(folder: Path) -> tuple[SavedState | None, list[str]]:
+    """The newest state that is whole, and one sentence for each newer one that is not."""
+    complaints: list[str] = []
+    for sidecar in reversed(sidecars(folder)):
+        try:
+            return _read(sidecar), complaints
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            complaints.append(f"{sidecar.with_suffix('.safetensors')}: is damaged ({error}); using the state before it")
+    return None, complaints
+
+
+def discard_after(folder: Path, iteration: int) -> None:
+    """Delete checkpoints beyond `iteration`: damaged ones, which would count among those that are kept."""
+    for sidecar in folder.glob("*.json"):
+        if sidecar.stem.isdecimal() and int(sidecar.stem) > iteration:
+            sidecar.unlink()
+            sidecar.with_suffix(".safetensors").unlink(missing_ok=True)
+
+
+def _read(sidecar: Path) -> SavedState:
+    facts = json.loads(sidecar.read_text(encoding="utf-8"))
+    path = sidecar.with_suffix(".safetensors")
+    size, crc = size_and_checksum(path)
+    if size != facts["bytes"]:
+        raise ValueError(f"{size} bytes instead of {facts['bytes']}")
+    if crc != facts["crc32"]:
+        raise ValueError("its checksum does not agree")
+    return SavedState(int(facts["iteration"]), facts["facts"], read_whole(path))
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what interrupted writes left behind: temporary files, tensors without their JSON."""
+    for temporary in folder.glob(".*.tmp"):
+        temporary.unlink(missing_ok=True)
+    for tensors in folder.glob("*.safetensors"):
+        if not tensors.with_suffix(".json").exists():
+            tensors.unlink()

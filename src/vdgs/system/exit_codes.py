@@ -1,0 +1,54 @@
+"""How a process of vdgs ends: its exit code, and what it prints of an error that a person can mend."""
+
+from __future__ import annotations
+
+import errno
+import sys
+from collections.abc import Callable
+from typing import Any
+
+
+def exit_code_of(name: str, action: Callable[[], Any], when_interrupted: str) -> int:
+    """Run an action to its end: 0 done (or what the action returns), 1 an error that was printed, 130 stopped.
+
+    `name` begins what is printed. What is no trouble of a person's is raised.
+    """
+    from vdgs.errors import Interrupted, Stopped, VdgsError
+    from vdgs.system.stop_signals import stop_requests
+
+    try:
+        with stop_requests(interrupts=True):
+            return int(action() or 0)
+    except (KeyboardInterrupt, Interrupted):
+        print(f"{name}: interrupted. {when_interrupted}", file=sys.stderr)
+        return 130
+    except VdgsError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 130 if isinstance(error, Stopped) else 1
+    except BrokenPipeError:
+        return 1
+    except OSError as error:  # a disk that is full, a folder that cannot be written: no news from a traceback
+        print(f"{name}: {error.filename or 'a file'}: {error.strerror or error}{_remedy(error)}", file=sys.stderr)
+        return 1
+    except (MemoryError, RuntimeError) as error:
+        from vdgs.system.memory.process_memory import is_out_of_memory
+
+        if not is_out_of_memory(error):
+            raise
+        print(
+            f"{name}: out of memory ({str(error).strip().splitlines()[0] if str(error) else 'no room'}). What was "
+            "saved is kept. Smaller photographs (--downscale 2), a smaller --width or fewer --jobs need less.",
+            file=sys.stderr,
+        )
+        return 1
+
+
+def _remedy(error: OSError) -> str:
+    """What to do about a file that the system refuses, where that is plain."""
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return ". See whose it is and who may use it (ls -l, chmod), or choose another."
+    if error.errno in (errno.EROFS, errno.ENOSPC, errno.EDQUOT):
+        from vdgs.system.atomic_files import remedy
+
+        return f". {remedy(error)}."
+    return ""

@@ -1,0 +1,73 @@
+"""Folders that processes hold, by a lock of the system on a file in them, which ends with the process."""
+
+from __future__ import annotations
+
+import fcntl
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from vdgs.errors import RunError
+from vdgs.system.atomic_files import remedy
+
+#: A lock that is taken is tried so often, with so many seconds between: one who only looks (`is_locked`) holds it too,
+#: for a moment.
+LOCK_ATTEMPTS, LOCK_SECONDS = 3, 0.02
+
+
+def is_locked(folder: Path) -> bool:
+    """Whether a process works on what is in a folder alone. Only looks: nothing is created.
+
+    OSError where the file system of the folder locks no files: for those who must know.
+    """
+    try:
+        handle = (folder / ".lock").open("rb")
+    except OSError:
+        return False
+    with handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
+def seems_locked(folder: Path) -> bool:
+    """As `is_locked`, for those who only show or read what is there: where no file can be locked, none is."""
+    try:
+        return is_locked(folder)
+    except OSError:  # Lustre without -o flock, some of FUSE: a finished run can be looked at there all the same
+        return False
+
+
+@contextmanager
+def hold(folder: Path, shared: bool = False) -> Iterator[None]:
+    """Hold a folder for this process, alone or `shared`; it is made if it is not there.
+
+    RunError if another process stands in the way, or the folder cannot be written.
+    """
+    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        # For reading and writing: NFS wants the one for a shared lock and the other for one that is not.
+        handle = (folder / ".lock").open("a+b")
+    except OSError as error:
+        raise RunError(f"{folder}: cannot be written ({error.strerror}). {remedy(error)}.") from error
+    with handle:
+        for attempt in range(LOCK_ATTEMPTS):
+            try:
+                fcntl.flock(handle, kind | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if attempt + 1 == LOCK_ATTEMPTS:
+                    raise RunError(
+                        f"{folder}: another vdgs process works on this run. Wait for it or stop it."
+                    ) from error
+                time.sleep(LOCK_SECONDS)
+            except OSError as error:
+                raise RunError(
+                    f"{folder}: its file system locks no files ({error.strerror}). Mount it with locks (NFS 4; Lustre: "
+                    "-o flock), or choose a folder elsewhere."
+                ) from error
+        yield

@@ -1,0 +1,87 @@
+"""How much memory this process takes, took at most and may still take; and what a failure to get some looks like."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import gc
+import resource
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import psutil
+
+from vdgs.kernels import release_idle_memory
+from vdgs.system.memory.cgroups import group_limits, slurm_limit
+
+#: How the libraries word it: torch on the CPU (Linux, Windows), C++, OpenCV.
+OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "Insufficient memory", "CUDA out of memory")
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an exception means that memory could not be had, in main memory or on a card."""
+    if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+        return True
+    return any(words in str(error) for words in OUT_OF_MEMORY)
+
+
+def available_bytes() -> int:
+    """What this process may still take: of the machine's free memory, of its control groups' (a container's, a SLURM
+    job's, a systemd unit's), of its own limit. Where no group limits a SLURM job, of what the job asked for."""
+    memory, groups = psutil.virtual_memory(), group_limits()
+    free = [memory.available, *(group.free for group in groups)]
+    job = slurm_limit()
+    if job is not None and all(group.limit >= memory.total for group in groups):
+        free.append(job - _taken_with_children())
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY:
+        free.append(limit - psutil.Process().memory_info().vms)
+    return max(0, min(free))
+
+
+def _taken_with_children() -> int:
+    """Resident bytes of this process and of those that it started; what they share counts for each."""
+    process = psutil.Process()
+    taken = process.memory_info().rss
+    for child in process.children(recursive=True):
+        with suppress(psutil.Error):  # it has just ended
+            taken += child.memory_info().rss
+    return int(taken)
+
+
+def peak_memory_bytes() -> int:
+    """Largest resident size of this process since it began, or since `forget_peak` where the system can forget."""
+    with suppress(OSError, ValueError, StopIteration):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return 1024 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return int(peak if sys.platform == "darwin" else peak * 1024)
+
+
+def forget_peak() -> None:
+    """Let the peak begin again at today's size, so that each stage of a run is measured apart (Linux)."""
+    gc.collect()
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
+#: glibc's number for the most arenas that `mallopt` allows.
+_M_ARENA_MAX = -8
+
+
+def share_arenas(most: int = 2) -> None:
+    """Let all threads allocate from so few arenas (glibc): each of many threads else keeps what it has freed."""
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, most)
+
+
+def return_unused() -> None:
+    """Give back to the system what this process keeps but does not use.
+
+    That is the rasteriser's idle memory and, with glibc, what was freed between pieces that are in use: after anchors
+    were replaced by others, more than they take themselves. Costs some milliseconds: for once in a hundred steps.
+    """
+    release_idle_memory()
+    with suppress(OSError, AttributeError, TypeError):  # other C libraries have no such function, or no such handle
+        ctypes.CDLL(None).malloc_trim(0)

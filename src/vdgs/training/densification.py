@@ -1,0 +1,239 @@
+"""Where anchors are added and removed: statistics, growing, pruning (Scaffold-GS section 4.2).
+
+Dimensions: n anchors, k offsets, v anchors visible in a view, m Gaussians drawn (splats), p parents.
+`Statistics` are kept per anchor and grow and shrink with them; all here are pure functions.
+Plain growth and compensated growth (`vdgs.training.compensation`) are one policy: the latter adds to the gradients.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from vdgs.config.method import GrowthConfig
+from vdgs.kernels import choose
+from vdgs.kernels.kernel_types import FEATURE_SIZE, Statistics
+from vdgs.model.anchors import Anchors
+
+#: Cells have keys within this many cells of the origin on each axis.
+LATTICE_REACH = 2**20
+#: So many random numbers are drawn at once: the numbers are those of one long draw, the memory is not.
+RANDOM_CHUNK = 2**20
+
+#: Which places [p, 3] may get a new anchor, as a mask [p].
+MayHold = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Compensated:
+    """What compensation changes in one decision (VDGS section IV-C); `compensation.compensate` makes it."""
+
+    #: Added to the gradients: the cache g_k for offsets of low visibility (the set L), 0 for the others.
+    added: Float[Tensor, "n k"]
+    #: The anchors of L.
+    low: Bool[Tensor, " n"]
+    #: An offset of L with g_k > 0 is judged once it was drawn more often than this (never later than without).
+    gate: float
+    #: Added to the sum of an offset's gradients, before it is divided by how often it was drawn; else to their mean.
+    to_sum: bool = False
+
+    def per_draw(self, drawn: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        """What a mean over so many draws gains; an offset that was never drawn counts as drawn once."""
+        return self.added / drawn.clamp(min=1) if self.to_sum else self.added
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What one growth step does to the anchors: first append `added`, then keep `kept` of all."""
+
+    added: Anchors
+    kept: Bool[Tensor, " n"]
+    pruned: int
+    #: New anchors in cells with at least one parent of low visibility, and the other new anchors.
+    grown_low: int
+    grown_other: int
+
+
+@dataclass(frozen=True)
+class _Parents:
+    """Offsets that ask for a new anchor: index into the flattened [n, k] (ascending), gradient, whether in L."""
+
+    index: Int64[Tensor, " p"]
+    gradient: Float[Tensor, " p"]
+    low: Bool[Tensor, " p"]
+
+    def __len__(self) -> int:
+        return self.index.shape[0]
+
+    def select(self, mask: Bool[Tensor, " p"]) -> _Parents:
+        return _Parents(self.index[mask], self.gradient[mask], self.low[mask])
+
+
+def mean_gradient(statistics: Statistics) -> Float[Tensor, "n k"]:
+    """Mean gradient norm over the times that an offset was drawn; 0 where it never was."""
+    times = statistics.drawn.clamp(min=1)
+    return torch.div(statistics.gradient, times, out=times)
+
+
+def decide(
+    anchors: Anchors,
+    statistics: Statistics,
+    voxel: float,
+    config: GrowthConfig,
+    generator: torch.Generator,
+    *,
+    compensated: Compensated | None = None,
+    surroundings: Float[Tensor, "s 3"] | None = None,
+    may_hold: MayHold | None = None,
+) -> Decision:
+    """One growth decision (Scaffold-GS eqs. 9-10 and its pruning; with `compensated`, VDGS section IV-C).
+
+    `surroundings` are positions of further anchors, which occupy cells but neither grow nor go; `may_hold` says which
+    cell centres may get an anchor (all, if not given). Random numbers belong to offsets, not to policies: the same
+    generator keeps the same offsets with compensation and without.
+
+    Resets, in place, the gradient statistics of the offsets that were judged and the opacity statistics of the
+    anchors that were, as upstream does; the others keep counting.
+    """
+    judged = _judged(statistics, config, compensated)
+    parents = _parents(statistics, judged, config.threshold, compensated)
+    taken = [anchors.positions] if surroundings is None else [anchors.positions, surroundings]
+    added, grown_low = _grow(anchors, parents, taken, voxel, config, generator, may_hold)
+    statistics.gradient[judged] = 0
+    statistics.drawn[judged] = 0
+
+    old_enough = statistics.seen > config.prune_views * config.interval
+    faint = statistics.opacity < config.prune_opacity * statistics.seen
+    pruned = old_enough & faint
+    statistics.opacity[old_enough] = 0
+    statistics.seen[old_enough] = 0
+    return Decision(added, ~pruned, int(pruned.sum()), grown_low, len(added) - grown_low)
+
+
+def _judged(statistics: Statistics, config: GrowthConfig, compensated: Compensated | None) -> Bool[Tensor, "n k"]:
+    """Offsets that were drawn often enough to be judged."""
+    judged = statistics.drawn > config.gate * config.interval
+    if compensated is not None:
+        judged |= (statistics.drawn > compensated.gate) & (compensated.added > 0)
+    return judged
+
+
+def _parents(
+    statistics: Statistics, judged: Bool[Tensor, "n k"], threshold: float, compensated: Compensated | None
+) -> _Parents:
+    """The judged offsets whose mean gradient, compensated, reaches the threshold of the first level."""
+    gradient = mean_gradient(statistics)
+    if compensated is not None:
+        gradient += compensated.per_draw(statistics.drawn)
+    index = (judged & (gradient >= threshold)).reshape(-1).nonzero()[:, 0]
+    low = torch.zeros_like(index, dtype=torch.bool)
+    if compensated is not None:
+        low = compensated.low[index // gradient.shape[1]]
+    return _Parents(index, gradient.reshape(-1)[index], low)
+
+
+def _grow(
+    anchors: Anchors,
+    parents: _Parents,
+    taken: Sequence[Float[Tensor, "_ 3"]],
+    voxel: float,
+    config: GrowthConfig,
+    generator: torch.Generator,
+    may_hold: MayHold | None,
+) -> tuple[Anchors, int]:
+    """New anchors, at the centres of empty cells that hold a parent's Gaussian, and how many have a parent in L."""
+    grown, grown_low = anchors.select(parents.index[:0]), 0
+    for level in range(config.levels):
+        parents = parents.select(parents.gradient >= config.threshold * 2.0**level)
+        room = config.max_anchors - len(anchors) - len(grown) if config.max_anchors else None
+        if not len(parents) or (room is not None and room <= 0):
+            break  # later levels ask for more
+        count = anchors.offsets.shape[0] * anchors.offsets.shape[1]
+        kept = parents.select(_random(parents.index, count, generator) > 0.5 ** (level + 1))
+        cell = voxel * config.coarsest_cell / 4.0**level
+        more, low = _fill_cells(anchors, kept, [*taken, grown.positions], cell, room, may_hold)
+        grown, grown_low = grown.extended(more), grown_low + low
+    return grown, grown_low
+
+
+def _random(index: Int64[Tensor, " p"], count: int, generator: torch.Generator) -> Float[Tensor, " p"]:
+    """The numbers at `index` (ascending) of `count` uniform random numbers."""
+    here, numbers = index.cpu(), torch.empty(len(index))  # drawn on the CPU: the same numbers for any device
+    done = 0
+    for start in range(0, count, RANDOM_CHUNK):
+        chunk = torch.rand(min(RANDOM_CHUNK, count - start), generator=generator)
+        end = int(torch.searchsorted(here, start + len(chunk)))
+        numbers[done:end] = chunk[here[done:end] - start]
+        done = end
+    return numbers.to(index.device)
+
+
+def _fill_cells(
+    anchors: Anchors,
+    parents: _Parents,
+    taken: Sequence[Float[Tensor, "_ 3"]],
+    cell: float,
+    room: int | None,
+    may_hold: MayHold | None,
+) -> tuple[Anchors, int]:
+    """One anchor at the centre of each cell that holds a parent's Gaussian, no anchor yet, and may hold one.
+
+    Where `room` is short, the cells with the largest gradients are served first. Also says how many of the cells
+    have a parent in L.
+    """
+    kernels, k = choose(anchors.positions.device), anchors.offsets.shape[1]
+    rows = parents.index // k
+    means = anchors.positions[rows] + anchors.offsets[rows, parents.index % k] * anchors.log_scales[rows, :3].exp()
+    within = _within_lattice(means, cell)
+    parents, means = parents.select(within), means[within]
+    # Cells are centred on multiples of their edge (upstream rounds), hence the origin at half a cell.
+    origin = means.new_full((3,), -0.5 * cell)
+    cells, group = kernels.group_cells(kernels.cell_keys(means, cell, origin))
+    chosen = ~_hold_any(cells, taken, cell, origin)
+    if may_hold is not None:
+        chosen[chosen.clone()] = may_hold(kernels.cell_centres(cells[chosen], cell, origin))
+    if room is not None and int(chosen.sum()) > room:
+        strongest = kernels.group_max(parents.gradient[:, None], group, len(cells))[:, 0]
+        strongest[~chosen] = -1.0
+        chosen = torch.zeros_like(chosen).index_fill_(0, strongest.argsort(descending=True, stable=True)[:room], True)
+    served = chosen[group]
+    place = (chosen.cumsum(0) - 1)[group[served]]
+    return _anchors_at(kernels.cell_centres(cells[chosen], cell, origin), place, parents.select(served), anchors, cell)
+
+
+def _anchors_at(
+    centres: Float[Tensor, "c 3"], place: Int64[Tensor, " p"], parents: _Parents, anchors: Anchors, cell: float
+) -> tuple[Anchors, int]:
+    """New anchors at `centres`, the features the maximum of their parents', and how many have a parent in L."""
+    kernels, k, count = choose(centres.device), anchors.offsets.shape[1], len(centres)
+    new = Anchors(
+        positions=centres,
+        features=kernels.group_max(anchors.features[parents.index // k], place, count).reshape(count, FEATURE_SIZE),
+        offsets=centres.new_zeros(count, k, 3),
+        log_scales=centres.new_full((count, 6), math.log(cell)),
+    )
+    return new, len(place[parents.low].unique())
+
+
+def _hold_any(
+    cells: Int64[Tensor, " c"], points: Sequence[Float[Tensor, "_ 3"]], cell: float, origin: Float[Tensor, "3"]
+) -> Bool[Tensor, " c"]:
+    """Which of the cells hold any of the points."""
+    kernels, full = choose(cells.device), torch.zeros_like(cells, dtype=torch.bool)
+    for some in points:
+        within = _within_lattice(some, cell)
+        some = some if bool(within.all()) else some[within]
+        full |= kernels.contains(kernels.cell_keys(some, cell, origin), cells)
+    return full
+
+
+def _within_lattice(points: Float[Tensor, "p 3"], cell: float) -> Bool[Tensor, " p"]:
+    """Which points have a cell: finite and within 2^20 cells of the origin (a key has 21 bits an axis).
+
+    What lies farther away than a million of the finest cells does not grow (choice)."""
+    return (points.abs() < (LATTICE_REACH - 2) * cell).all(1)

@@ -1,0 +1,184 @@
+"""Training that is watched: logged, checkpointed, stopped and continued. The same for every kind of state."""
+
+from __future__ import annotations
+
+import re
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
+
+import cv2
+from rich.console import Console
+
+from vdgs.errors import RunError, Stopped, TrainingDiverged, VdgsError
+from vdgs.runs.stage_folder import StageFolder
+from vdgs.runs.status import Status
+from vdgs.system.checkpoints import SavedState, discard_after, load_newest, save_state
+from vdgs.system.memory.process_memory import is_out_of_memory, peak_memory_bytes, return_unused
+from vdgs.system.stop_signals import stop_requests
+
+#: As what missing memory arrives, among others (`is_out_of_memory`): from Python and C++, torch, the system, OpenCV.
+MEMORY_ERRORS = (MemoryError, RuntimeError, OSError, cv2.error)
+#: Seconds between two notes of the progress in status.json.
+STATUS_SECONDS = 2.0
+
+
+class WatchedState(Protocol):
+    """What every state of a training says of itself."""
+
+    iteration: int
+    seconds: float
+    peak_memory_bytes: int
+
+
+State = TypeVar("State", bound=WatchedState)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Watched:
+    """A training as the one who watches it sees it."""
+
+    folder: StageFolder
+    state: WatchedState
+    #: The whole state as it is saved.
+    to_saved: Callable[[], SavedState]
+    #: Where training stands.
+    status: Callable[[], Status]
+    #: How large the model is, in words ("12,000 anchors").
+    size: Callable[[], str]
+    #: What a person may do about a loss that diverges, and about missing memory.
+    after_divergence: str
+    save_memory: Callable[[], str]
+    #: Whether every step of the state is whole, so that it may be saved though a step was broken off.
+    whole: Callable[[], bool]
+
+    def save(self) -> None:
+        save_state(self.folder.checkpoints, self.to_saved())
+
+
+def restore_or_start(
+    folder: StageFolder,
+    iterations: int,
+    start: Callable[[], State],
+    restore: Callable[[SavedState], State],
+    advice: str,
+    console: Console,
+) -> State:
+    """The state of the newest whole checkpoint, or a new one; the log ends where the state does.
+
+    Raises RunError, with `advice`, for a state that this version cannot read, and for one beyond the last iteration.
+    """
+    folder.checkpoints.mkdir(parents=True, exist_ok=True)
+    saved, complaints = load_newest(folder.checkpoints)
+    for complaint in complaints:
+        console.print(f"[yellow]note[/] {complaint}")
+    if saved is None:
+        if complaints:
+            console.print("[yellow]note[/] no checkpoint is whole: starting again from the first iteration")
+        state = start()
+    else:
+        try:
+            state = restore(saved)
+        except (KeyError, TypeError, ValueError) as error:
+            raise RunError(f"{folder.checkpoints}: holds a state of another version ({error}). {advice}") from error
+        if state.iteration > iterations:
+            raise RunError(f"{folder.checkpoints}: is at iteration {state.iteration}, beyond {iterations}.")
+        discard_after(folder.checkpoints, state.iteration)
+        console.print(f"continuing at iteration {state.iteration}")
+    folder.truncate_log(state.iteration)
+    return state
+
+
+def watch(training: Watched, loop: Callable[[Callable[[], bool]], bool]) -> None:
+    """Run `loop(stop)`, which trains until complete (True) or asked to stop, and note in status.json how it ends.
+
+    Raises Stopped after Ctrl-C or SIGTERM (state saved), TrainingDiverged and VdgsError (out of memory, a photograph
+    that is gone, a full disk), each with what is kept.
+    """
+    folder, state = training.folder, training.state
+    try:
+        with stop_requests(second_interrupts=True) as asked:
+            folder.set_status(training.status())
+            complete = loop(lambda: bool(asked))
+    except TrainingDiverged as error:
+        folder.set_status(Status(state="failed", iteration=state.iteration, why=str(error)))
+        raise TrainingDiverged(f"{error} {_kept(folder)} {training.after_divergence}".rstrip()) from error
+    except MEMORY_ERRORS as error:
+        if not is_out_of_memory(error):
+            raise
+        traceback.clear_frames(error.__traceback__)  # they hold the pictures and splats of the step that failed
+        kept = _rescue(training)
+        folder.set_status(Status(state="failed", iteration=state.iteration, why="out of memory"))
+        raise VdgsError(
+            f"{folder.path}: out of memory with {training.size()}{_wanted(error)}. {kept} {training.save_memory()}"
+        ) from error
+    except VdgsError as error:  # a photograph that is gone, a full disk: every step so far is whole
+        folder.set_status(Status(state="failed", iteration=state.iteration, why=str(error)))
+        training.save()
+        raise
+    if not complete:
+        training.save()
+        folder.set_status(replace(training.status(), state="stopped"))
+        raise Stopped(f"Stopped at iteration {state.iteration}; saved. The same command continues.")
+
+
+class Keeper:
+    """After every step: the state's account of time and memory (across interruptions), checkpoints, status.json."""
+
+    def __init__(self, training: Watched, save_every: int):
+        self._training, self._save_every = training, save_every
+        self._last = self._noted = time.monotonic()
+
+    def tick(self) -> None:
+        """Add the time since the last step to the state's account."""
+        now, state = time.monotonic(), self._training.state
+        state.seconds += now - self._last
+        state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
+        self._last = now
+
+    def keep(self, status: Callable[[], Status], flush_log: Callable[[], None] | None = None) -> None:
+        """Save the state and write the `status`, each where it is time.
+
+        The log is flushed before the checkpoint is written: a run that continues there must not miss lines of it.
+        """
+        training = self._training
+        if training.state.iteration % self._save_every == 0:
+            if flush_log is not None:
+                flush_log()
+            return_unused()
+            training.save()
+        if time.monotonic() - self._noted > STATUS_SECONDS:
+            self._noted = time.monotonic()
+            training.folder.set_status(status())
+
+
+def _kept(folder: StageFolder) -> str:
+    kept, _ = load_newest(folder.checkpoints)
+    if kept is None:
+        return "There is no checkpoint yet."
+    return f"The checkpoint of iteration {kept.iteration} is kept in {folder.checkpoints}."
+
+
+def _rescue(training: Watched) -> str:
+    """Save the state after memory ran out, if every step of it is whole and there is room; what is kept then."""
+    return_unused()
+    folder = training.folder
+    if training.whole():
+        try:
+            training.save()
+        except (VdgsError, *MEMORY_ERRORS):
+            pass  # what was saved before is still there
+        else:
+            return f"The checkpoint of iteration {training.state.iteration} is saved in {folder.checkpoints}."
+    try:
+        return _kept(folder)
+    except MEMORY_ERRORS:
+        return f"Earlier checkpoints are kept in {folder.checkpoints}."
+
+
+def _wanted(error: BaseException) -> str:
+    """How much was asked for in vain, where the error says so."""
+    asked = re.search(r"allocate ([\d.]+) (bytes|[KMG]iB)", str(error))
+    return f" ({asked.group(1)} {asked.group(2)} more could not be had)" if asked else ""

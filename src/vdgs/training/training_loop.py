@@ -1,0 +1,192 @@
+"""The training loop: one for the coarse stage and for blocks; what differs is data (`Stage`).
+
+Each step is a function of the state and the iteration number, and everything random is drawn from (seed, iteration).
+A run that is stopped and continued is therefore the run that was not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from vdgs.errors import TrainingDiverged
+from vdgs.geometry.camera import Camera
+from vdgs.kernels import choose
+from vdgs.kernels.kernel_types import DecoderWeights, OrderedSplats, SplatGradients
+from vdgs.model.renderer import decode_rows_to_train, visible_rows
+from vdgs.model.scale_bounds import SPREAD
+from vdgs.training.background import background_at
+from vdgs.training.densification_step import grow, reorder
+from vdgs.training.gradient_roi import narrow
+from vdgs.training.objective import compare
+from vdgs.training.optimizer import rates_at
+from vdgs.training.schedule import downscale_at, view_at
+from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
+from vdgs.training.target import box_at, part_of, target_at
+from vdgs.training.training_state import Stage, StepReport, TrainingState
+from vdgs.training.training_step import coast_anchors, draw_view, move_anchors
+from vdgs.training.weight_averaging import Average, counts_in_mean
+
+#: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
+REFERENCE_HEIGHT = 10.0
+#: Every so many iterations anchors are put into Morton order, so that neighbours in space are neighbours in memory.
+REORDER_INTERVAL = 1000
+#: Every so many iterations sizes are brought back below their bounds, and whenever a model is averaged or complete.
+BOUND_INTERVAL = 10
+#: Every so many iterations the PSNR of the training view is taken, for people.
+PSNR_INTERVAL = 10
+
+
+def train_step(state: TrainingState, stage: Stage) -> StepReport:
+    """One step: render a training view, compare, move what was visible, count, perhaps grow.
+
+    Changes `state` in place. Raises TrainingDiverged if the loss or a gradient is not finite.
+    """
+    config, iteration = stage.config, state.iteration
+    downscale = downscale_at(iteration, config)
+    view = view_at(iteration, stage.image_count, config.seed, stage.shares)
+    box = box_at(stage, view, downscale, iteration)
+    camera = part_of(stage.images.camera(view, downscale), box)
+
+    rows = visible_rows(state.anchors, camera)
+    weights = state.decoder.for_image(appearance_at(stage, view))
+    background = background_at(stage, iteration)
+    with torch.no_grad():
+        splats = decode_rows_to_train(state.anchors, rows, weights, camera)
+        target = target_at(stage, view, downscale, narrow(stage, splats, camera, box))
+        around = _surroundings(stage, view, camera, target.camera)
+        drawn = draw_view(splats, target.camera, background, around)
+    compared = compare(drawn, target, state.decoder, appearance_at(stage, view), config)
+    volume_weight, loss = _volume_weight(stage), compared.loss
+    if volume_weight and len(drawn.source):
+        loss = loss + volume_weight * drawn.volume
+    # Read at once: on a card, each number that is asked for waits for everything before it.
+    value, l1, ssim = torch.stack([loss, compared.l1, compared.ssim]).tolist()
+    if not math.isfinite(value):
+        raise TrainingDiverged(f"The loss is {value} at iteration {iteration + 1}.")
+    gradients = drawn.backward(compared.image, volume_weight)
+    psnr = psnr_of(compared.shown, target.image, target.mask) if (iteration + 1) % PSNR_INTERVAL == 0 else None
+    state.whole = False
+    _move(state, stage, rows, gradients, weights, camera)
+
+    growing = iteration + 1 <= config.growth.until * config.iterations
+    if growing and iteration + 1 > config.growth.statistics_from:
+        # Seen is what V counts too: an anchor beside the picture may touch it, but is not to blame for showing nothing.
+        kernels = choose(stage.device)
+        inside = kernels.mark_visible(state.anchors.positions[rows], camera)
+        kernels.add_view_statistics(
+            state.statistics, rows, inside, drawn.source, drawn.opacities, gradients.means_px, *camera.whole_size
+        )
+    state.iteration += 1
+    report = StepReport(loss=value, l1=l1, ssim=ssim, visible=len(rows), splats=len(drawn.source))
+    if growing and state.iteration >= config.growth.start and state.iteration % config.growth.interval == 0:
+        report = replace(report, **grow(state, stage))
+    if state.iteration % REORDER_INTERVAL == 0:
+        reorder(state)
+    last, averaged = state.iteration == config.iterations, counts_in_mean(state.iteration, config)
+    if state.iteration % BOUND_INTERVAL == 0 or averaged or last:
+        _bound_sizes(state)
+    if averaged:
+        _average(state)
+    _smooth(state, value, psnr)
+    state.whole = True
+    return report
+
+
+@torch.no_grad()
+def _surroundings(stage: Stage, view: int, camera: Camera, part: Camera) -> OrderedSplats | None:
+    """The splats in a part of a view of the frozen anchors around a block: drawn, but out of autograd's sight."""
+    around = stage.surroundings
+    if around is None or not len(around.anchors):
+        return None
+    weights = around.decoder.for_image(appearance_at(stage, view))
+    # Of anchors that the whole view shows: one that strews its Gaussians may stand beside the part that they cover.
+    return decode_rows_to_train(around.anchors, visible_rows(around.anchors, camera), weights, part)
+
+
+def appearance_at(stage: Stage, view: int) -> int:
+    """The number of a view among all training images of the capture."""
+    return view if stage.appearance_of is None else stage.appearance_of[view]
+
+
+def _volume_weight(stage: Stage) -> float:
+    """Weight of the mean volume in the loss, for the unit of this scene."""
+    return stage.config.loss.volume_weight / (stage.camera_height / REFERENCE_HEIGHT) ** 3
+
+
+def _move(
+    state: TrainingState, stage: Stage, rows: Tensor, gradients: SplatGradients, weights: DecoderWeights, camera: Camera
+) -> None:
+    """One step of Adam for the visible anchors (where it is dense, for all) and the decoder."""
+    config, step = stage.config, state.iteration + 1
+    rates = rates_at(config.rates, state.iteration / config.iterations)
+    states, updates = state.optimiser.anchor_states(state.anchors, rates, config.early), state.optimiser.updates
+    dense = config.adam == "dense"
+    if dense:
+        updates.fill_(state.iteration)
+    finite = move_anchors(state.anchors, rows, gradients, weights, camera, states, updates, stage.mobility)
+    if dense:
+        coast_anchors(state.anchors, rows, states, step, stage.mobility)
+        updates.fill_(step)
+    finite = state.optimiser.update_decoder(state.decoder, rates, step) & finite
+    if not finite:
+        raise TrainingDiverged(f"A gradient is not a finite number at iteration {step}.")
+
+
+@torch.no_grad()
+def _bound_sizes(state: TrainingState) -> None:
+    """Let no Gaussian be larger than pictures can show (the decoder only makes an anchor's scales smaller), nor an
+    anchor strew them: the unit of its offsets is bounded too."""
+    offsets, sizes = state.anchors.log_scales[:, :3], state.anchors.log_scales[:, 3:]
+    torch.minimum(sizes, state.largest[:, None], out=sizes)
+    torch.minimum(offsets, state.largest[:, None] + math.log(SPREAD), out=offsets)
+
+
+def _average(state: TrainingState) -> None:
+    """Count the model in the mean that the stage ends with."""
+    if state.average is None:
+        state.average = Average.of(state.anchors, state.decoder)
+    else:
+        state.average.add(state.anchors, state.decoder)
+
+
+def _smooth(state: TrainingState, loss: float, psnr: float | None) -> None:
+    """Update the smoothed loss and, where it was taken, PSNR (for people and for the divergence check)."""
+    state.loss = smoothed(state.loss, loss, KEEP_LOSS)
+    if psnr is not None:
+        state.psnr = smoothed(state.psnr, psnr, KEEP_PSNR)
+    if state.iteration > 100:
+        state.best_loss = min(state.best_loss, state.loss)
+        if state.loss > 0.3 and state.loss > 4 * state.best_loss:
+            raise TrainingDiverged(
+                f"The smoothed loss rose to {state.loss:.3f} from {state.best_loss:.3f} by iteration {state.iteration}."
+            )
+
+
+def train(
+    state: TrainingState,
+    stage: Stage,
+    *,
+    stop: Callable[[], bool],
+    after_step: Callable[[TrainingState, StepReport], None],
+    prefetch: int = 4,
+) -> bool:
+    """Steps until the stage is complete or `stop()` is true. True if complete.
+
+    `after_step` sees every step (progress, log, saving).
+    """
+    config = stage.config
+    while state.iteration < config.iterations:
+        if stop():
+            return False
+        ahead = range(state.iteration + 1, min(state.iteration + 1 + prefetch, config.iterations))
+        for iteration in ahead:
+            view = view_at(iteration, stage.image_count, config.seed, stage.shares)
+            stage.images.prefetch([view], downscale_at(iteration, config))
+        report = train_step(state, stage)
+        after_step(state, report)
+    return True

@@ -1,0 +1,55 @@
+"""The mean of the last models that training passes through (Polyak and Juditsky, 1992), in place of the very last one.
+
+Where rates do not fade (features, log-scales), Adam ends about the optimum: where the last few photographs pulled it.
+What few photographs show is pulled farthest. The mean over many of those places is nearer (choice; reports/choices.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from vdgs.config.method import TrainConfig
+from vdgs.model.anchors import TRAINED, Anchors
+from vdgs.model.decoder import Decoder
+
+#: The mean is one of about so many models: enough for it, and few enough to cost no time.
+MODELS = 100
+
+
+@dataclass
+class Average:
+    """The mean of `count` models with the same anchors in the same order."""
+
+    count: int
+    #: By name, as `Anchors.tensors` without positions, which never move, and as `Decoder.tensors`.
+    anchors: dict[str, Tensor]
+    decoder: dict[str, Tensor]
+
+    @staticmethod
+    def of(anchors: Anchors, decoder: Decoder) -> Average:
+        """The mean of one model, in tensors of its own."""
+        return Average(
+            1,
+            {name: getattr(anchors, name).clone() for name in TRAINED},
+            {name: tensor.detach().clone() for name, tensor in decoder.tensors().items()},
+        )
+
+    @torch.no_grad()
+    def add(self, anchors: Anchors, decoder: Decoder) -> None:
+        """Count one more model, in place. What is the same in all of them keeps its bits."""
+        self.count += 1
+        for name, mean in self.anchors.items():
+            mean.lerp_(getattr(anchors, name), 1 / self.count)
+        for name, mean in self.decoder.items():
+            mean.lerp_(decoder.tensors()[name], 1 / self.count)
+
+
+def counts_in_mean(iteration: int, config: TrainConfig) -> bool:
+    """Whether the model after `iteration` steps is one of those averaged: about `MODELS`, evenly spread over the last
+    share `config.average` of the iterations, none of them before growth has ended; the very last one is."""
+    begin = max(1 - config.average, config.growth.until) * config.iterations
+    every = max(1, round((config.iterations - begin) / MODELS))
+    return config.average > 0 and iteration > begin and (config.iterations - iteration) % every == 0

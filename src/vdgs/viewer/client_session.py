@@ -1,0 +1,283 @@
+"""One visitor: their camera, what they chose to see, and the panel that they choose with."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import CancelledError
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from vdgs.captures.camera_height import camera_height
+from vdgs.captures.overview import FOV_DEG
+from vdgs.errors import VdgsError
+from vdgs.geometry.camera import Camera
+from vdgs.system.memory.process_memory import available_bytes
+from vdgs.viewer import navigation, overlays
+from vdgs.viewer.layers import LAYERS, Layer, Painter, Shown
+from vdgs.viewer.navigation import Stand
+from vdgs.viewer.path_panel import PathPanel
+from vdgs.viewer.point_panel import PlacePanel
+from vdgs.viewer.render_scheduler import Frame, Studio
+from vdgs.viewer.viewer_scene import Scene
+
+#: What layers are called in the panel.
+NAMES: dict[str, Layer] = {
+    "Colour": "colour", "Depth": "depth", "V: cameras that see it": "visibility", "Alpha: how opaque": "alpha",
+    "Blocks": "blocks", "Error against nearest photograph": "error",
+}  # fmt: skip
+MODELS = {"Merged": "merged", "Coarse": "coarse", "Side by side": "both"}
+#: JPEG quality of quick pictures and of full ones.
+_QUICK_QUALITY, _FULL_QUALITY = 70, 92
+_LEGEND_PX = 300
+#: Farther from where a photograph was taken than this share of the camera height, it no longer lies over the model.
+_AT_PHOTOGRAPH = 2e-3
+
+
+class Visitor:
+    """Between one browser and the studio. Callbacks of the browser come in any thread."""
+
+    def __init__(self, client: Any, scene: Scene, studio: Studio, console: Console) -> None:
+        self.client, self.scene, self.studio, self._console = client, scene, studio, console
+        self._lock = threading.RLock()
+        self._shown = Shown(model=scene.names[0])
+        self._camera: Camera | None = None
+        # Found once: with another limit at every move, a camera that rests would seem to be another one.
+        self._most_px = navigation.most_pixels(available_bytes())
+        self._arrived = False
+        self._legend_of: object = None
+        self.painter = Painter(scene)
+        self._seat = studio.seat(self.painter, self._deliver, self._failed)
+        self._build()
+        client.camera.on_update(lambda _: self._moved())
+        client.scene.on_click()(lambda event: self.place.clicked(event.screen_pos))
+        height = camera_height(scene.capture)
+        client.camera.min_orbit_distance, client.camera.max_orbit_distance = 1e-3 * height, 200 * height
+        self._moved()
+
+    # ------------------------------------------------------------------------------------- what they see
+
+    @property
+    def camera(self) -> Camera | None:
+        """Where they are, at the size of their canvas, or the largest that is drawn."""
+        return self._camera
+
+    @property
+    def shown(self) -> Shown:
+        return self._shown
+
+    @property
+    def stand(self) -> Stand:
+        """Where they are and what they look at."""
+        return Stand(np.array(self.client.camera.position), np.array(self.client.camera.look_at))
+
+    def show(self, **changes: Any) -> None:
+        """See something else from the same place."""
+        with self._lock:
+            self._shown = replace(self._shown, **changes)
+            if self._camera is not None:
+                self.studio.ask(self._seat, self._camera, self._shown)
+
+    def go(self, stand: Stand, fov: float | None = None) -> None:
+        """Stand elsewhere."""
+        camera = self.client.camera
+        with self.client.atomic():
+            camera.up_direction = (0.0, 0.0, 1.0)
+            camera.position = tuple(stand.position)
+            camera.look_at = tuple(stand.look_at)
+            if fov is not None:
+                camera.fov = float(fov)
+        self._moved(theirs=False)
+
+    def look_from(self, index: int) -> None:
+        """Stand where a photograph was taken, with the photograph over the model."""
+        taken = self.scene.capture.views[index].camera
+        with self._lock:
+            self._arrived = False
+            self._shown = replace(self._shown, photograph=index)
+            self._photograph.visible = True
+        self.go(
+            navigation.stand_of(taken, camera_height(self.scene.capture)),
+            navigation.fov_for(taken, self.client.camera.aspect),
+        )
+
+    def model_changed(self) -> None:
+        """The run has a newer model."""
+        names = ["both", *self.scene.names] if len(self.scene.names) > 1 else [*self.scene.names]
+        model = self._shown.model if self._shown.model in names else self.scene.names[0]
+        self._models.visible = len(self.scene.names) > 1
+        self._legend_of = None
+        self.show(model=model)
+
+    def tell(self, progress: str) -> None:
+        """How far training is."""
+        self._progress.content = progress
+        self._training.visible = bool(progress)
+
+    def leave(self) -> None:
+        self.path.stop()
+        self.studio.leave(self._seat)
+
+    def _moved(self, theirs: bool = True) -> None:
+        """Draw for where the camera is now: by the browser (`theirs`), which may still send older news after we told it
+        to go elsewhere, or by us."""
+        state = self.client.camera
+        try:
+            camera = navigation.camera_of(
+                state.wxyz, state.position, state.fov, int(state.image_width), int(state.image_height)
+            )
+        except (ValueError, AssertionError):  # a canvas that is just being laid out
+            return
+        camera = navigation.drawable(camera, self._most_px)
+        with self._lock:
+            if self._camera is not None and is_same(camera, self._camera):
+                return  # the browser tells again what we know: the camera rests
+            self._camera = camera
+            if theirs:
+                self._leave_photograph(camera)
+            self.studio.ask(self._seat, camera, self._shown)
+
+    def _leave_photograph(self, camera: Camera) -> None:
+        index = self._shown.photograph
+        if index is None:
+            return
+        away = float(np.linalg.norm(self.scene.capture.views[index].camera.position - camera.position))
+        if away <= _AT_PHOTOGRAPH * camera_height(self.scene.capture):
+            self._arrived = True
+        elif self._arrived:
+            self._shown = replace(self._shown, photograph=None)
+            self._photograph.visible = False
+
+    def _deliver(self, frame: Frame) -> None:
+        """Send a picture, and its legend once the camera rests. In the studio's thread."""
+        quality = _FULL_QUALITY if frame.full else _QUICK_QUALITY
+        self.client.scene.set_background_image(frame.picture, format="jpeg", jpeg_quality=quality)
+        self.client.flush()
+        if frame.full:
+            self._show_legend(frame.shown)
+
+    def _show_legend(self, shown: Shown) -> None:
+        if shown.layer in ("colour", "blocks"):
+            self._legend.visible = False
+            return
+        scale = self.painter.scale(shown)
+        if scale is None:
+            return
+        if self._legend_of != (shown.layer, shown.model, scale.low, scale.high):
+            from vdgs.rendering.colorbar import legend
+
+            self._legend.image = np.ascontiguousarray(legend(scale, _LEGEND_PX, 0))
+            self._legend_of = (shown.layer, shown.model, scale.low, scale.high)
+        self._legend.visible = True
+
+    def _failed(self, error: Exception) -> None:
+        """What they asked for cannot be drawn: say why, and show colours again."""
+        self.notify("This cannot be drawn", str(error))
+        if not isinstance(error, VdgsError):
+            self._console.print(f"[yellow]warning[/] a picture could not be drawn: {error!r}", highlight=False)
+        if self._shown.layer != "colour" or self._shown.photograph is not None:
+            self._layer.value = next(iter(NAMES))
+            self.show(layer="colour", photograph=None)
+
+    def notify(self, title: str, body: str) -> None:
+        self.client.add_notification(title, body, auto_close_seconds=8.0)
+
+    def errand(self, do: Callable[[], Any]) -> Any:
+        """Have something done by the studio; None, and the visitor told, where it fails for a reason to be told."""
+        try:
+            return self.studio.errand(do).result()
+        except VdgsError as error:
+            self.notify("This cannot be shown", str(error))
+        except CancelledError:
+            pass  # the studio closes: nobody is there to be told
+        return None
+
+    # ------------------------------------------------------------------------------------- the panel
+
+    def _build(self) -> None:
+        gui = self.client.gui
+        self._layer = gui.add_dropdown("Layer", tuple(NAMES), hint=f"What is drawn: one of {len(LAYERS)} layers")
+        self._layer.on_update(lambda _: self.show(layer=NAMES[self._layer.value]))
+        self._legend = gui.add_image(np.full((2, _LEGEND_PX, 3), 255, np.uint8), format="png", visible=False)
+        several = len(self.scene.names) > 1
+        self._models = gui.add_dropdown("Model", tuple(MODELS), visible=several)
+        self._models.on_update(lambda _: self._choose_model())
+        self._split = gui.add_slider("Coarse | merged", 0.0, 1.0, 0.01, 0.5, visible=False)
+        self._split.on_update(lambda _: self.show(split=float(self._split.value)))
+        self._photograph = gui.add_slider("Photograph | model", 0.0, 1.0, 0.01, 0.5, visible=False)
+        self._photograph.on_update(lambda _: self.show(photograph_split=float(self._photograph.value)))
+        self._build_views()
+        self._build_overlays()
+        self.place = PlacePanel(self)
+        self.path = PathPanel(self)
+        self._training = gui.add_folder("Training", visible=False)
+        with self._training:
+            self._progress = gui.add_markdown("")
+
+    def _choose_model(self) -> None:
+        model = MODELS[self._models.value]
+        self._split.visible = model == "both"
+        self.show(model=model)
+
+    def _build_views(self) -> None:
+        gui = self.client.gui
+        buttons = gui.add_button_group("Go to", ("All", "From above", "North up"))
+
+        @buttons.on_click
+        def _(_: Any) -> None:
+            change: dict[str, Callable[[], Stand]] = {
+                "All": lambda: navigation.whole_scene(self.scene.capture),
+                "From above": lambda: navigation.from_above(self.stand),
+                "North up": lambda: navigation.north_up(self.stand),
+            }
+            self.go(change[buttons.value](), np.radians(FOV_DEG))
+
+    def _build_overlays(self) -> None:
+        gui = self.client.gui
+        with gui.add_folder("Over it"):
+            self._checkbox("Block borders", self._add_borders)
+            self._checkbox("Cameras", self._add_cameras)
+            self._checkbox("Sparse points", self._add_points)
+
+    def _checkbox(self, name: str, add: Callable[[], Any]) -> None:
+        box = self.client.gui.add_checkbox(name, False)
+        drawn: list[Any] = []
+
+        @box.on_update
+        def _(_: Any) -> None:
+            while drawn:
+                drawn.pop().remove()
+            if box.value and (handle := add()) is not None:
+                drawn.append(handle)
+
+    def _add_borders(self) -> Any:
+        lines = self._lines("borders", overlays.borders, 3.0)
+        if lines is None:
+            self.notify("No borders", "The scene is not cut into blocks.")
+        return lines
+
+    def _add_cameras(self) -> Any:
+        return self._lines("cameras", overlays.frusta, 1.5)
+
+    def _lines(self, name: str, of: Callable[[Scene], overlays.Segments], thickness: float) -> Any:
+        found = self.errand(lambda: of(self.scene))
+        if found is None or not len(found[0]):
+            return None
+        return self.client.scene.add_line_segments(
+            f"/{name}", *found, thickness=thickness, thickness_units="screen"
+        )  # fmt: skip
+
+    def _add_points(self) -> Any:
+        points, colours = overlays.sparse_points(self.scene)
+        size = 2e-3 * camera_height(self.scene.capture)
+        return self.client.scene.add_point_cloud("/points", points, colours, point_size=size, precision="float32")
+
+
+def is_same(one: Camera, other: Camera) -> bool:
+    """Whether two cameras show the same: to less than a hundredth of a pixel, at any size of a screen."""
+    if (one.width, one.height) != (other.width, other.height) or abs(one.fy / other.fy - 1) > 1e-7:
+        return False
+    return np.allclose(one.camera_from_world, other.camera_from_world, rtol=1e-7, atol=1e-7)

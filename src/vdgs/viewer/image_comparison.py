@@ -1,0 +1,129 @@
+"""Photographs beside the model: the one nearest to a view, laid over it, and what the model gets wrong of it."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from vdgs.captures.camera_height import camera_height
+from vdgs.captures.image_cache import shrink
+from vdgs.evaluation.view_exposures import as_photographed
+from vdgs.geometry.camera import Camera
+from vdgs.model.renderer import render
+from vdgs.viewer.viewer_scene import Scene
+
+#: Photographs are compared at most so large (longer side): an error map is for looking at.
+_COMPARED_PX = 800
+#: A place is what a photograph shows if the depths agree so well (share).
+_SAME_DEPTH = 0.03
+#: Maps of errors that are kept.
+_KEPT = 6
+
+
+@dataclass(frozen=True, eq=False)
+class Misses:
+    """How far a model, in the exposure of a photograph, is from it, in the photograph's own pixels."""
+
+    camera: Camera
+    #: Mean absolute difference of the three channels, 0 to 1; NaN where the photograph is masked.
+    error: Float[np.ndarray, "h w"]
+    #: Median depth of the model; 0 where nothing is.
+    depth: Float[np.ndarray, "h w"]
+
+
+def nearest_view(scene: Scene, camera: Camera) -> int:
+    """The number of the photograph taken most nearly from where, and towards where, a camera looks.
+
+    A distance of the flight's height counts as much as a turn of one radian (choice).
+    """
+    height = camera_height(scene.capture)
+
+    def away(each: Camera) -> float:
+        turn = np.arccos(np.clip(float(each.forward @ camera.forward), -1.0, 1.0))
+        return float(np.linalg.norm(each.position - camera.position)) / height + float(turn)
+
+    return min(range(len(scene.capture.views)), key=lambda index: away(scene.capture.views[index].camera))
+
+
+class Comparison:
+    """Errors against photographs, each found once and kept a while. Used from the thread that draws."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._kept: OrderedDict[tuple[int, str, int], Misses] = OrderedDict()
+
+    def error_in(self, name: str, camera: Camera, whole: Camera) -> Float[np.ndarray, "h w"]:
+        """The error against the photograph nearest to the `whole` view, as its part `camera` sees it; NaN where that
+        photograph does not show the place, or is masked."""
+        misses = self._misses(name, nearest_view(self._scene, whole))
+        model = self._scene.model(name)
+        depth = render(model, camera, depth=True).median_depth
+        assert depth is not None
+        return _carried(misses, camera, depth.cpu().numpy())
+
+    def _misses(self, name: str, index: int) -> Misses:
+        key = (self._scene.generation, name, index)
+        if key not in self._kept:
+            self._kept[key] = self._compared(name, index)
+            while len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
+        return self._kept[key]
+
+    def _compared(self, name: str, index: int) -> Misses:
+        view = self._scene.capture.views[index]
+        camera, exposures = view.camera.within(_COMPARED_PX), self._scene.exposures(name)
+        photograph = shrink(self._scene.photographs.get(index), camera.width, camera.height)
+        raster = render(self._scene.model(name), camera, depth=True)
+        assert raster.median_depth is not None
+        drawn = raster.image.cpu().numpy()
+        if exposures is not None:
+            drawn = as_photographed(drawn, exposures(view))
+        error = np.abs(drawn.clip(0, 1) - photograph.image.numpy() / 255.0).mean(axis=-1).astype(np.float32)
+        if photograph.mask is not None:
+            error[photograph.mask.numpy() == 0] = np.nan
+        return Misses(camera, error, raster.median_depth.cpu().numpy())
+
+
+def _carried(misses: Misses, camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Errors where `camera` sees them, from where the photograph does."""
+    places = camera.unproject(depth).reshape(-1, 3)
+    pixels, away = misses.camera.project(places)
+    x, y = ((pixels[:, axis] - 0.5).reshape(depth.shape).astype(np.float32) for axis in (0, 1))
+    there = cv2.remap(misses.depth, x, y, cv2.INTER_NEAREST, borderValue=0.0)
+    error = cv2.remap(misses.error, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    away = away.reshape(depth.shape)
+    shown = (depth > 0) & (away > 0) & (there > 0) & (np.abs(there - away) <= _SAME_DEPTH * np.abs(away))
+    return np.where(shown, error, np.nan).astype(np.float32)
+
+
+def picture_of(scene: Scene, index: int, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
+    """A photograph at a size. Raises CaptureError if it cannot be read."""
+    pixels = scene.photographs.get(index).image.numpy()
+    return np.ascontiguousarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def laid_over(scene: Scene, index: int, camera: Camera) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """A photograph as a camera at the same place sees it, however it is turned and however wide it looks, and where
+    there is any: from one place, turning is a mapping of pixels to pixels."""
+    taken = scene.capture.views[index].camera
+    scale = min(1.0, camera.fx / taken.fx)
+    taken = taken.resized(max(1, round(taken.width * scale)), max(1, round(taken.height * scale)))
+    picture = picture_of(scene, index, taken.width, taken.height)
+    turn = camera.camera_from_world[:3, :3] @ taken.camera_from_world[:3, :3].T
+    mapping = _intrinsics(camera) @ turn @ np.linalg.inv(_intrinsics(taken))
+    size = (camera.width, camera.height)
+    warped = cv2.warpPerspective(picture, mapping, size, flags=cv2.INTER_LINEAR)
+    inside = cv2.warpPerspective(np.ones(picture.shape[:2], np.uint8), mapping, size, flags=cv2.INTER_NEAREST)
+    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    behind = np.linalg.inv(mapping)[2] @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    return np.asarray(warped), (inside > 0) & (behind.reshape(inside.shape) > 0)
+
+
+def _intrinsics(camera: Camera) -> Float[np.ndarray, "3 3"]:
+    """For OpenCV, where the centre of the first pixel is (0, 0)."""
+    return np.array([[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]])

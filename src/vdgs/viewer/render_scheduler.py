@@ -1,0 +1,303 @@
+"""One hand that draws for all visitors: small and quick while a camera moves, at full size once it rests.
+
+All kernels run in this one thread; they take the cores themselves. Visitors take turns, a quick picture of anyone
+before the next rows of a full one of anyone. A camera that moves on leaves nothing to be finished: what it last asked
+for counts, and what was begun for it before is dropped.
+
+The more visitors move, the less each picture may take, so that a round of all of them stays short (`ROUND`). What a
+picture takes follows from the anchors that it is drawn from, and from pixels only where those are few: each seat learns
+its seconds an anchor, and asks for as many as fit. Two visitors who rest at the same place get the same full picture.
+"""
+
+from __future__ import annotations
+
+import gc
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable, Hashable, Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from vdgs.geometry.camera import Camera
+from vdgs.system.memory.process_memory import return_unused
+from vdgs.viewer.layers import Shown
+
+#: A camera that has not moved for so long rests, seconds.
+REST = 0.1
+#: A quick picture takes so long, and never has fewer pixels nor more than these.
+QUICK, FEWEST_PX, MOST_PX = 0.045, 240 * 160, 640 * 480
+#: A quick picture of each visitor who moves takes so long together, and no picture is given less than this.
+ROUND, BRIEFEST = 0.12, 0.008
+#: A quick picture is drawn from at most about so many anchors before it is known what they take, never from fewer.
+FIRST_ANCHORS, FEWEST_ANCHORS = 20_000, 2_000
+#: Of a new measure of seconds an anchor, this share counts; the rest is what was known.
+LEARNING = 0.4
+#: Rows of a full picture are drawn for so long before others have their turn, and from about so many anchors at once:
+#: what they decode to is memory.
+TURN, TURN_ANCHORS, MOST_TURNS = 0.1, 40_000, 24
+#: Full pictures that are kept for others who stand at the same place.
+KEPT = 3
+#: With nothing to do for so long (seconds), or after so many have left, memory is given back.
+IDLE, MOST_LEFT = 1.0, 16
+
+_Result = TypeVar("_Result")
+
+
+@runtime_checkable
+class Paints(Protocol):
+    """Draws what one visitor asks for (`layers.Painter`)."""
+
+    #: Anchors that the last picture was drawn from; 0 where that is not known.
+    drawn: int
+
+    def settle(self, shown: Shown, whole: Camera) -> None: ...
+    def key(self, shown: Shown) -> Hashable: ...
+    def in_view(self, shown: Shown, camera: Camera) -> int: ...
+    def paint(self, shown: Shown, camera: Camera, whole: Camera, most: int | None = None) -> np.ndarray: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A picture for a visitor."""
+
+    picture: UInt8[np.ndarray, "h w 3"]
+    #: Drawn at full size, with the camera at rest.
+    full: bool
+    #: The view that it shows, at full size.
+    camera: Camera
+    shown: Shown
+
+
+@dataclass(eq=False, kw_only=True)
+class Seat:
+    """A visitor's place in the studio."""
+
+    painter: Paints
+    deliver: Callable[[Frame], None]
+    #: Told why a picture could not be drawn.
+    failed: Callable[[Exception], None]
+    #: What was asked for last, at full size.
+    asked: tuple[Camera, Shown] | None = None
+    quick_due: bool = False
+    full_due: bool = False
+    #: When the camera last moved.
+    moved: float = 0.0
+    #: A full picture that is being drawn.
+    work: Iterator[None] | None = None
+    #: Pixels that a quick picture may have, learned from what they take.
+    quick_px: float = 320 * 240
+    #: Seconds that a quick picture takes for each of its anchors; 0 before there was any.
+    per_anchor: float = 0.0
+    #: Seconds that a pixel of a full picture took; 0 before there was any.
+    per_px: float = 0.0
+
+
+class Studio:
+    """Draws for whoever has a seat. `step` does one piece of work; `run` does so until it is closed."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._seats: list[Seat] = []
+        self._errands: deque[tuple[Future[Any], Callable[[], None]]] = deque()
+        self._full_pictures: OrderedDict[Hashable, np.ndarray] = OrderedDict()
+        self._changed = threading.Condition()
+        self._closed = False
+        self._left = 0
+
+    def seat(self, painter: Paints, deliver: Callable[[Frame], None], failed: Callable[[Exception], None]) -> Seat:
+        """A place for a new visitor."""
+        seat = Seat(painter=painter, deliver=deliver, failed=failed)
+        with self._changed:
+            self._seats.append(seat)
+        return seat
+
+    def leave(self, seat: Seat) -> None:
+        """The visitor is gone; nothing more is drawn for them."""
+        with self._changed:
+            if seat in self._seats:
+                self._seats.remove(seat)
+                self._left += 1
+            seat.work, seat.asked = None, None
+
+    def ask(self, seat: Seat, camera: Camera, shown: Shown) -> None:
+        """What a visitor wants to see now, at full size. Replaces what they wanted before."""
+        with self._changed:
+            seat.asked, seat.moved = (camera, shown), self._clock()
+            seat.quick_due = seat.full_due = True
+            seat.work = None
+            self._changed.notify()
+
+    def errand(self, do: Callable[[], _Result]) -> Future[_Result]:
+        """Something else that needs the kernels: done next, in the thread that draws; cancelled once the studio closes,
+        so that nobody waits for what does not come."""
+        future: Future[_Result] = Future()
+
+        def run() -> None:
+            try:
+                future.set_result(do())
+            except BaseException as error:  # raised again in whoever waits
+                future.set_exception(error)
+
+        with self._changed:
+            if self._closed:
+                future.cancel()
+            else:
+                self._errands.append((future, run))
+                self._changed.notify()
+        return future
+
+    def close(self) -> None:
+        """Let `run` return. Errands that have not begun are cancelled."""
+        with self._changed:
+            self._closed = True
+            for future, _ in self._errands:
+                future.cancel()
+            self._errands.clear()
+            self._changed.notify()
+
+    def run(self) -> None:
+        """Work until `close`."""
+        while True:
+            wait = self.step()
+            if self._left >= MOST_LEFT:
+                self._tidy()
+            with self._changed:
+                if self._closed:
+                    return
+                if wait == 0 or self._busy():
+                    continue
+                told = self._changed.wait(IDLE if wait is None else wait)
+                if told or wait is not None or self._busy() or self._closed:
+                    continue
+            self._tidy()
+            with self._changed:
+                self._changed.wait_for(lambda: self._busy() or self._closed)
+
+    def _tidy(self) -> None:
+        """Give back what pictures and visitors took: who left is held by circles of theirs."""
+        self._left = 0
+        gc.collect()
+        return_unused()
+
+    def _busy(self) -> bool:
+        return bool(self._errands) or any(seat.quick_due for seat in self._seats)
+
+    def step(self) -> float | None:
+        """Do one piece of work. Returns 0 if there may be more, else seconds until there will be; None: not known."""
+        with self._changed:
+            errand = self._errands.popleft()[1] if self._errands else None
+            now = self._clock()
+            seat = None if errand else self._next(now)
+            quick = seat is not None and seat.quick_due
+            resting = [each.moved + REST - now for each in self._seats if each.full_due]
+        if errand is not None:
+            errand()
+            return 0
+        if seat is None:
+            return max(min(resting), 1e-3) if resting else None
+        try:
+            self._draw_quick(seat) if quick else self._draw_on(seat)
+        except Exception as error:  # one visitor's trouble ends no other's pictures
+            with self._changed:
+                seat.quick_due, seat.full_due, seat.work = False, False, None
+            seat.failed(error)
+        return 0
+
+    def _next(self, now: float) -> Seat | None:
+        """Whose turn it is; they go to the end of the queue."""
+        for wants in (lambda s: s.quick_due, lambda s: s.full_due and now - s.moved >= REST - 1e-6):
+            for seat in self._seats:
+                if seat.asked is not None and wants(seat):
+                    self._seats.remove(seat)
+                    self._seats.append(seat)
+                    return seat
+        return None
+
+    def _draw_quick(self, seat: Seat) -> None:
+        with self._changed:
+            asked, seat.quick_due = seat.asked, False
+        if asked is None:
+            return
+        whole, shown = asked
+        small = shrunk(whole, seat.quick_px)
+        if small is whole and not seat.full_due:
+            return
+        began = self._clock()
+        allowed = self._allowed(began)
+        anchors = max(int(allowed / seat.per_anchor), FEWEST_ANCHORS) if seat.per_anchor else FIRST_ANCHORS
+        seat.deliver(Frame(seat.painter.paint(shown, small, small, anchors), False, whole, shown))
+        taken = max(self._clock() - began, 1e-4)
+        if seat.painter.drawn:
+            measured = taken / seat.painter.drawn
+            seat.per_anchor += (LEARNING if seat.per_anchor else 1.0) * (measured - seat.per_anchor)
+        most = max(min(MOST_PX, whole.width * whole.height), FEWEST_PX)
+        seat.quick_px = float(np.clip(seat.quick_px * np.clip(allowed / taken, 0.5, 1.5), FEWEST_PX, most))
+
+    def _allowed(self, now: float) -> float:
+        """Seconds that a quick picture may take: a fair share of a round of all who move."""
+        with self._changed:
+            moving = sum(now - seat.moved < 2 * REST for seat in self._seats)
+        return min(QUICK, max(ROUND / max(moving, 1), BRIEFEST))
+
+    def _draw_on(self, seat: Seat) -> None:
+        """The next rows of a full picture."""
+        with self._changed:
+            asked = seat.asked
+            if asked is None:
+                return
+            if seat.work is None:
+                seat.work = self._full(seat, *asked)
+            work = seat.work
+        done = next(work, self) is self
+        with self._changed:
+            if done and seat.work is work:
+                seat.work, seat.full_due = None, False
+
+    def _full(self, seat: Seat, whole: Camera, shown: Shown) -> Iterator[None]:
+        """Draw a full picture, turn by turn, and deliver it unless something else was asked for meanwhile."""
+        seat.painter.settle(shown, whole)
+        key = (view_of(whole), shown, seat.painter.key(shown))
+        if key in self._full_pictures:
+            self._full_pictures.move_to_end(key)
+            seat.deliver(Frame(self._full_pictures[key], True, whole, shown))
+            return
+        turns = round(seat.per_px * whole.width * whole.height / TURN)
+        turns = max(turns, -(-seat.painter.in_view(shown, whole) // TURN_ANCHORS), 1)
+        turns = min(turns, MOST_TURNS, whole.height)
+        edges = np.linspace(0, whole.height, turns + 1).round().astype(int).tolist()
+        parts, taken = [], 0.0
+        for top, bottom in pairwise(edges):
+            began = self._clock()
+            part = whole if turns == 1 else whole.cropped(0, top, whole.width, bottom)
+            parts.append(seat.painter.paint(shown, part, whole))
+            taken += self._clock() - began
+            if bottom != whole.height:
+                yield
+        seat.per_px = taken / (whole.width * whole.height)
+        picture = np.concatenate(parts)
+        self._full_pictures[key] = picture
+        while len(self._full_pictures) > KEPT:
+            self._full_pictures.popitem(last=False)
+        if seat.asked == (whole, shown):
+            seat.deliver(Frame(picture, True, whole, shown))
+
+
+def view_of(camera: Camera) -> Hashable:
+    """What tells a view from others: equal for two cameras that see the same, to the last bit."""
+    return (
+        camera.camera_from_world.tobytes(), camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
+    )  # fmt: skip
+
+
+def shrunk(camera: Camera, pixels: float) -> Camera:
+    """The same view with at most so many pixels; the very camera where it has no more."""
+    share = (pixels / (camera.width * camera.height)) ** 0.5
+    if share >= 1.0:
+        return camera
+    return camera.resized(max(1, int(camera.width * share)), max(1, int(camera.height * share)))

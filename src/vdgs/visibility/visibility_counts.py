@@ -1,0 +1,112 @@
+"""Visibility: how many training cameras hold each anchor in their frustum (sections IV-B and IV-C).
+
+A frustum holds a point where z > near and the projected centre lies on the image. Nothing is hidden behind anything
+else: the paper counts frusta, not lines of sight. Symbols: V_i (views of anchor i), V̂_i (normalised), c_k (share of the
+cameras of a growth cycle).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, Int32
+from torch import Tensor
+
+from vdgs.geometry.camera import Camera
+from vdgs.kernels import choose
+
+#: Percentiles and limits by which visibility is described.
+QUANTILES = (5, 25, 50, 75, 95)
+LIMITS = (3, 5, 10)
+#: Keeps V̂ finite where all anchors are seen alike (eq. 5).
+EPSILON = 1e-8
+
+
+@dataclass(frozen=True)
+class Imbalance:
+    """How unevenly anchors are seen."""
+
+    mean: float
+    #: V by percentile.
+    quantiles: dict[int, float]
+    #: Gini coefficient of V: 0 where all are seen alike, towards 1 where few anchors have all the views.
+    gini: float
+    #: Share of the anchors that fewer than so many cameras see.
+    share_below: dict[int, float]
+
+
+def visibility_of(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Int32[Tensor, " n"]:
+    """V_i of every anchor: the number of `cameras` (the training views) whose frustum holds it.
+
+    Raises TypeError or ValueError unless positions are float32 or float64 [n, 3].
+    """
+    return choose(positions.device).count_visibility(positions, cameras)
+
+
+def votes_of(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> tuple[float, ...]:
+    """How much of the training each camera deserves (choice): every anchor has one vote and divides it among the
+    cameras that hold it, so that w_j = sum of 1 / V_i over the anchors i that camera j holds.
+
+    The shares add up to the number of anchors that any camera holds; where that is none, all are 1.
+    """
+    votes = 1.0 / visibility_of(positions, cameras).double().clamp(min=1)
+    shares = tuple(float(votes[visibility_of(positions, [camera]) > 0].sum()) for camera in cameras)
+    return shares if any(shares) else (1.0,) * len(cameras)
+
+
+def effective_count(shares: Sequence[float]) -> float:
+    """How many things used alike vary as much in the mean as these used in proportion to `shares`: (Σ w)² / Σ w²
+    (Kish, Survey Sampling, 1965, section 11.7). At least one share is above 0."""
+    return sum(shares) ** 2 / sum(share * share for share in shares)
+
+
+def normalised(visibility: Int[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """V̂_i = (V_i - min V) / (max V - min V + 1e-8), float64 in [0, 1) (eq. 5)."""
+    count = np.asarray(visibility, np.float64)
+    if len(count) == 0:
+        return count
+    return (count - count.min()) / (np.ptp(count) + EPSILON)
+
+
+def share_in_cycle(positions: Float[Tensor, "n 3"], cameras: Sequence[Camera]) -> Float[Tensor, " n"]:
+    """c_k of every anchor (eq. 8): the share of the distinct cameras of a growth cycle whose frustum holds it, float32.
+
+    A view that was drawn twice in the cycle, or at two resolutions, counts once. All offsets of an anchor share its
+    c_k. Raises ValueError without any camera.
+    """
+    if not cameras:
+        raise ValueError("a growth cycle without cameras has no shares")
+    distinct = list({_frustum(camera): camera for camera in cameras}.values())
+    return visibility_of(positions, distinct).float() / len(distinct)
+
+
+def _frustum(camera: Camera) -> tuple[bytes, tuple[float, ...], str]:
+    """What makes two cameras see the same: pose, and intrinsics as shares of the image."""
+    across, down = camera.width, camera.height
+    shares = (camera.fx / across, camera.fy / down, camera.cx / across, camera.cy / down)
+    return camera.camera_from_world.tobytes(), tuple(round(share, 9) for share in shares), camera.model
+
+
+def imbalance(visibility: Int[np.ndarray, " n"]) -> Imbalance:
+    """The distribution of V in numbers. Raises ValueError if there is no anchor."""
+    count = np.asarray(visibility, np.float64)
+    if len(count) == 0:
+        raise ValueError("no anchors: their visibility has no distribution")
+    return Imbalance(
+        mean=float(count.mean()),
+        quantiles={percent: float(np.percentile(count, percent)) for percent in QUANTILES},
+        gini=_gini(count),
+        share_below={limit: float((count < limit).mean()) for limit in LIMITS},
+    )
+
+
+def _gini(values: Float[np.ndarray, " n"]) -> float:
+    """Half the mean absolute difference of two values, over their mean; from sorted values in O(n log n)."""
+    total = values.sum()
+    if total == 0:
+        return 0.0
+    n = len(values)
+    ranks = 2 * np.arange(1, n + 1) - n - 1
+    return float((ranks * np.sort(values)).sum() / (n * total))
