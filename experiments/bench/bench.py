@@ -39,8 +39,7 @@ from vdgs.captures.loading import load_capture
 from vdgs.captures.output_guard import refuse_among_files, refuse_in_a_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.serialization import differences, to_dict
-from vdgs.distributed.executor import Outcome, Task
-from vdgs.distributed.lines import Lines
+from vdgs.distributed.executor import Lines, Outcome, Task
 from vdgs.distributed.local_executor import LocalExecutor
 from vdgs.distributed.progress_table import STYLES
 from vdgs.errors import Stopped, VdgsError

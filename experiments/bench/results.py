@@ -15,7 +15,7 @@ from experiments.bench.worker import RECORD
 from vdgs.distributed.executor import Outcome
 from vdgs.errors import VdgsError
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import Status
 from vdgs.system.atomic_files import read_json
 
 #: What evaluations report, raw and after colour correction.

@@ -209,7 +209,7 @@ def main(arguments: list[str]) -> int:
     from vdgs.kernels import configure_threads
 
     configure_threads()  # before anything imports torch
-    from vdgs.distributed.parent import stop_when_parent_dies
+    from vdgs.distributed.task_process import stop_when_parent_dies
     from vdgs.system.stop_signals import stop_requests
 
     stop_when_parent_dies()

@@ -27,10 +27,11 @@ import torch
 from PIL import Image
 from rich.console import Console
 
-from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.captures.capture import Capture, View
 from vdgs.config.commands import ExportRequest
 from vdgs.export import export_run
 from vdgs.geometry.camera import Camera
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.kernels import choose, set_threads, threads
 from vdgs.kernels.kernel_types import FEATURE_SIZE
 from vdgs.model.anchor_model import AnchorModel
@@ -38,7 +39,7 @@ from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
 from vdgs.runs.open_run import TrainedRun
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import Status
 
 OFFSETS, ANCHORS_PER_VIEW, SEEN_BY, SPACING = 10, 1600, 10, 1.0
 WIDTH, HEIGHT = 400, 300

@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 
 from support.captures import TinyScene, data_folder, look_down, moved, tiny_scene
 from vdgs.captures.camera_height import camera_height
-from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.captures.capture import Capture, View
 from vdgs.captures.loading import load_capture
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.method import TrainConfig
 from vdgs.geometry.camera import Camera
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.training import Stage
 from vdgs.training.training_loop import _volume_weight
 

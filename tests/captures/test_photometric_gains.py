@@ -16,11 +16,10 @@ from hypothesis import strategies as st
 
 from support.captures import TinyScene, render_plane, tiny_scene, write_colmap
 from support.commands import vdgs
-from vdgs.captures.capture import View
+from vdgs.captures.capture import Sightings, View
 from vdgs.captures.formats.colmap_records import SIGHTINGS, some_of
 from vdgs.captures.image_cache import ImageCache, Picture
 from vdgs.captures.photometric_gains import LEAST_LIGHT, PointColours, point_colours
-from vdgs.captures.sightings import Sightings
 from vdgs.config.presets import PRESETS
 from vdgs.model.anchor_model import AnchorModel
 

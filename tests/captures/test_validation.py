@@ -15,9 +15,8 @@ from rich.console import Console
 from support.captures import TinyScene, look_down, moved, tiny_scene, write_colmap, write_images, write_ply
 from support.commands import vdgs
 from vdgs.captures.formats.colmap_records import SIGHTINGS
-from vdgs.captures.image_checks import check_images
+from vdgs.captures.image_checks import check_images, rounding_of
 from vdgs.captures.loading import load_capture
-from vdgs.captures.precision import rounding_of
 from vdgs.captures.validation import judge, refuse_unsound
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError

@@ -8,9 +8,9 @@ import sys
 from types import SimpleNamespace
 
 import pytest
-from vdgs.cli.main.doctor import doctor_report as doctor_report
-from vdgs.cli.main.doctor import system_checks as doctor
 
+from vdgs.cli.doctor import doctor_report as doctor_report
+from vdgs.cli.doctor import system_checks as doctor
 from vdgs.cli.doctor.check import Check
 from vdgs.cli.doctor.doctor_report import healthy, print_report, report
 
@@ -118,6 +118,8 @@ def test_a_missing_dependency_has_its_command(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_it_imports_nothing_heavy_before_it_looks():
-    code = "import sys, vdgs.cli.doctor.doctor_report; print(sorted({'torch', 'numpy', 'cv2', 'rich'} & set(sys.modules)))"
+    code = (
+        "import sys, vdgs.cli.doctor.doctor_report; print(sorted({'torch', 'numpy', 'cv2', 'rich'} & set(sys.modules)))"
+    )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"

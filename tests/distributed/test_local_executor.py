@@ -13,11 +13,10 @@ import pytest
 from support.commands import PATIENCE_SECONDS, wait_until
 from support.shard_scripts import job, run
 from vdgs.distributed import local_executor
-from vdgs.distributed.executor import Listener, Outcome, Task
-from vdgs.distributed.lines import Lines
+from vdgs.distributed.executor import Lines, Listener, Outcome, Task
 from vdgs.distributed.local_executor import LocalExecutor
-from vdgs.distributed.parent import PARENT, stop_when_parent_dies
 from vdgs.distributed.shard_runner import Piece
+from vdgs.distributed.task_process import PARENT, stop_when_parent_dies
 from vdgs.runs.stage_folder import StageFolder
 
 FINE = 'tell("done", iteration=10, iterations=10, psnr_training=25.5, anchors=1234)'
@@ -313,7 +312,7 @@ def test_a_second_interrupt_kills(tmp_path):
 def test_a_job_ends_with_a_driver_that_was_killed(tmp_path):
     watched = (
         "import sys; sys.path.insert(0, sys.argv[2])\n"
-        "from vdgs.distributed.parent import stop_when_parent_dies\nstop_when_parent_dies(0.05)\n" + LONG
+        "from vdgs.distributed.task_process import stop_when_parent_dies\nstop_when_parent_dies(0.05)\n" + LONG
     )
     source = str(Path(local_executor.__file__).parents[2])
     jobs = [job(tmp_path, i, watched) for i in range(2)]

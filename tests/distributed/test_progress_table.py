@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from vdgs.distributed.output import explanation
 from vdgs.distributed.progress_table import progress_line, progress_table
 from vdgs.distributed.shard_progress import Figures, PieceProgress, read_figures, seconds_left_overall
 from vdgs.distributed.shard_runner import default_jobs
+from vdgs.distributed.task_process import explanation
 
 
 @given(st.dictionaries(st.sampled_from(["iteration", "iterations", "psnr_training", "anchors", "seconds_left",

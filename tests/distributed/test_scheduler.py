@@ -9,21 +9,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from support.captures import tiny_scene, write_colmap
-from vdgs.cli.main import run_cmd
+from vdgs.cli import run_cmd
 from vdgs.config.executor_options import ExecutorOptions, SlurmOptions
 from vdgs.config.presets import PRESETS
 from vdgs.distributed import node_check
 from vdgs.distributed.backend_selection import Machine, choose
-from vdgs.distributed.engine import Begun, End
-from vdgs.distributed.executor import Listener, Needs, Task
-from vdgs.distributed.lines import Lines
+from vdgs.distributed.executor import Begun, End, Lines, Listener, Needs, Task
 from vdgs.distributed.node_check import Question, examine
 from vdgs.distributed.resource_allocation import Work, by_queue, exceeds, on_cluster, on_this_machine
 from vdgs.distributed.scheduler import Policy, run_crew
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.runs.stage_folder import StageFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import StageFolder, Status
 from vdgs.system.memory.memory_estimate import decoded_bytes, estimate, need_of_block
 
 GB = 10**9

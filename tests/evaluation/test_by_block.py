@@ -28,7 +28,7 @@ from vdgs.evaluation.by_block import (
     border_pixels,
     label_map,
 )
-from vdgs.evaluation.reference_views import ReferenceViews
+from vdgs.evaluation.renderable_model import ReferenceViews
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.model.renderer import render

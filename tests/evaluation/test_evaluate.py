@@ -21,8 +21,7 @@ from vdgs.errors import CaptureError, RunError, TrainingDiverged
 from vdgs.evaluation import comparison_images, image_io, metrics
 from vdgs.evaluation.evaluate_model import evaluate
 from vdgs.evaluation.lpips import Lpips, LpipsScores
-from vdgs.evaluation.reference_views import ReferenceViews
-from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ModelFacts
+from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ModelFacts, ReferenceViews
 from vdgs.system.atomic_files import jsonable, write_json
 
 pytestmark = pytest.mark.xdist_group("evaluate")
@@ -260,7 +259,9 @@ def test_the_colour_map_grows_with_the_error():
 def test_a_comparison_of_any_size(size: tuple[int, int]):
     reference = photograph(np.random.default_rng(1), *size)
     picture = comparison_images.comparison(reference, reference, "a name " * 3, "30.00 dB")
-    width, height = comparison_images.panel_size(size[1], size[0], comparison_images.PANEL_MIN_PX, comparison_images.PANEL_MAX_PX)
+    width, height = comparison_images.panel_size(
+        size[1], size[0], comparison_images.PANEL_MIN_PX, comparison_images.PANEL_MAX_PX
+    )
     assert picture.width > 3 * width
     assert picture.height > height
 

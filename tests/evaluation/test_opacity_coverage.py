@@ -23,8 +23,7 @@ from vdgs.evaluation.coverage import seen_map
 from vdgs.evaluation.depth_errors import NAMES, DepthErrors, errors_of_view
 from vdgs.evaluation.evaluate_model import evaluate
 from vdgs.evaluation.opacity_coverage import PSNRS_SEEN, Rendered, larger_than_picture
-from vdgs.evaluation.reference_views import ReferenceViews
-from vdgs.evaluation.renderable_model import MeasuredModel
+from vdgs.evaluation.renderable_model import MeasuredModel, ReferenceViews
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster, Splats
 

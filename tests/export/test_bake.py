@@ -13,7 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from support.hand_made_models import camera_above, model_at
-from vdgs.export import bake
+from vdgs.export import bake as bake_module
 from vdgs.export.bake import Survey, bake, survey
 from vdgs.export.color_refinement import Baked, refit
 from vdgs.export.formats.export_scene import Scene
@@ -122,7 +122,7 @@ def test_parts_do_not_change_what_is_baked(monkeypatch):
     kept = np.flatnonzero(seen.pixels > 0)[::3]
     whole, done = baked(seen, 3, kept), list[int]()
     expected = whole.tensors()
-    monkeypatch.setattr(bake, "ANCHORS_AT_ONCE", 17)
+    monkeypatch.setattr(bake_module, "ANCHORS_AT_ONCE", 17)
     parts = list(bake(seen, kept, 3, done.append))
     assert len(parts) > 5
     assert done[-1] == len(kept) == len(whole)

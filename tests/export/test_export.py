@@ -16,7 +16,8 @@ from support.gaussians import random_gaussians
 from support.hand_made_models import capture_at, ground, model_at
 from vdgs.config.commands import ExportRequest
 from vdgs.errors import VdgsError
-from vdgs.export import export_run, local_bake
+from vdgs.export import export_run as export_module
+from vdgs.export import local_bake
 from vdgs.export.bake import survey
 from vdgs.export.export_run import RECORD, export_run
 from vdgs.export.formats import registry
@@ -28,7 +29,7 @@ from vdgs.model.gaussians import draw_gaussians
 from vdgs.model.renderer import render
 from vdgs.runs.open_run import TrainedRun
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import Status
 from vdgs.system.atomic_files import read_json
 
 #: Far from the middle of its UTM zone: grid north is 1.1 degrees off.
@@ -55,7 +56,7 @@ def export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             folder=RunFolder(tmp_path / "run"), model=shown, model_path=file, name="merged", status=Status(), key="k",
             caution="", capture=capture_at(origin),
         )  # fmt: skip
-        monkeypatch.setattr(export_run, "open_run", lambda *_: opened)
+        monkeypatch.setattr(export_module, "open_run", lambda *_: opened)
         request = ExportRequest(
             run=tmp_path / "run", to=tuple(tmp_path / name for name in names), measure=False, device="cpu", **asked
         )

@@ -5,9 +5,9 @@ import sys
 import numpy as np
 import pytest
 
-from vdgs.captures.capture import GroundFrame
 from vdgs.errors import VdgsError
 from vdgs.geometry.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_enu
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.map_projection import Placement
 
 pyproj = pytest.importorskip("pyproj")

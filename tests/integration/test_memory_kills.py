@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from support.shard_scripts import job, run
-from vdgs.distributed.engine import End
+from vdgs.distributed.executor import End
 from vdgs.distributed.node_check import Question
 from vdgs.distributed.ray_actor import Keeper, Order
 

@@ -270,7 +270,7 @@ def test_a_block_that_is_killed_is_started_again(unbroken, copied):
 
 def swallow_ctrl_c() -> None:
     """Let Ctrl-C come between two stages, inside something that swallows it."""
-    from vdgs.pipeline.run_pipeline import run_pipeline
+    from vdgs.pipeline import run_pipeline
 
     def measure_visibility(*_: object) -> None:
         with suppress(KeyboardInterrupt):

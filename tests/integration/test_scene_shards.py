@@ -18,7 +18,7 @@ from vdgs.export.bake import Shown
 from vdgs.export.bake_io import load_added, load_lacking, load_shown, save_added, save_lacking, save_shown
 from vdgs.export.color_refinement import Lacking
 from vdgs.export.formats.gaussian_store import flat, opened, unflattened
-from vdgs.pipeline.run_pipeline import run_pipeline
+from vdgs.pipeline import run_pipeline
 from vdgs.rendering.ortho.tile_renderer import Tile
 from vdgs.rendering.ortho.tile_shards import load_tile, save_tile
 from vdgs.runs.run_context import RunContext

@@ -121,7 +121,11 @@ def test_the_same_command_does_nothing_and_an_option_only_what_depends_on_it(mad
     before = files(output)
     reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1, keep_work=True), console())
     assert files(output) == before
-    for room, name in ((feature_extraction, "find_features"), (feature_matching, "match"), (incremental_mapper, "find_models")):
+    for room, name in (
+        (feature_extraction, "find_features"),
+        (feature_matching, "match"),
+        (incremental_mapper, "find_models"),
+    ):
         monkeypatch.setattr(room, name, lambda *_: pytest.fail("was done already"))
     asked = SfmRequest(photographs=(flight.folder,), output=output, threads=1, options=SfmOptions(max_size=200))
     reconstruct(asked, console())

@@ -261,7 +261,9 @@ def test_another_focal_length_begins_mapping_anew(flight, begun, tmp_path, monke
         with pytest.raises(KeyboardInterrupt), stop_requests(interrupts=True):
             reconstruct(SfmRequest(photographs=(flight.folder,), output=output, threads=1), console())
     assert any((output / "work" / "kept").iterdir())
-    monkeypatch.setattr(incremental_mapper, "find_models", lambda work, *_: pytest.fail("kept") if work.kept.exists() else done())
+    monkeypatch.setattr(
+        incremental_mapper, "find_models", lambda work, *_: pytest.fail("kept") if work.kept.exists() else done()
+    )
 
     def done():
         raise CaptureError("begun anew")

@@ -136,9 +136,7 @@ def test_a_gradient_that_is_not_a_number_is_reported_and_stays_out_of_its_anchor
 def test_a_frozen_decoder_gets_no_gradients():
     scene = Scene.random(700, seed=2)
     gradients, states = gradients_of(scene), states_of(scene)
-    answer = cpu.decode_backward_adam(
-        scene.positions, states, scene.weights, CAMERA, ROWS, gradients, UPDATES.clone()
-    )
+    answer = cpu.decode_backward_adam(scene.positions, states, scene.weights, CAMERA, ROWS, gradients, UPDATES.clone())
     assert answer == (True, None)
     _, expected = fused(cpu, scene, gradients)
     assert all(torch.equal(a, b) for a, b in zip([t for s in states for t in s[:3]], expected, strict=False))
@@ -197,9 +195,7 @@ def test_a_state_that_does_not_fit_is_refused():
         states = states_of(scene)
         states[0] = states[0]._replace(**damage)
         with pytest.raises(ValueError, match="moments"):
-            cpu.decode_backward_adam(
-                scene.positions, states, scene.weights, CAMERA, ROWS, gradients, UPDATES.clone()
-            )
+            cpu.decode_backward_adam(scene.positions, states, scene.weights, CAMERA, ROWS, gradients, UPDATES.clone())
 
 
 @pytest.mark.parametrize("kernels", [cpu, torch_ref])

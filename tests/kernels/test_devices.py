@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from vdgs.cli.main.doctor import cuda_checks as doctor_cuda
 
+from vdgs.cli.doctor import cuda_checks as doctor_cuda
 from vdgs.errors import VdgsError
 from vdgs.kernels import cpu, cuda, device_selection, gpu, gsplat, operations, torch_ref
 from vdgs.kernels.cuda import driver

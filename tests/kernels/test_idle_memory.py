@@ -7,7 +7,7 @@ import pytest
 
 HOLED = """
 import torch
-from vdgs.system.memory.process_memory import return_unused
+from vdgs.kernels.idle_memory import return_unused
 
 def resident():
     with open("/proc/self/status") as status:

@@ -15,12 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely.affinity import translate
 
-from vdgs.captures.capture import GroundFrame
 from vdgs.config.method import BlockConfig, MethodConfig, PartitionConfig
 from vdgs.config.presets import PRESETS
 from vdgs.errors import RunError, VdgsError
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.partition import clustering
 from vdgs.partition.blocks import Block, Blocks, load_blocks, save_blocks, save_blocks_wgs84
 from vdgs.partition.boundary import alpha_shape, widen

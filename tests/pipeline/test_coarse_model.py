@@ -26,7 +26,7 @@ from vdgs.runs.open_run import open_run
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import standing_of
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import Status
 from vdgs.runs.visibility_store import keep_visibility
 from vdgs.system.atomic_files import write_json
 from vdgs.system.tensors import identity

@@ -28,7 +28,7 @@ from vdgs.errors import RunError
 from vdgs.pipeline.run_pipeline import with_capture
 from vdgs.runs.create_or_resume import begin_run, driven_run
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import Status
 from vdgs.system.atomic_files import write_json
 
 #: Another process that drives a run: it holds the lock of which it is told until its input ends.

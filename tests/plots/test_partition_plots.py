@@ -15,15 +15,14 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from vdgs.captures.capture import GroundFrame
 from vdgs.config.method import PartitionConfig
 from vdgs.geometry.camera import Camera
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.partition.blocks import Block, Blocks
 from vdgs.pipeline.partition_stage import how_cut
 from vdgs.plots.partition import block_maps as figures
-from vdgs.plots.partition.block_stats import block_facts
+from vdgs.plots.partition.block_stats import PALETTE, block_colour, block_facts
 from vdgs.plots.partition.score_heatmap import order_of_cameras
-from vdgs.plots.partition.words import PALETTE, block_colour
 from vdgs.plots.style import DPI, titles
 from vdgs.plots.visibility_map import without_speckles
 

@@ -17,10 +17,11 @@ from rich.console import Console
 
 from support.captures import look_down
 from support.hand_made_models import model_at, opaque_plane
-from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.captures.capture import Capture, View
 from vdgs.config.commands import MapRequest
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.map_projection import Placement
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.decoder import Decoder
@@ -105,7 +106,9 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         opened = SimpleNamespace(folder=ortho_folder, capture=capture, model=model, name="coarse", status=status)
         monkeypatch.setattr(RunContext, "open_model", lambda *_: opened)
         request = MapRequest(run=tmp_path / "run", device="cpu", **asked)
-        return render_ortho.map_run(RunContext.from_path(request.run), request, Console(file=sys.stderr, soft_wrap=True))
+        return render_ortho.map_run(
+            RunContext.from_path(request.run), request, Console(file=sys.stderr, soft_wrap=True)
+        )
 
     run.path = tmp_path / "run"
     return run
@@ -346,7 +349,9 @@ def test_maps_of_others_are_not_written_over(house, make, tmp_path, monkeypatch,
     with pytest.raises(VdgsError, match=r"holds dsm\.tif.*Nothing was drawn"):
         render_ortho.map_run(context, MapRequest(run=tmp_path / "run", output=tmp_path), Console(quiet=True))
     with pytest.raises(VdgsError, match="is a file"):
-        render_ortho.map_run(context, MapRequest(run=tmp_path / "run", output=tmp_path / "dsm.tif"), Console(quiet=True))
+        render_ortho.map_run(
+            context, MapRequest(run=tmp_path / "run", output=tmp_path / "dsm.tif"), Console(quiet=True)
+        )
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
@@ -478,7 +483,9 @@ def misted(capture: Capture, folder: Path) -> Capture:
         sharp = view.camera.resized(320, 240)
         x, y, _ = np.moveaxis(sharp.unproject(np.full((240, 320), sharp.position[2])), -1, 0)
         light = 0.5 + 0.1 * np.sin(2 * np.pi * (x + 0.3 * number) / 4.1) * np.cos(2 * np.pi * y / 5.3)
-        Image.fromarray((light[..., None].repeat(3, axis=2) * 255 + 0.5).astype(np.uint8)).save(ortho_folder / view.name)
+        Image.fromarray((light[..., None].repeat(3, axis=2) * 255 + 0.5).astype(np.uint8)).save(
+            ortho_folder / view.name
+        )
         views.append(replace(view, camera=sharp, image_path=ortho_folder / view.name))
     return replace(capture, views=tuple(views))
 

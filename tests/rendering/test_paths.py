@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from vdgs.captures.capture import GroundFrame
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.rendering.camera_paths import flyover, frame_count, interpolate, look_at, orbit
 from vdgs.rendering.path_io import load_path
 from vdgs.rendering.video import VideoWriter, best_encoder

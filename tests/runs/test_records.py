@@ -7,8 +7,7 @@ import pytest
 from vdgs.errors import RunError, VdgsError
 from vdgs.partition.block_records import AssignedBlock, CutBlock, MergedBlock, PartitionRecord
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import StageFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import StageFolder, Status
 from vdgs.system.records import known, plain, record_of
 
 MERGED = Status(

@@ -17,9 +17,8 @@ from vdgs.errors import RunError
 from vdgs.runs.create_or_resume import begin_run
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
-from vdgs.runs.stage_folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder, Status
 from vdgs.runs.stage_keys import NEEDS, counted, stage_keys
-from vdgs.runs.status import Status
 from vdgs.system.atomic_files import write_json, write_text
 
 

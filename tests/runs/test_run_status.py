@@ -27,7 +27,7 @@ from vdgs.runs.open_run import open_model, open_run
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
 from vdgs.runs.run_status import OTHER_BLOCKS, OTHER_CUT, OTHER_MODEL, OTHER_SETTINGS, standing_of
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import Status
 from vdgs.system.atomic_files import write_json
 from vdgs.system.file_locks import hold, is_locked
 from vdgs.system.tensors import identity

@@ -19,12 +19,11 @@ from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.geometry.geodesy import geodetic_from_enu
 from vdgs.sfm import pair_selection
-from vdgs.sfm.attitude import of_aircraft, of_gimbal
 from vdgs.sfm.focal_length import CALIBRATED, Lens, find_lens
 from vdgs.sfm.georegistration import tilt_against_attitudes
 from vdgs.sfm.gps_priors import find_positions
 from vdgs.sfm.image_list import collect, only_photographs
-from vdgs.sfm.image_metadata import Photograph, Unusable, read_photograph
+from vdgs.sfm.image_metadata import Photograph, Unusable, of_aircraft, of_gimbal, read_photograph
 from vdgs.sfm.incremental_mapper import holds_focal
 from vdgs.sfm.preflight import look_at
 from vdgs.sfm.reconstruction_plan import prepare
@@ -365,7 +364,9 @@ def test_without_attitudes_the_focal_length_is_held_where_positions_are_those_of
 @given(st.integers(2, 40), st.integers(1, 8), st.integers(0, 4))
 def test_pairs_are_sorted_and_none_is_of_one_photograph(count, following, doublings):
     order = list(np.random.default_rng(count).permutation(count))
-    chosen = pair_selection.in_order(order, following, doublings) | pair_selection.near(np.random.default_rng(0).random((count, 3)), 4)
+    chosen = pair_selection.in_order(order, following, doublings) | pair_selection.near(
+        np.random.default_rng(0).random((count, 3)), 4
+    )
     assert all(0 <= i < j < count for i, j in chosen)
     assert {tuple(sorted(pair)) for pair in pairwise(order)} <= chosen
 

@@ -26,7 +26,7 @@ from vdgs.config.sfm_options import SfmOptions, SfmRequest
 from vdgs.errors import CaptureError, VdgsError
 from vdgs.sfm import feature_extraction, incremental_mapper, reconstruct
 from vdgs.sfm.image_list import collect
-from vdgs.sfm.masking import kept_of, write_upright_masks
+from vdgs.sfm.mask_files import kept_of, write_upright_masks
 from vdgs.sfm.reconstruction_plan import prepare, tell
 from vdgs.sfm.run_request import sfm_request
 from vdgs.sfm.workspace import Work, quiet_colmap

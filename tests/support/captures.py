@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 import pytest
 
-from vdgs.captures.capture import GroundFrame
 from vdgs.geometry.camera import Camera
+from vdgs.geometry.ground_frame import GroundFrame
 
 MODEL_IDS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4}
 

@@ -19,7 +19,7 @@ from multiprocessing.process import BaseProcess
 from types import SimpleNamespace
 from typing import IO
 
-from vdgs.distributed.parent import PARENT
+from vdgs.distributed.task_process import PARENT
 
 #: Seconds between two looks at a process that is waited for.
 GLANCE_SECONDS = 0.01

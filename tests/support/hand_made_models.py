@@ -10,8 +10,9 @@ import shapely
 import torch
 
 from support.captures import look_down
-from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.captures.capture import Capture, View
 from vdgs.geometry.camera import Camera
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import psutil
 import pytest
-from vdgs.cli.main.doctor import system_checks as doctor
 
+from vdgs.cli.doctor import system_checks as doctor
 from vdgs.system.memory import process_memory
 from vdgs.system.memory.cgroups import GroupLimit, group_limits, slurm_limit
 

@@ -137,9 +137,7 @@ def test_a_view_is_counted_where_it_was_drawn():
     source = torch.tensor([0, 2, K + 1], dtype=torch.int32)  # anchor 1: offsets 0, 2; anchor 3: offset 1
     gradient = torch.tensor([[3.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
     inside = torch.tensor([False, True])
-    cpu.add_view_statistics(
-        stats, visible, inside, source, torch.tensor([0.5, 0.25, 1.0]), gradient, width=4, height=2
-    )
+    cpu.add_view_statistics(stats, visible, inside, source, torch.tensor([0.5, 0.25, 1.0]), gradient, width=4, height=2)
     assert stats.gradient[1].tolist() == [6.0, 0.0, 1.0, 0.0]
     assert stats.gradient[3, 1] == pytest.approx(math.hypot(2.0, 1.0))
     assert stats.drawn.sum() == 3

@@ -20,7 +20,7 @@ from vdgs.model.ground import BELOW_HORIZON_DEG, below_horizon
 from vdgs.model.renderer import decode_view, render
 from vdgs.model.scale_bounds import REACH, SPAN, SPREAD, largest_log_scales
 from vdgs.training import Stage, train
-from vdgs.training.background import background_at
+from vdgs.training.target import background_at
 from vdgs.visibility.frustum import project
 
 FOCAL, WIDTH, HEIGHT = 100.0, 200, 160

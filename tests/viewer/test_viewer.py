@@ -16,11 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from support.captures import camera_at, look_down
 from support.hand_made_models import opaque_plane, quadrants
-from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.captures.capture import Capture, View
 from vdgs.evaluation.auto_exposure import metered
 from vdgs.evaluation.metrics import to_8bit
 from vdgs.evaluation.view_exposures import as_photographed
 from vdgs.geometry.camera import Camera
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.model.anchor_model import AnchorModel, Part
 from vdgs.model.exposure import exposure_of
 from vdgs.model.renderer import render
@@ -29,7 +30,7 @@ from vdgs.rendering.camera_paths import look_at
 from vdgs.rendering.path_io import load_path
 from vdgs.runs.open_run import TrainedRun
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import Status
 from vdgs.viewer import navigation, overlays
 from vdgs.viewer.image_comparison import laid_over, nearest_view
 from vdgs.viewer.keyframes import at_time, path_json

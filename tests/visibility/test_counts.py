@@ -14,7 +14,7 @@ from support.captures import look_down
 from vdgs.config.method import TrainConfig
 from vdgs.geometry.camera import NEAR, Camera, CameraModel
 from vdgs.model.anchors import Anchors
-from vdgs.training.sampling import shares_for
+from vdgs.training.schedule import shares_for
 from vdgs.visibility.visibility_counts import (
     effective_count,
     imbalance,

@@ -33,6 +33,7 @@ from vdgs.captures.camera_height import camera_height
 from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import capture_facts, refuse_another_capture
 from vdgs.captures.image_cache import ImageCache
+from vdgs.captures.validation import refuse_unworkable
 from vdgs.config.checkpointing import WatchOptions
 from vdgs.config.serialization import differences, to_dict
 from vdgs.errors import RunError, VdgsError
@@ -44,12 +45,11 @@ from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, 
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.kernels.spherical_harmonics import MAX_DEGREE
-from vdgs.report.starting import refuse_unworkable
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.atomic_files import read_json, write_json
 from vdgs.training import mean_colour
-from vdgs.training.session.images import image_budget
+from vdgs.training.session.trainer import image_budget
 
 #: What metrics.json calls this method.
 NAME = "3dgs"

@@ -27,8 +27,7 @@ from experiments.baselines.gs3d.training import (
 )
 from vdgs.captures.capture import Capture
 from vdgs.config.checkpointing import WatchOptions
-from vdgs.runs.stage_folder import StageFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import StageFolder, Status
 from vdgs.system.checkpoints import save_state
 from vdgs.training.session.training_progress import LOG_INTERVAL, PLAIN_SECONDS
 from vdgs.training.session.training_session import Keeper, Watched, restore_or_start, watch

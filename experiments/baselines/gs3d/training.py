@@ -24,7 +24,7 @@ from vdgs.system.checkpoints import SavedState
 from vdgs.training import PSNR_INTERVAL, TrainingImages, view_at
 from vdgs.training.optimizer import Moments
 from vdgs.training.per_anchor_tensors import Group, remap
-from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
+from vdgs.training.training_loop import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
 
 
 @dataclass(frozen=True)

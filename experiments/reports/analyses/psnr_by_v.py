@@ -26,7 +26,7 @@ from vdgs.cameras import Camera
 from vdgs.captures.heights import camera_height
 from vdgs.model.visibility import visibility_of
 from vdgs.partition.blocks import places_of
-from vdgs.runs.cut import blocks_of, views_of_blocks
+from vdgs.runs.open_run import blocks_of, views_of_blocks
 from vdgs.runs.opening import TrainedRun, open_run
 from vdgs.synth.truth import load_truth
 

@@ -19,7 +19,7 @@ from experiments.microbench.machine import describe
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.render import render
 from vdgs.partition.blocks import Blocks, places_of
-from vdgs.runs.cut import blocks_of
+from vdgs.runs.open_run import blocks_of
 from vdgs.runs.folder import RunFolder
 from vdgs.runs.opening import open_capture, open_model
 

@@ -8,48 +8,28 @@ from typing import Literal
 
 import numpy as np
 
-from vdgs.captures.sightings import Sightings
 from vdgs.geometry.camera import Camera
-from vdgs.geometry.similarity import Similarity
+from vdgs.geometry.ground_frame import GroundFrame
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Points [m, 3] that a photograph shows, in the world of its camera, and where it shows them: x/z and y/z of the
+    camera's rays [m, 2], all float64; and their numbers [m] int64, the same in all photographs of a capture."""
+
+    points: np.ndarray
+    rays: np.ndarray
+    numbers: np.ndarray
+
+    def errors_px(self, camera: Camera) -> np.ndarray:
+        """Reprojection errors [m] in pixels of a pinhole camera in the same world; infinite behind it."""
+        pixels, depth = camera.project(self.points)
+        found = self.rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        distance = np.linalg.norm(pixels - found, axis=1)
+        return np.where((depth > 0) & np.isfinite(distance), distance, np.inf)
+
 
 Split = Literal["train", "test"]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class GroundFrame(Similarity):
-    """The similarity that brings the capture's own world into the ground frame (z up)."""
-
-    #: True where one unit of the ground frame is one metre.
-    metric: bool
-    #: How the up axis and the scale were found, for people ("GPS of 18 images", "least variance", ...).
-    how: str
-    #: Latitude (deg), longitude (deg), altitude (m) of the ground frame's origin (ENU), where known.
-    origin_geo: tuple[float, float, float] | None = None
-    #: Latitude and longitude (deg) of the place whose east, north and up are the axes, where it is not the origin: a
-    #: frame that is moved keeps its axes.
-    axes_geo: tuple[float, float] | None = None
-
-    @property
-    def level_at(self) -> tuple[float, float]:
-        """Latitude and longitude (deg) of the place whose east, north and up are the axes (georeferenced frames)."""
-        if self.origin_geo is None:
-            raise ValueError("a frame that is not georeferenced is level at no known place")
-        return self.axes_geo or self.origin_geo[:2]
-
-    @property
-    def unit(self) -> str:
-        """What one unit of the ground frame is called."""
-        return "m" if self.metric else "units"
-
-    @property
-    def axis_names(self) -> tuple[str, str]:
-        """What x and y are called in figures, with their unit: east and north where the frame is georeferenced."""
-        east, north = ("east", "north") if self.origin_geo else ("x", "y")
-        return f"{east} ({self.unit})", f"{north} ({self.unit})"
-
-    def to_ground(self, points: np.ndarray) -> np.ndarray:
-        """Source points [n, 3] to the ground frame."""
-        return self.apply(points)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

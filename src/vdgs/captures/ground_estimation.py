@@ -21,13 +21,13 @@ from pathlib import Path
 import numpy as np
 
 from vdgs.captures.camera_height import reach
-from vdgs.captures.capture import GroundFrame
 from vdgs.captures.formats.source_capture import KnownWorld, SourceCapture
 from vdgs.captures.georeference import match_gps, read_georef, read_gps
 from vdgs.captures.up_axis import estimate_up
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
 from vdgs.geometry.geodesy import enu_from_geodetic, geodetic_from_enu
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.similarity import (
     Similarity,
     disagreement,

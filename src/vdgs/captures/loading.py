@@ -7,21 +7,21 @@ from pathlib import Path
 
 import numpy as np
 
-from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.captures.capture import Capture, Sightings, View
 from vdgs.captures.format_dispatch import read_source
 from vdgs.captures.formats.source_capture import SourceCapture, listing
 from vdgs.captures.ground_estimation import find_ground_frame, transform_pose
+from vdgs.captures.image_checks import rounding_of
 from vdgs.captures.image_files import LEAST_SIDE_PX
 from vdgs.captures.image_matching import FoundView, find_photographs
 from vdgs.captures.output_guard import refuse_among_files
-from vdgs.captures.precision import rounding_of
-from vdgs.captures.sightings import Sightings
 from vdgs.captures.splits import choose_splits, nearest_to_middle
 from vdgs.captures.undistortion import ImageFile, undistort
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.config.ranges import problems
 from vdgs.errors import CaptureError
 from vdgs.geometry.camera import Camera
+from vdgs.geometry.ground_frame import GroundFrame
 
 #: Points farther from the cameras than this many times their spread are strays of the matching.
 FAR_POINT = 100.0

@@ -12,8 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from rich.console import Console
+from rich.markup import escape
 
 from vdgs.captures.capture import Capture, View
+from vdgs.captures.image_checks import check_images
 from vdgs.errors import CaptureError
 from vdgs.geometry.row_sampling import sample_points
 from vdgs.geometry.similarity import geometric_median
@@ -182,3 +185,14 @@ def _longest_side(views: Sequence[View]) -> float:
 
 def _some(names: list[str]) -> str:
     return ", ".join(names[:NAMES_SHOWN]) + (", ..." if len(names) > NAMES_SHOWN else "")
+
+
+def refuse_unworkable(capture: Capture, console: Console) -> None:
+    """Say what is doubtful about a capture and what masks leave out. Raises `CaptureError` for one that cannot become a
+    scene, and for photographs or masks that are damaged."""
+    soundness = refuse_unsound(capture)
+    checked = check_images(capture)
+    for warning in (*capture.warnings, *soundness.warnings, *checked.warnings):
+        console.print(f"[yellow]note[/] {escape(warning)}", highlight=False)
+    if checked.masked_share:
+        console.print(f"masks leave out {checked.masked_share:.1%} of the photographs", highlight=False)

@@ -77,10 +77,10 @@ def _run(verb: str, arguments: list[str]) -> int:
     from vdgs.kernels import configure_threads
 
     configure_threads()  # before anything imports torch
-    from vdgs import cli
+    from vdgs.cli import commands
     from vdgs.system.exit_codes import exit_code_of
 
-    action: Callable[[list[str]], Any] = getattr(cli, verb)
+    action: Callable[[list[str]], Any] = getattr(commands, verb)
     again = "continues: what is finished is kept" if verb in CONTINUES else "begins it anew"
     return exit_code_of(f"vdgs {verb}", lambda: action(arguments), f"The same command {again}.")
 

@@ -9,7 +9,7 @@ the task is started again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
@@ -103,3 +103,89 @@ class Executor(Protocol):
         One that fails stops no other but those that come `after` it. When this process is asked to stop (Ctrl-C,
         SIGTERM, SIGHUP), it asks the running tasks once to save and end, and starts no more.
         """
+
+
+#: Prints a line in a style of rich; the text is no markup.
+Say = Callable[[str, str], None]
+
+
+class Lines(Listener):
+    """Says what a person must know in any case: who waits, who crashed, who was asked to stop."""
+
+    def __init__(self, say: Say):
+        self.say = say
+
+    def waits(self, task: Task) -> None:
+        self.say(f"{task.name}: waiting for another process that works on it", "yellow")
+
+    def paused(self, task: Task, why: str) -> None:
+        self.say(f"{task.name}: saved and waits for another turn" + (f" ({why})" if why else ""), "yellow")
+
+    def crashed(self, task: Task, how: str, attempts_left: int) -> None:
+        text = f"{task.name}: crashed by {how}; continues from its last checkpoint, attempts left: {attempts_left}"
+        self.say(text, "yellow")
+
+    def stopping(self, tasks: Sequence[Task]) -> None:
+        names = ", ".join(task.name for task in tasks)
+        self.say(f"stopping: {names} will save and end (Ctrl-C again kills)", "yellow")
+
+
+#: Exit codes of the command line (cli.py).
+DONE, EXPLAINED, STOPPED = 0, (1, 2), 130
+
+
+@dataclass(frozen=True)
+class Begun:
+    """Where an attempt runs, and where its part of the output begins."""
+
+    output_from: int = 0
+    where: str = ""
+    """Empty on this machine."""
+
+
+@dataclass(frozen=True)
+class End:
+    """How an attempt ended."""
+
+    code: int | None
+    """The exit code as `subprocess` counts (negative: a signal); None of one that was lost with its place."""
+    how: str = ""
+    """Of a lost one: by what, in words."""
+    out_of_memory: bool = False
+    """The system, or the cluster, ended it for want of memory."""
+    out_of_time: bool = False
+    """It was asked to save because its time was up or its place was needed, and did."""
+
+
+class Attempt(Protocol):
+    """An attempt at a task, wherever its process is."""
+
+    @property
+    def begun(self) -> Begun | None:
+        """None while it waits for a place, or waits for one again."""
+
+    def look(self) -> End | None:
+        """How it ended; None while it goes on. Brings `begun` up to date."""
+
+    def ask_to_stop(self) -> None:
+        """Ask it to save and end; one that waits for a place ends at once. Called once."""
+
+    def kill(self) -> None:
+        """End it, and whatever it started, at once."""
+
+
+class Engine(Protocol):
+    """Begins attempts."""
+
+    @property
+    def most_memory(self) -> int | None:
+        """Bytes that a task can ask for at most; None of an engine that finds no place by needs."""
+
+    def start(self, tasks: Sequence[tuple[Task, int]]) -> Sequence[Attempt | OSError]:
+        """Begin an attempt (of that number) at each task, or say what the system refuses."""
+
+    def find(self, task: Task) -> Attempt | None:
+        """An attempt that a driver began which died since, and that goes on without it."""
+
+    def refresh(self) -> None:
+        """Learn the news that `look` tells; once before all looks."""

@@ -6,8 +6,7 @@ import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from vdgs.distributed.engine import Begun, End
-from vdgs.distributed.executor import Listener, Outcome, Task
+from vdgs.distributed.executor import Begun, End, Listener, Outcome, Task
 from vdgs.distributed.scheduler import Policy, run_crew
 from vdgs.distributed.task_process import Process, out_of_memory_kills
 

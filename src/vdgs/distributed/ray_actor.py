@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from vdgs.distributed.engine import Begun, End
+from vdgs.distributed.executor import Begun, End
 from vdgs.distributed.node_check import examine
 from vdgs.distributed.task_process import Process, out_of_memory_kills
 from vdgs.system.documents import FitnessQuestion

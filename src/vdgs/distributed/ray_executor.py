@@ -19,12 +19,11 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from vdgs.distributed.engine import STOPPED, Attempt, Begun, End
-from vdgs.distributed.executor import Listener, Outcome, Task
+from vdgs.distributed.executor import STOPPED, Attempt, Begun, End, Listener, Outcome, Task
 from vdgs.distributed.node_check import Question
-from vdgs.distributed.parent import PARENT
 from vdgs.distributed.ray_actor import Keeper, Order, Unfit
 from vdgs.distributed.scheduler import Policy, run_crew
+from vdgs.distributed.task_process import PARENT
 from vdgs.errors import VdgsError
 from vdgs.system.documents import FitnessAnswer, FitnessQuestion
 

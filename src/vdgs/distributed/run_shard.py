@@ -36,8 +36,8 @@ def main(arguments: Sequence[str]) -> int:
 def _run(given: argparse.Namespace) -> None:
     from rich.console import Console
 
-    from vdgs.distributed.parent import stop_when_parent_dies
     from vdgs.distributed.shard import Shard, run_shard
+    from vdgs.distributed.task_process import stop_when_parent_dies
     from vdgs.kernels.device_selection import choose
 
     device = choose(given.device).device

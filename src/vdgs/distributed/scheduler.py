@@ -14,9 +14,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vdgs.distributed.engine import DONE, EXPLAINED, STOPPED, Attempt, End, Engine
-from vdgs.distributed.executor import EndState, Listener, Outcome, Task
-from vdgs.distributed.output import explanation, last_lines
+from vdgs.distributed.executor import DONE, EXPLAINED, STOPPED, Attempt, End, EndState, Engine, Listener, Outcome, Task
+from vdgs.distributed.task_process import explanation, last_lines
 from vdgs.errors import VdgsError
 from vdgs.runs.stage_folder import StageFolder
 from vdgs.system.stop_signals import stop_requests

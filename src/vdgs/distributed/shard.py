@@ -15,8 +15,7 @@ from rich.console import Console
 from vdgs.config.serialization import from_dict
 from vdgs.distributed.sharded_job import REQUEST, ShardedJob
 from vdgs.errors import Interrupted, RunError, Stopped, VdgsError
-from vdgs.runs.stage_folder import StageFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import StageFolder, Status
 from vdgs.system.atomic_files import read_json
 from vdgs.system.memory.process_memory import peak_memory_bytes
 from vdgs.system.stop_signals import stop_if_asked

@@ -10,9 +10,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from vdgs.distributed.executor import Executor, Needs, Outcome, Task
+from vdgs.distributed.executor import Executor, Lines, Needs, Outcome, Task
 from vdgs.distributed.job_labels import BLOCKS, Kind
-from vdgs.distributed.lines import Lines
 from vdgs.distributed.progress_table import STYLES, Board
 from vdgs.distributed.shard_progress import PieceProgress, read_figures
 from vdgs.errors import VdgsError

@@ -35,8 +35,7 @@ from vdgs.distributed.resource_allocation import Share, Work
 from vdgs.distributed.shard_runner import Piece, run_pieces
 from vdgs.errors import RunError, Stopped
 from vdgs.kernels import threads as threads_available
-from vdgs.runs.stage_folder import StageFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import StageFolder, Status
 from vdgs.system.atomic_files import write_json
 from vdgs.system.file_locks import hold
 from vdgs.system.memory.process_memory import available_bytes

@@ -18,10 +18,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from vdgs.config.executor_options import SlurmOptions
-from vdgs.distributed.engine import STOPPED, Attempt, Begun, End
-from vdgs.distributed.executor import Listener, Needs, Outcome, Task
+from vdgs.distributed.executor import STOPPED, Attempt, Begun, End, Listener, Needs, Outcome, Task
 from vdgs.distributed.node_check import Question
-from vdgs.distributed.parent import PARENT
 from vdgs.distributed.scheduler import Policy, run_crew
 from vdgs.distributed.slurm_commands import (
     Element,
@@ -35,6 +33,7 @@ from vdgs.distributed.slurm_commands import (
     submit,
 )
 from vdgs.distributed.slurm_job import Record, read
+from vdgs.distributed.task_process import PARENT
 from vdgs.errors import VdgsError
 from vdgs.system.atomic_files import read_record, write_json, write_text
 from vdgs.system.documents import JsonObject

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from vdgs.distributed.engine import EXPLAINED, STOPPED
+from vdgs.distributed.executor import EXPLAINED, STOPPED
 from vdgs.distributed.node_check import examine
 from vdgs.distributed.slurm_commands import Element, requeue
 from vdgs.distributed.task_process import Process, out_of_memory_kills

@@ -3,15 +3,72 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from vdgs.distributed.parent import PARENT
+#: Environment variable with the process id of the driver; set for each task that a driver starts.
+PARENT = "VDGS_PARENT"
+
+
+def stop_when_parent_dies(poll_seconds: float = 1.0) -> threading.Thread | None:
+    """Send this process SIGTERM, once, when the driver that started it is gone. Returns the watching thread.
+
+    Does nothing (None) where no driver did. The variable is removed, so that processes which this one starts do not
+    take its parent for theirs. Polling is enough and, unlike PR_SET_PDEATHSIG, works on every POSIX system, needs no
+    code between fork and exec, and does not end the task with the driver's thread.
+    """
+    try:
+        parent = int(os.environ.pop(PARENT, ""))
+    except ValueError:
+        return None
+    watch = threading.Thread(target=_watch, args=(parent, poll_seconds), name="parent", daemon=True)
+    watch.start()
+    return watch
+
+
+def _watch(parent: int, poll_seconds: float) -> None:
+    while os.getppid() == parent:  # an orphan is adopted by another process
+        time.sleep(poll_seconds)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+#: Bytes of output that are looked at, and lines that are shown.
+TAIL_BYTES, TAIL_LINES = 1 << 16, 12
+#: How the command line begins the message of an error (cli.py).
+MESSAGE = re.compile(r"vdgs \w+: ")
+#: Colours and cursor movements; other control characters.
+ESCAPES, CONTROLS = re.compile(r"\x1b\[[0-9;?]*[ -/]*[@-~]"), re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+
+
+def last_lines(output: Path, start: int = 0) -> list[str]:
+    """The last lines after byte `start` that are not empty; none if the file cannot be read."""
+    try:
+        with output.open("rb") as handle:
+            end = handle.seek(0, 2)
+            handle.seek(max(start, end - TAIL_BYTES))
+            text = handle.read(TAIL_BYTES).decode(errors="replace")
+    except OSError:
+        return []
+    # A carriage return overwrites its line: what follows the last one is what a person saw.
+    lines = [line.rstrip("\r\n").rpartition("\r")[2] for line in text.split("\n")]
+    clean = [CONTROLS.sub("", ESCAPES.sub("", line)).rstrip() for line in lines]
+    return [line for line in clean if line][-TAIL_LINES:]
+
+
+def explanation(output: Path, start: int = 0) -> str:
+    """The message that the command line ended with, else the last line; empty if there is no output."""
+    lines = last_lines(output, start)
+    for place in reversed(range(len(lines))):
+        if MESSAGE.match(lines[place]):
+            return "\n".join([MESSAGE.sub("", lines[place]), *lines[place + 1 :]])
+    return lines[-1] if lines else ""
 
 
 class Process:

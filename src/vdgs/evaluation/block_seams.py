@@ -35,7 +35,7 @@ from vdgs.evaluation.by_block import (
 )
 from vdgs.evaluation.metric_tables import shown
 from vdgs.evaluation.metrics import masked_mean, psnr_of, squared_error, to_8bit
-from vdgs.evaluation.reference_views import ReferenceViews
+from vdgs.evaluation.renderable_model import ReferenceViews
 from vdgs.evaluation.view_exposures import as_photographed
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
@@ -206,7 +206,8 @@ def seam_picture(view: SeamView) -> Image.Image:
         comparison_images.Panel(comparison_images.resize(view.merged, size), "merged", _caption(view.merged, view)),
         comparison_images.Panel(with_borders(view.merged, view.labels, size), "borders of blocks"),
         comparison_images.Panel(
-            comparison_images.resize(comparison_images.colourise(error, comparison_images.ERROR_LIMIT), size), f"merged: {comparison_images.ERROR_LABEL}"
+            comparison_images.resize(comparison_images.colourise(error, comparison_images.ERROR_LIMIT), size),
+            f"merged: {comparison_images.ERROR_LABEL}",
         ),
     ]
     return comparison_images.row_of_panels(panels, view.name, comparison_images.ERROR_LIMIT)

@@ -30,8 +30,7 @@ from vdgs.evaluation.depth_errors import DepthErrors, figures_of
 from vdgs.evaluation.lpips import Lpips
 from vdgs.evaluation.metric_tables import metrics_table
 from vdgs.evaluation.opacity_coverage import largest_splats_of_all, solidity_of_all
-from vdgs.evaluation.reference_views import ReferenceViews
-from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ModelFacts
+from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ModelFacts, ReferenceViews
 from vdgs.evaluation.view_metrics import AFFINE, CORRECTED, NEUTRAL, RAW, ViewFigures, ViewInputs, measure_view
 from vdgs.system.atomic_files import jsonable, write_json
 from vdgs.system.documents import EvaluationMetrics, JsonObject

@@ -20,8 +20,7 @@ from vdgs.errors import RunError
 from vdgs.evaluation.coverage import seen_map
 from vdgs.evaluation.evaluate_model import evaluate
 from vdgs.evaluation.lpips import load_lpips
-from vdgs.evaluation.reference_views import ReferenceViews
-from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ModelFacts
+from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ModelFacts, ReferenceViews
 from vdgs.evaluation.view_exposures import exposures_of
 from vdgs.geometry.camera import Camera
 from vdgs.model.anchor_model import AnchorModel

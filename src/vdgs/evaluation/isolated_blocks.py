@@ -6,16 +6,15 @@ from collections import OrderedDict
 from dataclasses import replace
 
 from vdgs.evaluation.block_seams import BlockInputs
-from vdgs.evaluation.reference_views import ReferenceViews
+from vdgs.evaluation.renderable_model import ReferenceViews
 from vdgs.evaluation.view_exposures import exposures_of
 from vdgs.geometry.camera import Camera
 from vdgs.kernels.kernel_types import Raster
 from vdgs.model.anchor_model import AnchorModel, Part
 from vdgs.model.renderer import render
 from vdgs.partition.block_regions import split_anchors
-from vdgs.runs.cut import blocks_of
 from vdgs.runs.model_integrity import load_vouched
-from vdgs.runs.open_run import TrainedRun
+from vdgs.runs.open_run import TrainedRun, blocks_of
 from vdgs.runs.run_folder import RunFolder
 
 #: Blocks are held assembled among their surroundings up to so many bytes (at least one): views show them in turn.

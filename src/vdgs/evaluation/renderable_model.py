@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from vdgs.captures.capture import View
@@ -88,3 +88,12 @@ class EvaluationSettings:
     contact_views: int = 40
     #: Error at the bright end of the colour map, where white is 1.
     error_limit: float = comparison_images.ERROR_LIMIT
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceViews:
+    """Test views, and how to load their photographs and masks (true = keep; None: all of it counts)."""
+
+    views: Sequence[View]
+    load_image: Callable[[View], UInt8[np.ndarray, "h w 3"]]
+    load_mask: Callable[[View], Bool[np.ndarray, "h w"] | None]

@@ -26,8 +26,7 @@ from vdgs.evaluation.color_correction import correct_colours, correct_colours_af
 from vdgs.evaluation.depth_errors import DepthErrors, errors_of_view, figures_of
 from vdgs.evaluation.lpips import MIN_SIDE_PX, Lpips
 from vdgs.evaluation.opacity_coverage import Rendered, larger_than_picture, solidity_of_view
-from vdgs.evaluation.reference_views import ReferenceViews
-from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel
+from vdgs.evaluation.renderable_model import EvaluationSettings, MeasuredModel, ReferenceViews
 from vdgs.system.documents import JsonObject
 
 RAW = ("psnr", "ssim", "lpips_vgg", "lpips_vgg_01")

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Int
 from rich.console import Console
 
+from vdgs.captures.camera_height import overview
 from vdgs.captures.output_guard import refuse_among_inputs, refuse_in_a_capture
-from vdgs.captures.overview import overview
 from vdgs.config.commands import ExportRequest
 from vdgs.distributed.sharded_job import Wish
 from vdgs.errors import VdgsError

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.captures.capture import GroundFrame
 from vdgs.export.formats.export_scene import Facts
 from vdgs.geometry.geodesy import enu_axes, geodetic_from_enu
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.map_projection import Placement
 from vdgs.geometry.similarity import Similarity
 from vdgs.model.gaussian_transform import transformed

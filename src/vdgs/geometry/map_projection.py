@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.captures.capture import GroundFrame
 from vdgs.errors import VdgsError
 from vdgs.geometry.crs import Projection, open_projection, utm_zone
 from vdgs.geometry.geodesy import enu_axes, enu_from_geodetic, geodetic_from_enu
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.geometry.similarity import Similarity
 
 Places = Float[np.ndarray, "n 3"]

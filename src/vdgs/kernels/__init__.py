@@ -118,10 +118,3 @@ def set_threads(count: int) -> None:
 
     extension.set_threads(count)
     torch.set_num_threads(count)
-
-
-def release_idle_memory() -> None:
-    """Give back what implementations keep from picture to picture but do not use now."""
-    from vdgs.kernels.cpu import extension
-
-    extension.native().drop_idle_frames()

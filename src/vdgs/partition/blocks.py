@@ -18,9 +18,9 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from vdgs.captures.capture import GroundFrame
 from vdgs.errors import RunError
 from vdgs.geometry.geodesy import geodetic_from_enu
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.partition.polygon_lookup import Cores
 from vdgs.system.atomic_files import write_json
 from vdgs.system.documents import JsonObject

@@ -39,8 +39,8 @@ from vdgs.system.memory.process_memory import available_bytes
 from vdgs.system.stop_signals import stop_if_asked
 from vdgs.system.units import data_size, rough_duration
 from vdgs.training import TrainingState, train
-from vdgs.training.session.images import image_budget
 from vdgs.training.session.memory_advice import need_of
+from vdgs.training.session.trainer import image_budget
 
 #: Steps at each size that are timed at least, the first of them not; then as many as fit into so many seconds.
 TIMED_STEPS, TIMED_SECONDS = 4, 2.0

@@ -40,8 +40,7 @@ from vdgs.evaluation.lpips import load_lpips
 from vdgs.evaluation.renderable_model import ModelFacts
 from vdgs.evaluation.view_metrics import ViewInputs, measure_view
 from vdgs.evaluation.view_metrics_io import load_view, save_view
-from vdgs.runs.cut import blocks_of
-from vdgs.runs.open_run import FoundModel, find_model
+from vdgs.runs.open_run import FoundModel, blocks_of, find_model
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import read_json, read_record, write_bytes, write_json

@@ -10,12 +10,12 @@ from rich.console import Console
 
 from vdgs.errors import RunError
 from vdgs.partition.merging import merge
-from vdgs.runs.cut import blocks_of, views_of_blocks
 from vdgs.runs.model_integrity import load_vouched
+from vdgs.runs.open_run import blocks_of, views_of_blocks
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import standing_of
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import Status
 from vdgs.system.memory.process_memory import forget_peak, peak_memory_bytes
 from vdgs.system.tensors import identity
 

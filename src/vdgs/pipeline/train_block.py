@@ -26,16 +26,14 @@ from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.model.scale_bounds import largest_log_scales
 from vdgs.partition.block_regions import drawn_by, holds, ramp, split_anchors
 from vdgs.partition.blocks import Blocks
-from vdgs.runs.cut import blocks_of, views_of_block
+from vdgs.runs.open_run import blocks_of, views_of_block
 from vdgs.runs.run_context import RunContext
-from vdgs.runs.stage_folder import StageFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import StageFolder, Status
 from vdgs.system.tensors import identity
 from vdgs.training import Stage, Surroundings, start_state
 from vdgs.training.crops import crops_of, load_or_find, mean_area, steps_for
-from vdgs.training.sampling import shares_for
-from vdgs.training.session.images import image_budget
-from vdgs.training.session.trainer import continue_or_start, finish, note_without_growth, train_watched
+from vdgs.training.schedule import shares_for
+from vdgs.training.session.trainer import continue_or_start, finish, image_budget, note_without_growth, train_watched
 from vdgs.visibility.visibility_counts import effective_count
 
 

@@ -18,11 +18,10 @@ from vdgs.distributed.node_check import Question, photographs_of
 from vdgs.distributed.sharded_job import ShardedJob, ShardNeeds, Wish
 from vdgs.errors import RunError, VdgsError
 from vdgs.geometry.camera import Camera
-from vdgs.runs.cut import blocks_of
+from vdgs.runs.open_run import blocks_of
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.stage_folder import StageFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import StageFolder, Status
 from vdgs.system.memory.memory_estimate import decoded_bytes, estimate, largest_picture, need_of_block
 
 

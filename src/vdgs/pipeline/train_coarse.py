@@ -14,6 +14,7 @@ from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import capture_facts
 from vdgs.captures.image_cache import ImageCache
 from vdgs.captures.photometric_gains import point_colours
+from vdgs.captures.validation import refuse_unworkable
 from vdgs.config.checkpointing import WatchOptions
 from vdgs.config.method import TrainConfig
 from vdgs.model.anchor_model import ModelMetadata
@@ -24,19 +25,17 @@ from vdgs.model.initialization.initialize import initial_anchors
 from vdgs.model.initialization.stereo import DensePoints
 from vdgs.model.scale_bounds import largest_log_scales
 from vdgs.pipeline.dense_points import find_points
-from vdgs.report.starting import refuse_unworkable
 from vdgs.runs.open_run import refuse_empty
 from vdgs.runs.run_cameras import keep_flight
 from vdgs.runs.run_context import RunContext
 from vdgs.runs.run_folder import RunFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import Status
 from vdgs.system.atomic_files import write_json
 from vdgs.system.checkpoints import save_state
 from vdgs.system.stop_signals import stop_if_asked
 from vdgs.training import Stage, TrainingState, mean_colour, start_state, to_saved
-from vdgs.training.sampling import shares_for
-from vdgs.training.session.images import image_budget
-from vdgs.training.session.trainer import continue_or_start, finish, note_without_growth, train_watched
+from vdgs.training.schedule import shares_for
+from vdgs.training.session.trainer import continue_or_start, finish, image_budget, note_without_growth, train_watched
 
 
 def train_coarse(context: RunContext, options: WatchOptions, console: Console, device: str = "cpu") -> None:

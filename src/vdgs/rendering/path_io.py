@@ -30,12 +30,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from vdgs.captures.capture import GroundFrame
 from vdgs.config import commands
 from vdgs.config.ranges import Range
 from vdgs.config.serialization import suggestion
 from vdgs.errors import VdgsError
 from vdgs.geometry.camera import Camera
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.rendering.camera_paths import FPS, SECONDS, CameraPath, frame_count, interpolate, look_at, rigid_at
 from vdgs.rendering.nerfstudio import frame_beside, pose_in_source
 

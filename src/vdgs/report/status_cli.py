@@ -12,7 +12,7 @@ from rich.markup import escape
 from vdgs.report.write_report import report_standing
 from vdgs.runs.run_folder import REPORT, RunFolder
 from vdgs.runs.run_status import RunStanding, Standing, standing_of
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import Status
 from vdgs.system.documents import RunStatus, StageStatus
 
 #: Exit code of `vdgs status` for a run that is not whole: something of it is missing, runs, failed or is out of date.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vdgs.plots.partition.words import block_colour
+from vdgs.plots.partition.block_stats import block_colour
 from vdgs.report.charts import MERGED, Curve, draw_curves
 from vdgs.report.formatting import decibels, figure_of, share
 from vdgs.report.html_page import Html, figure, gallery, heading, joined, paragraph, section, table

@@ -6,7 +6,9 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
+from jaxtyping import Bool
 
 from vdgs.captures.capture import Capture
 from vdgs.captures.capture_metadata import refuse_another_capture
@@ -14,11 +16,12 @@ from vdgs.captures.loading import load_capture
 from vdgs.config.commands import ModelName
 from vdgs.errors import CaptureError, RunError
 from vdgs.model.anchor_model import AnchorModel
+from vdgs.partition.assignment.score_file import load_scores
+from vdgs.partition.blocks import Blocks, load_blocks
 from vdgs.runs.model_integrity import load_vouched
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import standing_of
-from vdgs.runs.stage_folder import StageFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import StageFolder, Status
 from vdgs.system.atomic_files import read_json
 
 
@@ -174,3 +177,35 @@ def remember_capture(folder: RunFolder, at: Path) -> Capture:
             refuse_another_capture(folder.capture_file, read_json(folder.capture_file), capture)
         folder.move_capture(at)
     return capture
+
+
+def blocks_of(run: RunFolder) -> Blocks:
+    """The blocks of a run, with cameras. Raises RunError unless they were made with the run's settings."""
+    record, keys = run.partition_record(), run.keys()
+    if (record.key, record.assignment_key) != (keys.partition, keys.assignment):
+        raise RunError(
+            f"{run.path}: is not cut into blocks yet, or with other settings. Run: vdgs partition {run.path}"
+        )
+    return load_blocks(run.partition / "blocks.geojson")
+
+
+def views_of_block(run: RunFolder, capture: Capture, index: int) -> list[int]:
+    """Which training views, by number, serve a block."""
+    return _views(_assigned(run, capture)[:, index])
+
+
+def views_of_blocks(run: RunFolder, capture: Capture) -> list[list[int]]:
+    """The same of every block, read once."""
+    return [_views(of_block) for of_block in _assigned(run, capture).T]
+
+
+def _views(assigned: Bool[np.ndarray, " c"]) -> list[int]:
+    return [int(view) for view in np.flatnonzero(assigned)]
+
+
+def _assigned(run: RunFolder, capture: Capture) -> Bool[np.ndarray, "c b"]:
+    """Which training view serves which block. Raises RunError where that is of other views."""
+    _, _, assignment = load_scores(run.partition / "scores.npz")
+    if len(assignment.cameras) != len(capture.train_views):
+        raise RunError(f"{run.partition / 'scores.npz'}: is of another capture. Run: vdgs partition {run.path}")
+    return assignment.cameras

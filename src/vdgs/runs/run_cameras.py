@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from vdgs.captures.camera_height import camera_height
-from vdgs.captures.capture import Capture, GroundFrame, View
+from vdgs.captures.capture import Capture, View
 from vdgs.captures.capture_metadata import fingerprint
 from vdgs.captures.output_guard import folders_of_inputs
 from vdgs.errors import RunError
 from vdgs.geometry.camera import Camera
+from vdgs.geometry.ground_frame import GroundFrame
 from vdgs.runs.run_folder import RunFolder
 from vdgs.system.atomic_files import read_json, write_json
 from vdgs.system.documents import CaptureMetadata, JsonObject

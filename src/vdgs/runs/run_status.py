@@ -18,9 +18,8 @@ from vdgs.partition.block_records import PartitionRecord
 from vdgs.runs.model_integrity import foreign, to_delete
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_settings import RunSettings
-from vdgs.runs.stage_folder import StageFolder
+from vdgs.runs.stage_folder import StageFolder, Status
 from vdgs.runs.stage_keys import StageKeys, stage_keys
-from vdgs.runs.status import Status
 from vdgs.system.atomic_files import read_record
 from vdgs.system.file_locks import seems_locked
 

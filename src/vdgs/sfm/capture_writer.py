@@ -19,7 +19,7 @@ from vdgs.captures.image_files import decode_photograph
 from vdgs.captures.undistortion import pinhole_for, sampling_map
 from vdgs.config.capture_options import CaptureOptions
 from vdgs.errors import CaptureError
-from vdgs.sfm.masking import png_of, straight_mask
+from vdgs.sfm.mask_files import png_of, straight_mask
 from vdgs.sfm.workspace import Work, progress
 from vdgs.system.atomic_files import write_bytes
 from vdgs.system.stop_signals import stop_if_asked

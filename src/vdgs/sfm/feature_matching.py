@@ -26,7 +26,11 @@ def expected_pairs(photographs: Sequence[Photograph], positions: Positions, opti
     count = len(photographs)
     if not positions.usable:
         everyone = count * (count - 1) // 2
-        return everyone if count <= options.exhaustive else count * (pair_selection.NEXT + pair_selection.DOUBLINGS + pair_selection.ALIKE // 2)
+        return (
+            everyone
+            if count <= options.exhaustive
+            else count * (pair_selection.NEXT + pair_selection.DOUBLINGS + pair_selection.ALIKE // 2)
+        )
     if count <= pair_selection.NEXT:
         return count * (count - 1) // 2
     return len(_by_positions(photographs, positions, options)) + (count - len(positions)) * pair_selection.ALIKE

@@ -34,7 +34,7 @@ from vdgs.sfm import (
     gcp_adjustment,
     georegistration,
     incremental_mapper,
-    masking,
+    mask_files,
 )
 from vdgs.sfm.console_report import tell_facts
 from vdgs.sfm.image_list import LeftOut
@@ -168,11 +168,15 @@ def _features(
     failed = feature_extraction.stand_upright(work, photographs)
     counts = feature_extraction.feature_counts(work)
     if not work.is_done("features", key):
-        masking.write_upright_masks(work, photographs, prepared.threads)
-        counts = feature_extraction.find_features(work, kinds, options.feature_size, options.features, prepared.threads, console)
+        mask_files.write_upright_masks(work, photographs, prepared.threads)
+        counts = feature_extraction.find_features(
+            work, kinds, options.feature_size, options.features, prepared.threads, console
+        )
         work.finish("features", key)
     named = {each.name for each in failed}
-    return failed + [each for each in feature_extraction.without_features(photographs, counts) if each.name not in named]
+    return failed + [
+        each for each in feature_extraction.without_features(photographs, counts) if each.name not in named
+    ]
 
 
 def _matches(prepared: Prepared, work: Work, key: str, console: Console) -> int:
@@ -199,21 +203,27 @@ def _models(
         incremental_mapper.forget_models(work)
         work.begin("model", key)
     incremental_mapper.write_priors(work, prepared.collection.photographs, prepared.positions)
-    models = incremental_mapper.find_models(work, count, hold_focal, prepared.positions.usable, prepared.threads, console)
+    models = incremental_mapper.find_models(
+        work, count, hold_focal, prepared.positions.usable, prepared.threads, console
+    )
     work.finish("model", key)
     return models
 
 
 def _place(
     model: pycolmap.Reconstruction, prepared: Prepared, hold_focal: bool
-) -> tuple[georegistration.Placed | georegistration.Unplaced, tuple[float, float, float] | None, tuple[SurveyFacts, ...]]:
+) -> tuple[
+    georegistration.Placed | georegistration.Unplaced, tuple[float, float, float] | None, tuple[SurveyFacts, ...]
+]:
     """Bring the model to metres east, north, up, its median point to height 0; the origin that this has on Earth, and
     what it makes of surveyed points."""
     photographs, positions, control = prepared.collection.photographs, prepared.positions, prepared.control
     doubtful = set[str]()
     if control is not None and control.places_the_model:
         how, doubtful = gcp_adjustment.bring_to_control(model, control, prepared.origin, hold_focal, prepared.threads)
-        placed: georegistration.Placed | georegistration.Unplaced = georegistration.as_it_lies(model, photographs, positions, how)
+        placed: georegistration.Placed | georegistration.Unplaced = georegistration.as_it_lies(
+            model, photographs, positions, how
+        )
     else:
         placed = georegistration.place(model, photographs, positions)
         if isinstance(placed, georegistration.Placed):
@@ -252,7 +262,9 @@ def _write(
     for image in sorted(model.images.values(), key=lambda image: image.name):
         if image.has_pose:
             names.setdefault(image.camera_id, []).append(image.name)
-    capture_writer.write_images(output, work, names, _lenses(model, prepared.request.options.max_size), threads, console)
+    capture_writer.write_images(
+        output, work, names, _lenses(model, prepared.request.options.max_size), threads, console
+    )
 
 
 def _georef(facts: ReconstructionFacts, origin: tuple[float, float, float]) -> JsonObject:

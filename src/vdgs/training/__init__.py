@@ -1,7 +1,7 @@
 """Training of anchors: one loop for the coarse stage and for blocks; what differs is data."""
 
-from vdgs.training.background import mean_colour
 from vdgs.training.schedule import downscale_at, view_at, views_in_cycle
+from vdgs.training.target import mean_colour
 from vdgs.training.training_loop import PSNR_INTERVAL, train, train_step
 from vdgs.training.training_state import (
     Stage,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from vdgs.kernels import choose
-from vdgs.system.memory.process_memory import return_unused
+from vdgs.kernels.idle_memory import return_unused
 from vdgs.training.compensation import begin_cycle, compensate, cycle_facts, low_visibility, update_cache
 from vdgs.training.densification import Compensated, decide
 from vdgs.training.per_anchor_tensors import remap

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
 
 from vdgs.config.method import TrainConfig
+from vdgs.geometry.camera import Camera
+from vdgs.model.anchors import Anchors
 from vdgs.training.training_state import Stage
+from vdgs.visibility.visibility_counts import votes_of
 
 
 def view_at(iteration: int, count: int, seed: int, shares: tuple[float, ...] | None = None) -> int:
@@ -49,3 +54,15 @@ def views_in_cycle(iteration: int, stage: Stage) -> list[int]:
         begin = growth.statistics_from
     used = range(max(min(begin, iteration - 1), 0), iteration)
     return sorted({view_at(each, stage.image_count, stage.config.seed, stage.shares) for each in used})
+
+
+def shares_for(config: TrainConfig, anchors: Anchors, cameras: Sequence[Camera]) -> tuple[float, ...] | None:
+    """How often each training view is used, by the settings, for the anchors that training starts with.
+
+    Roots, because a view with few votes also costs little (`training.crops`): a mean varies least for what it costs
+    if strata are drawn in proportion to their weight over the root of their cost (Cochran, 1977, section 5.5).
+    """
+    if config.sampling == "even":
+        return None
+    votes = votes_of(anchors.positions, cameras)
+    return votes if config.sampling == "shares" else tuple(math.sqrt(share) for share in votes)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vdgs.errors import TrainingDiverged
@@ -19,17 +20,33 @@ from vdgs.kernels import choose
 from vdgs.kernels.kernel_types import DecoderWeights, OrderedSplats, SplatGradients
 from vdgs.model.renderer import decode_rows_to_train, visible_rows
 from vdgs.model.scale_bounds import SPREAD
-from vdgs.training.background import background_at
 from vdgs.training.densification_step import grow, reorder
 from vdgs.training.gradient_roi import narrow
 from vdgs.training.objective import compare
 from vdgs.training.optimizer import rates_at
 from vdgs.training.schedule import downscale_at, view_at
-from vdgs.training.smoothing import KEEP_LOSS, KEEP_PSNR, psnr_of, smoothed
-from vdgs.training.target import box_at, part_of, target_at
+from vdgs.training.target import background_at, box_at, part_of, target_at
 from vdgs.training.training_state import Stage, StepReport, TrainingState
 from vdgs.training.training_step import coast_anchors, draw_view, move_anchors
 from vdgs.training.weight_averaging import Average, counts_in_mean
+
+#: How much of the value before is kept at each step.
+KEEP_LOSS, KEEP_PSNR = 0.98, 0.9
+
+
+def smoothed(before: float, value: float, keep: float) -> float:
+    """The exponential mean after one more value; NaN before the first."""
+    return value if math.isnan(before) else keep * before + (1 - keep) * value
+
+
+def psnr_of(
+    image: Float[Tensor, "h w 3"], target: UInt8[Tensor, "h w 3"], mask: UInt8[Tensor, "h w"] | None
+) -> float | None:
+    """PSNR of a training view in dB; None where the mask keeps nothing."""
+    squared = (image.clamp(0, 1) - target.float() / 255.0) ** 2
+    counted = squared if mask is None else squared[mask > 0]
+    return -10.0 * math.log10(max(float(counted.mean()), 1e-10)) if counted.numel() else None
+
 
 #: Camera height above the ground to which volumes are referred, so that the volume term means the same in any unit.
 REFERENCE_HEIGHT = 10.0

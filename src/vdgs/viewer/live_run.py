@@ -12,9 +12,8 @@ from vdgs.config.commands import ModelName
 from vdgs.errors import RunError, VdgsError
 from vdgs.model.anchor_model import AnchorModel, ModelMetadata
 from vdgs.partition.merging import merge
-from vdgs.runs.cut import blocks_of, views_of_blocks
 from vdgs.runs.model_integrity import load_vouched
-from vdgs.runs.open_run import TrainedRun, open_capture, open_run
+from vdgs.runs.open_run import TrainedRun, blocks_of, open_capture, open_run, views_of_blocks
 from vdgs.runs.run_folder import RunFolder
 from vdgs.runs.run_status import standing_of
 from vdgs.runs.stage_folder import StageFolder

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from vdgs.captures.camera_height import overview
 from vdgs.captures.capture import Capture
-from vdgs.captures.overview import overview
 from vdgs.config.commands import BYTES_PER_PIXEL, LARGEST_SIDE_PX
 from vdgs.geometry.camera import Camera
 

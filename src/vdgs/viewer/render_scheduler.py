@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vdgs.geometry.camera import Camera
-from vdgs.system.memory.process_memory import return_unused
+from vdgs.kernels.idle_memory import return_unused
 from vdgs.viewer.layers import Shown
 
 #: A camera that has not moved for so long rests, seconds.

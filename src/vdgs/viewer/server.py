@@ -18,13 +18,13 @@ from typing import Any
 
 from rich.console import Console
 
-from vdgs.captures.camera_height import camera_height
-from vdgs.captures.overview import FOV_DEG
+from vdgs.captures.camera_height import FOV_DEG, camera_height
 from vdgs.config.commands import ViewRequest
 from vdgs.errors import Interrupted, VdgsError
+from vdgs.kernels.idle_memory import return_unused
 from vdgs.runs.open_run import TrainedRun
 from vdgs.runs.run_folder import RunFolder
-from vdgs.system.memory.process_memory import return_unused, share_arenas
+from vdgs.system.memory.process_memory import share_arenas
 from vdgs.system.stop_signals import stop_if_asked, stop_requests
 from vdgs.viewer import navigation
 from vdgs.viewer.access_control import ALL, Door, is_loopback

@@ -20,8 +20,7 @@ from vdgs.geometry.map_projection import Placement
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.renderer import render
 from vdgs.partition.blocks import Blocks, places_of
-from vdgs.runs.cut import blocks_of
-from vdgs.runs.open_run import TrainedRun, open_run
+from vdgs.runs.open_run import TrainedRun, blocks_of, open_run
 from vdgs.runs.visibility_store import visibility_of_run
 from vdgs.viewer.lod import Level, Levels
 
@@ -139,7 +138,7 @@ class Scene:
 
 def rgb_of(block: int) -> tuple[int, int, int]:
     """The colour of a block in all figures, 0 to 255."""
-    from vdgs.plots.partition.words import block_colour  # brings matplotlib: not before the first picture
+    from vdgs.plots.partition.block_stats import block_colour  # brings matplotlib: not before the first picture
 
     colour = block_colour(block).lstrip("#")
     red, green, blue = (int(colour[place : place + 2], 16) for place in (0, 2, 4))

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vdgs.captures.capture import Sightings
 from vdgs.captures.formats.colmap_binary import cameras_binary, images_binary, points_binary
 from vdgs.captures.formats.colmap_records import ImageRecord, Points, no_points
 from vdgs.captures.formats.colmap_text import cameras_text, images_text, points_text
@@ -25,7 +26,6 @@ from vdgs.captures.formats.source_capture import (
     rigid,
     safe_name,
 )
-from vdgs.captures.sightings import Sightings
 from vdgs.errors import CaptureError
 
 QUATERNION_TOLERANCE = 1e-3

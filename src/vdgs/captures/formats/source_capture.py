@@ -14,8 +14,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 
-from vdgs.captures.capture import Split
-from vdgs.captures.sightings import Sightings
+from vdgs.captures.capture import Sightings, Split
 from vdgs.errors import CaptureError
 
 #: COLMAP's camera models: identifier -> (name, number of parameters).

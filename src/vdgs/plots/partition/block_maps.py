@@ -19,9 +19,8 @@ from matplotlib.path import Path as Outline
 from vdgs.geometry.camera import Camera
 from vdgs.geometry.row_sampling import sample_points
 from vdgs.partition.blocks import Blocks
-from vdgs.plots.partition.block_stats import block_facts, draw_block_facts, spread_note
+from vdgs.plots.partition.block_stats import block_colour, block_facts, count_of, draw_block_facts, mixed, spread_note
 from vdgs.plots.partition.score_heatmap import draw_scores
-from vdgs.plots.partition.words import block_colour, count_of, mixed
 from vdgs.plots.style import DPI, FAINT, INK, NOTE, TEXT, placer, plain, titles
 from vdgs.plots.visibility_map import CameraMarks, SeenMap, draw_seen_map, map_size, mark_edge
 

@@ -12,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 
-from vdgs.plots.partition.words import count_of
+from vdgs.plots.partition.block_stats import count_of
 from vdgs.plots.style import ACCENT, DPI, FAINT, INK, NOTE, TEXT, placer, plain, titles
 
 #: From no score to the highest; nothing in it resembles the mark of an assigned camera.

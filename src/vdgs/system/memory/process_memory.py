@@ -12,7 +12,6 @@ from pathlib import Path
 
 import psutil
 
-from vdgs.kernels import release_idle_memory
 from vdgs.system.memory.cgroups import group_limits, slurm_limit
 
 #: How the libraries word it: torch on the CPU (Linux, Windows), C++, OpenCV.
@@ -74,14 +73,3 @@ def share_arenas(most: int = 2) -> None:
     """Let all threads allocate from so few arenas (glibc): each of many threads else keeps what it has freed."""
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).mallopt(_M_ARENA_MAX, most)
-
-
-def return_unused() -> None:
-    """Give back to the system what this process keeps but does not use.
-
-    That is the rasteriser's idle memory and, with glibc, what was freed between pieces that are in use: after anchors
-    were replaced by others, more than they take themselves. Costs some milliseconds: for once in a hundred steps.
-    """
-    release_idle_memory()
-    with suppress(OSError, AttributeError, TypeError):  # other C libraries have no such function, or no such handle
-        ctypes.CDLL(None).malloc_trim(0)

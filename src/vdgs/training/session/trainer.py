@@ -16,15 +16,21 @@ from vdgs.errors import VdgsError
 from vdgs.model.anchor_model import AnchorModel
 from vdgs.model.anchors import Anchors
 from vdgs.model.decoder import Decoder
-from vdgs.runs.stage_folder import StageFolder
-from vdgs.runs.status import Status
+from vdgs.runs.stage_folder import StageFolder, Status
 from vdgs.system.checkpoints import load_newest, save_state, state_file
+from vdgs.system.memory.process_memory import available_bytes
 from vdgs.system.tensors import identity
 from vdgs.system.units import data_size
 from vdgs.training import Stage, StepReport, TrainingState, from_saved, result_from_saved, to_saved, train
 from vdgs.training.session.memory_advice import after_failure, announce, need_of
 from vdgs.training.session.training_progress import TrainingProgress
 from vdgs.training.session.training_session import Keeper, Watched, restore_or_start, watch
+
+
+def image_budget(options: WatchOptions) -> int:
+    """Bytes for decoded photographs."""
+    return int(options.image_memory_gb * 1e9) or available_bytes() // 4
+
 
 #: What to do about a diverging loss, in the coarse stage and in a block.
 AFTER_DIVERGENCE = {

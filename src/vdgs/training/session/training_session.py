@@ -13,10 +13,10 @@ import cv2
 from rich.console import Console
 
 from vdgs.errors import RunError, Stopped, TrainingDiverged, VdgsError
-from vdgs.runs.stage_folder import StageFolder
-from vdgs.runs.status import Status
+from vdgs.kernels.idle_memory import return_unused
+from vdgs.runs.stage_folder import StageFolder, Status
 from vdgs.system.checkpoints import SavedState, discard_after, load_newest, save_state
-from vdgs.system.memory.process_memory import is_out_of_memory, peak_memory_bytes, return_unused
+from vdgs.system.memory.process_memory import is_out_of_memory, peak_memory_bytes
 from vdgs.system.stop_signals import stop_requests
 
 #: As what missing memory arrives, among others (`is_out_of_memory`): from Python and C++, torch, the system, OpenCV.
