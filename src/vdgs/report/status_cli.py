@@ -13,7 +13,7 @@ from vdgs.report.write_report import report_standing
 from vdgs.runs.run_folder import REPORT, RunFolder
 from vdgs.runs.run_status import RunStanding, Standing, standing_of
 from vdgs.runs.stage_folder import Status
-from vdgs.system.documents import RunStatus, StageStatus
+from vdgs.system.documents import RunStatusDocument, StageStatusDocument
 
 #: Exit code of `vdgs status` for a run that is not whole: something of it is missing, runs, failed or is out of date.
 NOT_WHOLE = 3
@@ -44,7 +44,7 @@ def print_status(run: RunFolder, console: Console) -> int:
     return 0 if standing.whole else NOT_WHOLE
 
 
-def status_facts(run: RunFolder) -> RunStatus:
+def status_facts(run: RunFolder) -> RunStatusDocument:
     """The same for programs."""
     standing = whole_standing(run)
     return {
@@ -83,7 +83,7 @@ def progress_of(status: Status | None) -> str:
     return ", ".join(parts)
 
 
-def _facts(stage: Standing) -> StageStatus:
+def _facts(stage: Standing) -> StageStatusDocument:
     status = stage.status or Status()
     return {
         "stage": stage.name, "state": stage.state, "why": stage.why or None, "folder": stage.folder,

@@ -79,7 +79,7 @@ class MeasuredAs(TypedDict, total=False):
     exposed: str | None
 
 
-class StageStatus(TypedDict):
+class StageStatusDocument(TypedDict):
     """A stage in what `vdgs status --json` prints."""
 
     stage: str
@@ -91,14 +91,14 @@ class StageStatus(TypedDict):
     seconds_left: float | None
 
 
-class RunStatus(TypedDict):
+class RunStatusDocument(TypedDict):
     """What `vdgs status --json` prints."""
 
     run: str
     whole: bool
     at_work: bool
     next: str | None
-    stages: list[StageStatus]
+    stages: list[StageStatusDocument]
 
 
 class ExportedFile(TypedDict):
